@@ -1,0 +1,13 @@
+"""Datasets on disk: LeRobot v3.0, written atomically, read without torch or lerobot.
+
+<root>/meta/info.json  stats.json  tasks.parquet  episodes/chunk-000/file-000.parquet
+<root>/data/chunk-000/file-000.parquet          one row group per episode
+<root>/meta/astra/dataset.json                  where the dataset comes from, and its content hash
+<root>/meta/astra/episodes.parquet              one row of metadata per episode, keyed by episode_uid
+<root>/meta/astra/subsets.json                  the permutation whose prefixes are the nested subsets
+"""
+
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
+
+__all__ = ["Dataset", "DatasetWriter"]

@@ -1,0 +1,75 @@
+"""Folders that appear finished or not at all."""
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from astra_data.errors import BadInputError
+
+
+@contextmanager
+def atomic_folder(target: Path) -> Iterator[Path]:
+    """Yield an empty hidden folder beside `target`, which is renamed to `target` when the block ends.
+
+    After an exception the folder is removed. After a kill it stays, hidden, and the next call with the same
+    target removes it: a folder is held by a file lock, which dies with its process.
+
+    Raises:
+        BadInputError: `target` exists, or another process is writing it.
+    """
+    _refuse(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(target)
+    folder = target.with_name(f".{target.name}.tmp-{os.getpid()}")
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        raise BadInputError(f"{target} is being written right now; wait or choose another folder.") from None
+    with _held(folder):
+        try:
+            yield folder
+            for path in folder.rglob("*"):
+                _sync(path)
+            _refuse(target)
+            os.replace(folder, target)
+            _sync(target.parent)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _refuse(target: Path) -> None:
+    if target.exists():
+        raise BadInputError(f"{target} exists already; delete it or choose another folder.")
+
+
+def _sweep(target: Path) -> None:
+    for folder in target.parent.iterdir():
+        if folder.name.startswith(f".{target.name}.tmp-") and folder.is_dir():
+            with _held(folder) as held:
+                if held:
+                    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[bool]:
+    """Hold the lock of `folder`; yield False if another process does."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        yield False
+    else:
+        yield True
+    finally:
+        os.close(handle)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,110 @@
+"""A dataset's table of contents: everything but the values of its columns."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from astra_data.columns import Column, Scalar
+from astra_data.dataset import format as layout
+from astra_data.dataset.parquet import read_blocks, to_numpy
+from astra_data.dataset.validate import file_faults
+from astra_data.errors import CorruptDatasetError
+
+Ints = NDArray[np.int64]
+_LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Contents:
+    """What a dataset of E episodes says about itself.
+
+    Attributes:
+        root: its folder.
+        info: meta/info.json.
+        description: meta/astra/dataset.json.
+        metadata: the episodes' metadata, key to one value per episode, None where one has none.
+        uids: uid of each episode, (E,).
+        lengths: steps of each episode, (E,).
+        starts: first row of each episode, (E,).
+        order: the permutation of episode indices whose prefixes are the nested subsets.
+        paths: the data files in order.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    description: dict[str, Any]
+    metadata: dict[str, list[Scalar | None]]
+    uids: Ints
+    lengths: Ints
+    starts: Ints
+    order: list[int]
+    paths: list[Path]
+
+
+def read_contents(root: Path) -> Contents:
+    """Read the table of contents of the dataset in folder `root`, and the footers of its data files.
+
+    Raises:
+        CorruptDatasetError: something is missing or does not fit; lists what.
+    """
+    needed = (
+        layout.INFO_PATH,
+        layout.STATS_PATH,
+        layout.TASKS_PATH,
+        layout.DATASET_PATH,
+        layout.METADATA_PATH,
+        layout.SUBSETS_PATH,
+    )
+    missing = [path for path in needed if not (root / path).is_file()]
+    if missing:
+        raise CorruptDatasetError(f"{', '.join(missing)} missing")
+    info, description, subsets = (
+        _read_json(root / path) for path in (layout.INFO_PATH, layout.DATASET_PATH, layout.SUBSETS_PATH)
+    )
+    if info.get("codebase_version") != layout.CODEBASE_VERSION:
+        raise CorruptDatasetError(
+            f"the format is {info.get('codebase_version')}, expected {layout.CODEBASE_VERSION}"
+        )
+    columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
+    tables = list(read_blocks(sorted((root / "meta/episodes").glob("*/*.parquet")), _LOCATION))
+    facts = list(read_blocks([root / layout.METADATA_PATH]))
+    if not tables or not facts:
+        raise CorruptDatasetError(f"meta/episodes or {layout.METADATA_PATH} has no rows")
+    metadata = pa.concat_tables(facts).to_pydict()
+    index, lengths, chunks, files, starts = (
+        to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
+    )
+    uids = np.array(metadata.pop("episode_uid"), dtype=np.int64)
+    metadata.pop("length")
+    pattern = info["data_path"]
+    rows: dict[Path, int] = {}
+    for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
+        path = root / pattern.format(chunk_index=chunk, file_index=file)
+        rows[path] = rows.get(path, 0) + length
+    faults = []
+    if len(index) != info["total_episodes"] or (index != np.arange(len(index))).any():
+        faults.append(f"meta/episodes has {len(index)} episodes, expected {info['total_episodes']}")
+    if len(uids) != len(index) or sorted(subsets["uids"]) != sorted(uids.tolist()):
+        faults.append(
+            f"{layout.METADATA_PATH} or {layout.SUBSETS_PATH} lists other episodes than meta/episodes"
+        )
+    if lengths.sum() != info["total_frames"] or (starts != np.cumsum(lengths) - lengths).any():
+        faults.append(f"meta/episodes adds up to {lengths.sum()} frames, expected {info['total_frames']}")
+    faults += file_faults(root, columns, rows)
+    if faults:
+        raise CorruptDatasetError("; ".join(faults))
+    position = {uid: episode for episode, uid in enumerate(uids.tolist())}
+    order = [position[uid] for uid in subsets["uids"]]
+    return Contents(root, info, description, metadata, uids, lengths, starts, order, list(rows))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        raise CorruptDatasetError(f"{path.name} is no JSON object ({error})") from error

@@ -1,0 +1,144 @@
+"""The LeRobot v3.0 format: the constants and rules that lerobot 0.6.1 keeps in code.
+
+They are repeated here because importing lerobot costs seconds and hundreds of megabytes; a test compares
+them with the installed lerobot.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pyarrow as pa
+
+from astra_data.columns import (
+    EPISODE_INDEX,
+    EPISODE_UID,
+    FRAME_INDEX,
+    INDEX,
+    TASK_INDEX,
+    TIMESTAMP,
+    Column,
+)
+
+CODEBASE_VERSION = "v3.0"
+CHUNK_SIZE = 1000
+"""Files per chunk folder."""
+DATA_FILE_SIZE_MB = 100
+VIDEO_FILE_SIZE_MB = 200
+INFO_PATH = "meta/info.json"
+STATS_PATH = "meta/stats.json"
+TASKS_PATH = "meta/tasks.parquet"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+DATASET_PATH = "meta/astra/dataset.json"
+METADATA_PATH = "meta/astra/episodes.parquet"
+SUBSETS_PATH = "meta/astra/subsets.json"
+METADATA_KEYS = ("episode_uid", "length")
+"""First columns of `METADATA_PATH`; the others are the episodes' own metadata."""
+
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
+STORED_STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
+"""In LeRobot's order."""
+
+DEFAULT_COLUMNS = (
+    Column(TIMESTAMP),
+    Column(FRAME_INDEX, "int64"),
+    Column(EPISODE_INDEX, "int64"),
+    Column(INDEX, "int64"),
+    Column(TASK_INDEX, "int64"),
+)
+EPISODE_UID_COLUMN = Column(EPISODE_UID, "int64", meaning="names the episode for good")
+
+_VALUE_TYPES = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
+_ENCODINGS = {"float32": "BYTE_STREAM_SPLIT", "int64": "DELTA_BINARY_PACKED"}
+
+
+def stored_columns(columns: Sequence[Column]) -> list[Column]:
+    """Return all columns of a dataset in the order of the file: the given ones, the uid, LeRobot's own."""
+    return [*columns, EPISODE_UID_COLUMN, *DEFAULT_COLUMNS]
+
+
+def arrow_type(column: Column) -> pa.DataType:
+    """Return the type of one step of `column`: a scalar, or a list of fixed size."""
+    value = _VALUE_TYPES[column.dtype]
+    return value if column.size == 1 else pa.list_(value, column.size)
+
+
+def data_schema(columns: Sequence[Column]) -> pa.Schema:
+    """Return the Arrow schema of the data files, with the metadata that HF datasets reads."""
+    features: dict[str, Any] = {}
+    for column in columns:
+        value = {"dtype": column.dtype, "_type": "Value"}
+        listed = {"feature": value, "length": column.size, "_type": "List"}
+        features[column.name] = value if column.size == 1 else listed
+    metadata = {"huggingface": json.dumps({"info": {"features": features}})}
+    return pa.schema([(column.name, arrow_type(column)) for column in columns], metadata=metadata)
+
+
+def data_encodings(columns: Sequence[Column]) -> dict[str, str]:
+    """Return the parquet encoding of each column by its path in the file: a third smaller than LeRobot's."""
+    return {
+        column.name if column.size == 1 else f"{column.name}.list.element": _ENCODINGS[column.dtype]
+        for column in columns
+        if column.dtype in _ENCODINGS
+    }
+
+
+def episodes_schema(columns: Sequence[Column]) -> pa.Schema:
+    """Return the Arrow schema of meta/episodes."""
+    fields: list[tuple[str, pa.DataType]] = [
+        ("episode_index", pa.int64()),
+        ("tasks", pa.list_(pa.string())),
+        ("length", pa.int64()),
+        ("data/chunk_index", pa.int64()),
+        ("data/file_index", pa.int64()),
+        ("dataset_from_index", pa.int64()),
+        ("dataset_to_index", pa.int64()),
+    ]
+    for column in columns:
+        for name in STORED_STATISTICS:
+            value = pa.int64() if name == "count" else pa.float64()
+            fields.append((f"stats/{column.name}/{name}", pa.list_(value)))
+    fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
+    return pa.schema(fields)
+
+
+def tasks_table(task: str) -> pa.Table:
+    """Return meta/tasks.parquet: a pandas frame with one row, the task as its index."""
+    text = {"pandas_type": "unicode", "numpy_type": "object"}
+    number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", **number},
+            {"name": "task", "field_name": "task", **text, "metadata": None},
+        ],
+        "attributes": {},
+        "pandas_version": "2.3.3",
+    }
+    schema = pa.schema(
+        [("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(pandas)}
+    )
+    return pa.table({"task_index": [0], "task": [task]}, schema=schema)
+
+
+def dataset_info(columns: Sequence[Column], *, fps: int, episodes: int, frames: int) -> Mapping[str, Any]:
+    """Return meta/info.json."""
+    return {
+        "codebase_version": CODEBASE_VERSION,
+        "fps": fps,
+        "features": {column.name: column.feature() for column in columns},
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "chunks_size": CHUNK_SIZE,
+        "data_files_size_in_mb": DATA_FILE_SIZE_MB,
+        "video_files_size_in_mb": VIDEO_FILE_SIZE_MB,
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "robot_type": None,
+        "splits": {"train": f"0:{episodes}"},
+    }

@@ -1,0 +1,128 @@
+"""Paired episodes as tensors: whole episodes side by side, and windows cut from them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from astra_data.columns import (
+    ABSTRACT_NEXT_STATE,
+    ABSTRACT_SIMULATED_NEXT_STATE,
+    ABSTRACT_STATE,
+    ACTION,
+    GOAL,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.errors import BadInputError
+from astra_data.models.grounding import Windows
+from astra_data.seeding import generator
+
+_COLUMNS = (
+    *(STATE, GOAL, ACTION, REWARD, TERMINATED, SUCCESS),
+    *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE),
+)
+
+
+@dataclass(frozen=True)
+class PairedEpisodes:
+    """E paired episodes, padded at the end to T steps.
+
+    Attributes:
+        target_state: s_i, (E, T, S). windows: everything else, (E, T, ...), with the mask of real steps.
+        reference: name and version of the dataset. content_hash: its hash.
+    """
+
+    target_state: Tensor
+    windows: Windows
+    reference: str
+    content_hash: str
+
+    @classmethod
+    def load(cls, root: Path, device: str = "cpu") -> "PairedEpisodes":
+        """Read the paired dataset at `root`.
+
+        Raises:
+            BadInputError: the dataset has not been paired.
+            CorruptDatasetError: it is incomplete.
+        """
+        dataset = Dataset.open(root)
+        if ABSTRACT_STATE not in dataset.features:
+            raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
+        columns = dataset.columns(_COLUMNS)
+        ends = np.cumsum(dataset.lengths)[:-1]
+
+        def padded(values: np.ndarray) -> Tensor:
+            pieces = [torch.from_numpy(piece).float() for piece in np.split(values, ends)]
+            return pad_sequence(pieces, batch_first=True).to(device)
+
+        action = padded(columns[ACTION])
+        return cls(
+            target_state=padded(columns[STATE]),
+            windows=Windows(
+                state=padded(columns[ABSTRACT_STATE]),
+                action=action,
+                previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
+                goal=padded(columns[GOAL]),
+                simulated_next=padded(columns[ABSTRACT_SIMULATED_NEXT_STATE]),
+                next_state=padded(columns[ABSTRACT_NEXT_STATE]),
+                reward=padded(columns[REWARD]),
+                toppled=padded(columns[TERMINATED] & ~columns[SUCCESS]),
+                mask=padded(np.ones(len(columns[ACTION]))),
+            ),
+            reference=dataset.reference,
+            content_hash=dataset.content_hash,
+        )
+
+    def __len__(self) -> int:
+        """Return the number of episodes E."""
+        return len(self.target_state)
+
+    @property
+    def lengths(self) -> Tensor:
+        """The number of real steps of each episode, (E,)."""
+        return self.windows.mask.sum(1).long()
+
+    def select(self, episodes: Tensor) -> "PairedEpisodes":
+        """Return the episodes `episodes` (n,)."""
+        return PairedEpisodes(
+            self.target_state[episodes], _gather(self.windows, episodes), self.reference, self.content_hash
+        )
+
+    def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
+        """Split by episodes into training and held-out ones, at random."""
+        order = torch.from_numpy(generator(seed, "held-out episodes").permutation(len(self)))
+        order = order.to(self.target_state.device)
+        count = max(1, round(held_out_share * len(self)))
+        return self.select(order[count:]), self.select(order[:count])
+
+    def steps(self, values: Tensor) -> Tensor:
+        """Return the real steps of `values` (E, T, ...), one after another, (N, ...)."""
+        return values[self.windows.mask.bool()]
+
+    def draw_windows(self, count: int, length: int) -> tuple[Windows, Tensor]:
+        """Draw windows of `length` steps, each step of the data equally likely; from torch's global generator.
+
+        Returns:
+            the windows (count, length, ...), and the target states in them (count, length, S).
+        """
+        length = min(length, self.windows.mask.shape[1])
+        lengths = self.lengths
+        episodes = torch.multinomial(lengths.float(), count, replacement=True)
+        # A window may begin before its episode's first full window ends: the first steps count as well.
+        latest = (lengths[episodes] - length).clamp_min(0)
+        first = (torch.rand(count, device=latest.device) * (latest + length // 2 + 1)).long() - length // 2
+        first = torch.minimum(first.clamp_min(0), latest)
+        steps = first[:, None] + torch.arange(length, device=first.device)
+        rows = (episodes[:, None], steps)
+        return _gather(self.windows, rows), self.target_state[rows]
+
+
+def _gather(windows: Windows, rows: Tensor | tuple[Tensor, Tensor]) -> Windows:
+    return Windows(**{name: values[rows] for name, values in vars(windows).items()})

@@ -1,0 +1,125 @@
+"""Parquet files: numpy columns in and out, and a writer that starts a new file when one is full."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from astra_data.columns import Array
+from astra_data.dataset.format import CHUNK_SIZE, DATA_FILE_SIZE_MB
+from astra_data.errors import CorruptDatasetError
+
+FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
+BLOCK_ROWS = 2**16
+"""Rows that are read at once, rounded up to whole row groups."""
+
+
+def to_arrow(values: Array, kind: pa.DataType) -> pa.Array:
+    """Return `values` (T,) or (T, size) as an Arrow array of type `kind`; only bools are copied."""
+    if values.ndim == 1:
+        return pa.array(values, kind)
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1), kind.value_type), values.shape[1])
+
+
+def to_lists(values: Array) -> pa.ListArray:
+    """Return the rows of `values` (n, size) as n lists."""
+    offsets = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
+    return pa.ListArray.from_arrays(offsets, np.ascontiguousarray(values).reshape(-1))
+
+
+def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
+    """Copy an Arrow column of n rows to a contiguous array (n,) or, if `size` > 1, (n, size).
+
+    Raises:
+        CorruptDatasetError: rows are missing values.
+    """
+    parts = [chunk.flatten() if size > 1 else chunk for chunk in column.chunks]
+    if any(part.null_count for part in parts) or sum(map(len, parts)) != len(column) * size:
+        raise CorruptDatasetError(f"expected {size} values in every row, some are missing")
+    # Through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no bits.
+    bits = dtype == "bool"
+    values = [np.from_dlpack(part.cast(pa.uint8()) if bits else part) for part in parts]
+    flat: Array = np.concatenate(values).astype(dtype, copy=False)
+    return flat if size == 1 else flat.reshape(-1, size)
+
+
+def read_blocks(paths: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[pa.Table]:
+    """Yield columns of all files in order, in blocks of whole row groups, so that memory stays bounded.
+
+    Raises:
+        CorruptDatasetError: a file cannot be read.
+    """
+    for path in paths:
+        try:
+            with pq.ParquetFile(path) as file:
+                groups: list[int] = []
+                rows = 0
+                for group in range(file.num_row_groups):
+                    groups.append(group)
+                    rows += file.metadata.row_group(group).num_rows
+                    if rows >= BLOCK_ROWS or group == file.num_row_groups - 1:
+                        yield file.read_row_groups(groups, columns=names, use_threads=False)
+                        groups, rows = [], 0
+        except (OSError, pa.ArrowException) as error:
+            name = f"{path.parent.name}/{path.name}"
+            raise CorruptDatasetError(f"{name} cannot be read ({first_line(error)})") from error
+
+
+def first_line(error: Exception) -> str:
+    """Return the first sentence of an error message."""
+    return str(error).split("\n")[0].split(". ")[0].rstrip(".")
+
+
+class RotatingWriter:
+    """Writes tables as row groups, and starts the next file once one has reached `FILE_SIZE_LIMIT`.
+
+    Attributes:
+        chunk_index: chunk of the current file.
+        file_index: its number within the chunk.
+    """
+
+    def __init__(
+        self, root: Path, pattern: str, schema: pa.Schema, encodings: Mapping[str, str] | None = None
+    ) -> None:
+        """Start the first file; `pattern` names the files, `encodings` those of their columns."""
+        self.chunk_index = 0
+        self.file_index = 0
+        self._root = root
+        self._pattern = pattern
+        self._schema = schema
+        self._encodings = encodings
+        self._open()
+
+    def _open(self) -> None:
+        name = self._pattern.format(chunk_index=self.chunk_index, file_index=self.file_index)
+        path = self._root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("wb")
+        self._writer = pq.ParquetWriter(
+            self._file,
+            self._schema,
+            compression="snappy",
+            use_dictionary=self._encodings is None,
+            column_encoding=self._encodings,
+        )
+
+    def locate(self) -> tuple[int, int]:
+        """Return (chunk_index, file_index) of where the next row group goes."""
+        if self._file.tell() >= FILE_SIZE_LIMIT:
+            self.close()
+            self.file_index += 1
+            if self.file_index == CHUNK_SIZE:
+                self.chunk_index, self.file_index = self.chunk_index + 1, 0
+            self._open()
+        return self.chunk_index, self.file_index
+
+    def write(self, table: pa.Table) -> None:
+        """Append `table` as one row group; call `locate` first."""
+        self._writer.write_table(table, row_group_size=table.num_rows)
+
+    def close(self) -> None:
+        """Write the footer."""
+        self._writer.close()
+        self._file.close()

@@ -1,0 +1,153 @@
+"""Read a dataset: whole columns as contiguous arrays, or one episode after the other."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.columns import RESERVED, Array, Column, Episode
+from astra_data.dataset.contents import Contents, read_contents
+from astra_data.dataset.parquet import read_blocks, to_numpy
+from astra_data.dataset.validate import content_faults
+from astra_data.errors import BadInputError, CorruptDatasetError
+
+
+class Dataset(Contents):
+    """A finished dataset of E episodes and N steps; make one with `Dataset.open`."""
+
+    @classmethod
+    def open(cls, root: Path) -> "Dataset":
+        """Open the dataset in folder `root`.
+
+        Raises:
+            BadInputError: there is no dataset.
+            CorruptDatasetError: it is incomplete or was altered; lists what is wrong.
+        """
+        if not root.is_dir():
+            raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
+        with _explained(root):
+            return cls(**vars(read_contents(root)))
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """LeRobot's features: dtype, shape, names, and our units, frames and roles under "astra"."""
+        return dict(self.info["features"])
+
+    @property
+    def schema(self) -> list[Column]:
+        """The columns that were handed to the writer."""
+        return self._specs([name for name in self.features if name not in RESERVED])
+
+    @property
+    def reference(self) -> str:
+        """Name and version, such as "antmaze-long-random@data-1.0.0"."""
+        return f"{self.description['name']}@data-{self.description['version']}"
+
+    @property
+    def content_hash(self) -> str:
+        """The sha256 over the values of all columns."""
+        return str(self.description["content_hash"])
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What a dataset that is made from this one lists among its parents."""
+        return {
+            "name": self.description["name"],
+            "version": self.description["version"],
+            "hash": self.content_hash,
+        }
+
+    def __len__(self) -> int:
+        """Return the number of episodes E."""
+        return len(self.lengths)
+
+    def __repr__(self) -> str:
+        """Show name, version, size and columns."""
+        columns = ", ".join(f"{c.name} ({c.size}) {c.dtype}" for c in self.schema)
+        return f"Dataset({self.reference}, {len(self)} episodes, {self.lengths.sum()} steps, {columns})"
+
+    def columns(self, names: Sequence[str]) -> dict[str, Array]:
+        """Return whole columns by name, contiguous (N, size), or (N,) where there is one value per step.
+
+        Raises:
+            BadInputError: a column does not exist.
+            CorruptDatasetError: a file cannot be read.
+        """
+        specs = self._specs(names)
+        rows = int(self.lengths.sum())
+        out = {c.name: np.empty((rows, c.size) if c.size > 1 else rows, c.dtype) for c in specs}
+        row = 0
+        with _explained(self.root):
+            for table in read_blocks(self.paths, names):
+                for c in specs:
+                    out[c.name][row : row + len(table)] = to_numpy(table.column(c.name), c.size, c.dtype)
+                row += len(table)
+        return out
+
+    def episodes(self, names: Sequence[str] | None = None) -> Iterator[Episode]:
+        """Yield all episodes in order with the columns `names`, by default all; memory stays bounded."""
+        specs = self.schema if names is None else self._specs(names)
+        rest: dict[str, Array] = {}
+        episode = 0
+        with _explained(self.root):
+            for table in read_blocks(self.paths, [c.name for c in specs]):
+                block = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in specs}
+                rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
+                first, rows = 0, len(next(iter(rest.values())))
+                while episode < len(self) and (last := first + int(self.lengths[episode])) <= rows:
+                    metadata = {key: values[episode] for key, values in self.metadata.items()}
+                    yield Episode(
+                        int(self.uids[episode]),
+                        {name: values[first:last] for name, values in rest.items()},
+                        {key: value for key, value in metadata.items() if value is not None},
+                    )
+                    first, episode = last, episode + 1
+                rest = {name: values[first:] for name, values in rest.items()} if first < rows else {}
+
+    def subset(self, count: int) -> list[int]:
+        """Return `count` episode indices; smaller subsets are prefixes of larger ones.
+
+        Raises:
+            BadInputError: there are not that many episodes.
+        """
+        if not 1 <= count <= len(self):
+            raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
+        return self.order[:count]
+
+    def verify(self) -> list[str]:
+        """Read every value again; return what is wrong, empty if nothing is."""
+        columns = self._specs(list(self.features))
+        try:
+            return list(
+                content_faults(
+                    self.paths,
+                    columns,
+                    fps=self.info["fps"],
+                    starts=self.starts,
+                    uids=self.uids,
+                    content_hash=self.content_hash,
+                )
+            )
+        except CorruptDatasetError as error:
+            return [str(error)]
+
+    def _specs(self, names: Sequence[str]) -> list[Column]:
+        unknown = [name for name in names if name not in self.features]
+        if unknown:
+            known = ", ".join(self.features)
+            raise BadInputError(f"{self.reference} has no column {', '.join(unknown)}; it has {known}.")
+        return [Column.from_feature(name, self.features[name]) for name in names]
+
+
+@contextmanager
+def _explained(root: Path) -> Iterator[None]:
+    try:
+        yield
+    except (CorruptDatasetError, KeyError) as error:
+        fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
+        raise CorruptDatasetError(
+            f"{root} is incomplete or was altered: {fault}. "
+            "Restore it from a copy, or delete the folder and run the stage that wrote it again."
+        ) from error

@@ -1,0 +1,175 @@
+"""Write a dataset: episodes stream into a hidden folder, which becomes the dataset when all is well."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from astra_data import columns as names
+from astra_data.columns import Array, Column, Episode, Scalar
+from astra_data.dataset import format as layout
+from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.episode_rows import EpisodeRows
+from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
+from astra_data.dataset.provenance import ContentHash, complete_description, permutation
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.statistics import global_statistics, statistics
+from astra_data.errors import BadInputError, CorruptDatasetError
+
+_METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+
+
+class DatasetWriter:
+    """Writes one dataset, all of it or nothing.
+
+        with DatasetWriter(root, columns, fps=20, task="reach the goal", description=...) as writer:
+            writer.add(episode)
+
+    Leaving the block validates and commits; an exception or a kill at any moment leaves `root` absent.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        columns: Sequence[Column],
+        *,
+        fps: int,
+        task: str,
+        description: Mapping[str, Any],
+        subset_seed: int = 0,
+    ) -> None:
+        """Prepare to write; entering the block starts.
+
+        Args:
+            root: the dataset's folder; must not exist yet.
+            columns: what every episode holds, without `columns.RESERVED`.
+            fps: steps per second.
+            task: what the episodes do, a sentence or a name.
+            description: see `complete_description`.
+            subset_seed: of the permutation whose prefixes are the nested subsets.
+
+        Raises:
+            BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
+        """
+        given = [column.name for column in columns]
+        faults = [f"column {name} is given twice" for name in sorted(set(given)) if given.count(name) > 1]
+        faults += [f"column {name} is the writer's, leave it out" for name in given if name in names.RESERVED]
+        if not given:
+            faults.append("no columns")
+        if type(fps) is not int or fps < 1:
+            faults.append(f"fps {fps!r}, expected a positive int")
+        if faults:
+            raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
+        self.root = root
+        self._columns = {column.name: column for column in columns}
+        self._stored = layout.stored_columns(columns)
+        self._schema = layout.data_schema(self._stored)
+        self._fps = fps
+        self._task = task
+        self._description = complete_description(description)
+        self._subset_seed = subset_seed
+        self._hash = ContentHash()
+        self._frames = 0
+        self._lengths: dict[int, int] = {}
+        self._metadata: list[Mapping[str, Scalar]] = []
+        self._metadata_types: dict[str, type] = {}
+        self._exit = ExitStack()
+
+    def __enter__(self) -> "DatasetWriter":
+        """Start the hidden folder."""
+        self._folder = self._exit.enter_context(atomic_folder(self.root))
+        encodings = layout.data_encodings(self._stored)
+        self._data = RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings)
+        self._rows = EpisodeRows(self._folder, self._stored, self._task)
+        self._exit.push(self._finish)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Commit, or remove every trace."""
+        self._exit.__exit__(kind, error, trace)
+
+    def add(self, episode: Episode) -> None:
+        """Append `episode`; one that is refused leaves the dataset as it was."""
+        faults = self._faults(episode)
+        if faults:
+            raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
+        length = len(episode)
+        frames = np.arange(length)
+        values = {name: episode.columns[name] for name in self._columns} | {
+            names.EPISODE_UID: np.full(length, episode.uid),
+            names.TIMESTAMP: (frames / self._fps).astype(np.float32),
+            names.FRAME_INDEX: frames,
+            names.EPISODE_INDEX: np.full(length, len(self._lengths)),
+            names.INDEX: frames + self._frames,
+            names.TASK_INDEX: np.zeros_like(frames),
+        }
+        chunk, file = self._data.locate()
+        arrays = [to_arrow(values[field.name], field.type) for field in self._schema]
+        self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+        for name, array in values.items():
+            self._hash.update(name, array)
+        flat = [array.reshape(length, -1) for array in values.values()]
+        self._rows.append(length, chunk, file, statistics(np.concatenate(flat, axis=1, dtype=np.float64)))
+        self._frames += length
+        self._lengths[episode.uid] = length
+        self._metadata.append(episode.metadata)
+        self._metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
+
+    def _faults(self, episode: Episode) -> list[str]:
+        faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
+        for name, values in episode.columns.items():
+            column = self._columns.get(name)
+            faults += column.faults(values) if column else [f"{name}: unknown column"]
+        for key, value in episode.metadata.items():
+            found, known = type(value), self._metadata_types.get(key, type(value))
+            if found is not known:
+                faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
+            if key in layout.METADATA_KEYS:
+                faults.append(f"metadata {key}: is the writer's, leave it out")
+        if episode.uid in self._lengths:
+            faults.append("an earlier episode has the same uid")
+        return faults
+
+    def _finish(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the data files and, if nothing went wrong, write all other files and validate."""
+        self._data.close()
+        self._rows.close()
+        if error is not None:
+            return
+        if not self._lengths:
+            raise BadInputError(f"{self.root}: no episodes were added; a dataset needs one at least.")
+        episodes, uids = len(self._lengths), list(self._lengths)
+        info = layout.dataset_info(self._stored, fps=self._fps, episodes=episodes, frames=self._frames)
+        order = permutation(uids, self._subset_seed)
+        self._write_json(layout.INFO_PATH, info)
+        self._write_json(layout.STATS_PATH, global_statistics(self._stored, self._frames, self._blocks))
+        self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
+        self._write_json(layout.DATASET_PATH, self._description | {"content_hash": self._hash.hexdigest()})
+        pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
+        metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}
+        for key, kind_ in sorted(self._metadata_types.items()):
+            metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
+        pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
+        faults = Dataset.open(self._folder).verify()
+        if faults:
+            raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")
+
+    def _blocks(self, name: str) -> Iterator[Array]:
+        column = next(column for column in self._stored if column.name == name)
+        for table in read_blocks(sorted(self._folder.glob("data/*/*.parquet")), [name]):
+            yield to_numpy(table.column(name), column.size, column.dtype)
+
+    def _write_json(self, path: str, content: Mapping[str, Any]) -> None:
+        target = self._folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(json.dumps(content, indent=4, ensure_ascii=False), encoding="utf-8")

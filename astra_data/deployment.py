@@ -1,0 +1,54 @@
+"""Run a policy in worlds: step by step, deterministically, with its encoders and memory carried along."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from astra_data.models.actor_critic import ActorCritic
+from astra_data.models.alignment import TargetEncoder
+from astra_data.models.grounding import GroundingModel
+from astra_data.tasks import Task
+from astra_data.world import policy_observation
+
+EncoderKind = Literal["target", "source"]
+
+
+@dataclass
+class DeployedPolicy:
+    """A policy at work on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them.
+
+    Attributes:
+        task: what to do. policy: the networks. model: the grounding, whose encoder is ψ^s.
+        target_encoder: ψ^t; where it is None, ψ^s is used.
+    """
+
+    task: Task
+    policy: ActorCritic
+    model: GroundingModel | None = None
+    target_encoder: TargetEncoder | None = None
+
+    def start(self, count: int) -> None:
+        """Forget everything; B = `count`."""
+        self._previous_action = torch.zeros(count, self.policy.shape.action_size)
+        self._hidden = self.policy.initial_hidden(count)
+        latent_size = self.model.shape.latent_size if self.model is not None else 0
+        self._encoder_hidden = torch.zeros(count, latent_size)
+
+    @torch.no_grad()
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        abstract = self.task.abstraction(state)
+        latent = None
+        if self.model is not None:
+            encoder: TargetEncoder | GroundingModel = self.target_encoder or self.model
+            seen = state if self.target_encoder is not None else abstract
+            inputs = encoder.encoder_input(seen, goal, self._previous_action)
+            self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
+            latent = encoder.encoder.latent(self._encoder_hidden)
+        observation = policy_observation(self.task.maze, abstract, goal, latent)
+        features, self._hidden = self.policy.remember(observation, self._previous_action, self._hidden)
+        mean, _ = self.policy.policy(features)
+        self._previous_action = mean
+        return mean

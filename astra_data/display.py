@@ -1,0 +1,84 @@
+"""What a run shows: a live line per running item in a terminal, plain lines elsewhere."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from astra_data.schedule import Watcher
+
+SECONDS_OF_SPEED = 600
+"""How far back the estimate of the remaining time looks."""
+
+
+@contextmanager
+def display(total: int, console: Console) -> Iterator[Watcher]:
+    """Show `total` items getting on, as it suits `console`."""
+    if not console.is_terminal:
+        yield PlainDisplay(total, console)
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
+    with Progress(*columns, console=console, speed_estimate_period=SECONDS_OF_SPEED) as progress:
+        yield LiveDisplay(total, progress)
+
+
+class PlainDisplay:
+    """One line per start, tenth and finish of an item."""
+
+    def __init__(self, total: int, console: Console) -> None:
+        self._total, self._console = total, console
+        self._finished = 0
+        self._tenths: dict[str, int] = {}
+
+    def started(self, key: str) -> None:
+        """Print that an item has begun."""
+        self._tenths[key] = 0
+        self._print(f"{key}  started")
+
+    def progressed(self, key: str, fraction: float, note: str) -> None:
+        """Print the note when another tenth is done."""
+        tenths = int(10 * fraction)
+        if tenths > self._tenths[key]:
+            self._tenths[key] = tenths
+            self._print(f"{key}  {10 * tenths} %  {note}")
+
+    def finished(self, key: str, seconds: float) -> None:
+        """Print how long the item took."""
+        self._finished += 1
+        self._print(f"{key}  finished in {seconds:.1f} s  ({self._finished} of {self._total})")
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+class LiveDisplay:
+    """One moving line per running item; finished ones become lines above."""
+
+    def __init__(self, total: int, progress: Progress) -> None:
+        self._total, self._progress = total, progress
+        self._finished = 0
+        self._whole = progress.add_task(f"0 of {total} finished", total=total, note="")
+        self._tasks: dict[str, TaskID] = {}
+
+    def started(self, key: str) -> None:
+        """Add the item's line."""
+        self._tasks[key] = self._progress.add_task(key, total=1.0, note="starting")
+
+    def progressed(self, key: str, fraction: float, note: str) -> None:
+        """Move the item's line on."""
+        self._progress.update(self._tasks[key], completed=fraction, note=note)
+
+    def finished(self, key: str, seconds: float) -> None:
+        """Replace the item's line by a finished one."""
+        self._progress.remove_task(self._tasks.pop(key))
+        self._finished += 1
+        text = f"{self._finished} of {self._total} finished"
+        self._progress.update(self._whole, completed=self._finished, description=text)
+        self._progress.console.print(f"{key}  finished in {seconds:.1f} s", markup=False, highlight=False)

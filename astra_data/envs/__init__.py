@@ -1,0 +1,1 @@
+"""Target environments: batched, and registered with Gymnasium."""

@@ -1,0 +1,135 @@
+"""AntMaze: Gymnasium's ant in a maze, driven by planar velocity commands through its low-level controller."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.ant import (
+    CONTROL_SUBSTEPS,
+    POSITIONS,
+    STATE_SIZE,
+    TOPPLE_COSINE,
+    TORSO_HEIGHT_M,
+    VelocityController,
+    ant_model,
+    up_cosine,
+    wall_geoms,
+)
+from astra_data.batched import Step
+from astra_data.navigation import Navigation
+from astra_data.physics import BatchedPhysics, Floats
+
+_REACH_M = 1.6
+"""No part of the standard ant is farther than this from its torso's centre."""
+
+
+class AntMazeEnv:
+    """B ants in a maze; action: world-frame velocity command in m/s, (B, 2), clipped to ±1 per axis.
+
+    State (B, 29): qpos (15) then qvel (14), as in Gymnasium. Observation (B, 31): state, then goal (2).
+    Reaching the goal and toppling end an episode; touching a wall is recorded, not punished.
+
+    Attributes:
+        state: (B, 29) float32. goal: (B, 2) float32. toppled, wall_contact: (B,) bool, of the last step.
+    """
+
+    observation_size = STATE_SIZE + 2
+    action_size = 2
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        num_envs: int,
+        *,
+        seed: int,
+        leg_scale: float = 1.0,
+        start_anywhere: bool = False,
+        controller: VelocityController | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        """Build B ants.
+
+        Args:
+            navigation: maze, goal and reward.
+            num_envs: B.
+            seed: of starts, goals and headings.
+            leg_scale: factor on the legs' length.
+            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
+            controller: the low-level controller, by default the one shipped.
+            num_threads: physics threads, by default one per core.
+        """
+        self.navigation = navigation
+        self.num_envs = num_envs
+        self.leg_scale = leg_scale
+        self.start_anywhere = start_anywhere
+        self.controller = controller or VelocityController.load()
+        model = ant_model(navigation.maze, leg_scale=leg_scale)
+        self.physics = BatchedPhysics(model, num_envs, substeps=CONTROL_SUBSTEPS, num_threads=num_threads)
+        self.goal = torch.zeros(num_envs, 2)
+        self.toppled = torch.zeros(num_envs, dtype=torch.bool)
+        self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
+        walls = wall_geoms(model)
+        assert walls is not None
+        self._walls = walls
+        self._rng = np.random.default_rng(seed)
+
+    @property
+    def state(self) -> Tensor:
+        """The full target states, (B, 29) float32."""
+        return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Stand the ants in `mask` (B,) up at new starts with random headings, by default all."""
+        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
+        count = len(rows)
+        navigation = self.navigation
+        draw = navigation.draw_anywhere if self.start_anywhere else navigation.draw_starts
+        qpos = standing_pose(count)
+        qpos[:, :2] = draw(self._rng, count)
+        yaw = self._rng.uniform(-np.pi, np.pi, count)
+        qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+        self.goal[rows] = torch.from_numpy(navigation.draw_goals(self._rng, count)).float()
+        self.reset_to(rows, np.concatenate([qpos, np.zeros((count, STATE_SIZE - POSITIONS))], axis=1))
+        return self._observe()
+
+    def reset_to(self, rows: np.ndarray, state: Floats) -> None:
+        """Set the ants `rows` (n,) to `state` (n, 29)."""
+        self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
+        self.toppled[rows] = False
+        self.wall_contact[rows] = False
+
+    def step(self, action: Tensor, active: Tensor | None = None) -> Step:
+        """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stand frozen."""
+        command = action.clamp(-1.0, 1.0).numpy().astype(np.float64)
+        before = torch.from_numpy(self.physics.qpos[:, :2]).float()
+        torques = self.controller(self.physics.qpos, self.physics.qvel, command)
+        self.physics.step(torques, None if active is None else active.numpy())
+        after = torch.from_numpy(self.physics.qpos[:, :2]).float()
+        self.toppled = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
+        self._find_wall_contacts()
+        success = self.navigation.reached(after, self.goal)
+        return Step(
+            observation=self._observe(),
+            reward=self.navigation.reward(before, after, self.goal, self.toppled),
+            terminated=success | self.toppled,
+            success=success,
+        )
+
+    def _find_wall_contacts(self) -> None:
+        clearance = self.navigation.maze.clearance(self.physics.qpos[:, :2])
+        near = np.flatnonzero(clearance < _REACH_M * self.leg_scale)
+        contact = np.zeros(self.num_envs, dtype=bool)
+        contact[near] = self.physics.touches(near, *self._walls)
+        self.wall_contact = torch.from_numpy(contact)
+
+    def _observe(self) -> Tensor:
+        return torch.cat([self.state, self.goal], dim=-1)
+
+
+def standing_pose(count: int) -> Floats:
+    """Return `count` upright poses (count, 15) at the origin, legs within their joint limits."""
+    qpos = np.zeros((count, POSITIONS))
+    qpos[:, 2] = TORSO_HEIGHT_M
+    qpos[:, 3] = 1.0
+    qpos[:, 7:] = np.array([0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
+    return qpos

@@ -1,0 +1,28 @@
+"""The report's figures: pure functions from arrays to a matplotlib Figure, in one style.
+
+style         colours, titles and roles of the methods; fonts and lines
+scores        success_bars, learning_curves
+motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
+open_loop     open_loop_error: how fast a simulator drifts from the target
+"""
+
+from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
+from astra_data.figures.open_loop import OpenLoop, open_loop_error
+from astra_data.figures.scores import Curve, learning_curves, success_bars
+from astra_data.figures.style import PLUS, ROLES, method_colour, method_title, png
+
+__all__ = [
+    "PLUS",
+    "ROLES",
+    "Curve",
+    "OpenLoop",
+    "Panel",
+    "dynamics_mismatch",
+    "learning_curves",
+    "method_colour",
+    "method_title",
+    "open_loop_error",
+    "png",
+    "success_bars",
+    "trajectories",
+]

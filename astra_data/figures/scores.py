@@ -1,0 +1,139 @@
+"""Success of each row: at the end, and while it learns."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from astra_data.figures.style import FAINT, INK, ROLES, is_plus, method_colour, method_title, style
+
+Floats = NDArray[np.float64]
+
+CURVE_POINTS = 200
+"""Points at which curves of different seeds are brought together."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One seed's training.
+
+    Attributes:
+        steps: simulator steps so far, (K,), increasing.
+        success: success rate, (K,); NaN where no episode had ended.
+    """
+
+    steps: Floats
+    success: Floats
+
+
+def success_bars(
+    scores: Mapping[str, Floats],
+    intervals: Mapping[str, tuple[float, float, float]],
+    simulated: Mapping[str, float],
+) -> Figure:
+    """Draw one bar per row, with a dot per seed.
+
+    Args:
+        scores: success of each row's seeds, (seeds,), in [0, 1].
+        intervals: (interquartile mean, low, high) of each row; low and high are NaN for a single seed.
+        simulated: mean success of a row in the simulator it was trained in, where there is one.
+    """
+    with style():
+        figure = Figure(figsize=(max(6.4, 1.0 + 1.0 * len(scores)), 3.7), layout="constrained")
+        axes = figure.add_subplot()
+        for place, (method, seeds) in enumerate(scores.items()):
+            _bar(axes, place, method, seeds, intervals[method])
+            if method in simulated:
+                axes.plot(place, simulated[method], "D", mfc="white", mec=INK, mew=1.1, ms=5, zorder=5)
+        axes.set_xticks(range(len(scores)), [_tick_label(method) for method in scores])
+        axes.tick_params(axis="x", length=0, pad=19)
+        axes.set_xlim(-0.6, len(scores) - 0.4)
+        axes.set_ylim(0, 1.04)
+        axes.set_yticks(np.linspace(0, 1, 6))
+        axes.set_ylabel("success rate in the target")
+        handles = [
+            Patch(fc=FAINT, ec="none", label="interquartile mean over seeds"),
+            Line2D([], [], color=INK, lw=1.6, label="95 % interval"),
+            Line2D([], [], marker="o", ls="", mfc="white", mec=INK, mew=0.9, ms=4.5, label="one seed"),
+        ]
+        if simulated:
+            handles.append(
+                Line2D([], [], marker="D", ls="", mfc="white", mec=INK, ms=5, label="in its own simulator")
+            )
+        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
+        return figure
+
+
+def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
+    """Draw success in the training simulator over steps: mean over seeds, band from the worst to the best.
+
+    Args:
+        curves: each row's seeds, at least one.
+    """
+    with style():
+        figure = Figure(figsize=(6.6, 3.7), layout="constrained")
+        axes = figure.add_subplot()
+        for method, seeds in curves.items():
+            steps, success = _on_one_grid(seeds)
+            colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
+            if len(seeds) > 1:
+                low, high = success.min(axis=0), success.max(axis=0)
+                axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
+            axes.plot(steps, success.mean(axis=0), dashes, color=colour, label=method_title(method))
+        axes.set_ylim(-0.02, 1.02)
+        axes.set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
+        axes.set_xlabel("simulator steps")
+        axes.set_ylabel("success rate in the simulator")
+        axes.xaxis.set_major_formatter(_steps_label)
+        figure.legend(loc="outside right center", handlelength=2.4)
+        return figure
+
+
+def _bar(axes: Axes, place: int, method: str, seeds: Floats, interval: tuple[float, float, float]) -> None:
+    iqm, low, high = interval
+    hatch = "////" if is_plus(method) else None
+    axes.bar(
+        place, iqm, width=0.64, color=method_colour(method), ec=(1, 1, 1, 0.4), lw=0, hatch=hatch, zorder=2
+    )
+    if np.isfinite(low):
+        axes.plot([place, place], [low, high], color=INK, lw=1.6, zorder=3)
+    spread = np.linspace(-0.2, 0.2, len(seeds)) if len(seeds) > 1 else np.zeros(1)
+    axes.plot(place + spread, seeds, "o", mfc="white", mec=INK, mew=0.9, ms=4.5, zorder=4)
+    # Under the axis, where neither dots nor diamonds can cover the number.
+    axes.annotate(
+        f"{iqm:.2f}",
+        (place, 0),
+        xytext=(0, -5),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontweight="bold",
+        fontsize=9.5,
+        annotation_clip=False,
+    )
+
+
+def _tick_label(method: str) -> str:
+    label = method_title(method).replace(" ", "\n", 1)
+    return f"{label}\n({ROLES[method]})" if method in ROLES else label
+
+
+def _on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:
+    """Return steps (K,) that all seeds cover, and their success there, (seeds, K)."""
+    known = [np.isfinite(seed.success) for seed in seeds]
+    parts = [(seed.steps[keep], seed.success[keep]) for seed, keep in zip(seeds, known, strict=True)]
+    first, last = max(steps[0] for steps, _ in parts), min(steps[-1] for steps, _ in parts)
+    grid = np.linspace(first, last, CURVE_POINTS)
+    return grid, np.stack([np.interp(grid, steps, success) for steps, success in parts])
+
+
+def _steps_label(steps: float, _: float) -> str:
+    for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(steps) >= size:
+            return f"{steps / size:g} {unit}"
+    return f"{steps:g}"

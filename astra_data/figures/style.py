@@ -1,0 +1,123 @@
+"""One look for all figures: each method has one colour and one title wherever it appears."""
+
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.style import context
+
+PLUS = "_plus"
+"""Ending of a row that is a variant of the row before it."""
+
+TITLES = {
+    "direct_transfer": "Direct transfer",
+    "domain_randomization": "Domain randomization",
+    "compass": "COMPASS",
+    "rma": "RMA",
+    "nas": "NAS",
+    "astra": "ASTRA",
+    "iql": "IQL",
+    "target": "Target",
+    "follower": "Careful follower",
+}
+
+COLOURS = {
+    "direct_transfer": "#E69F00",
+    "domain_randomization": "#CC79A7",
+    "compass": "#F0E442",
+    "rma": "#A6761D",
+    "nas": "#56B4E9",
+    "astra": "#009E73",
+    "iql": "#D55E00",
+    "target": "#4D4D4D",
+    "follower": "#9A9A9A",
+}
+"""Okabe and Ito's palette, which colour-blind readers can tell apart."""
+
+SPARE_COLOURS = ("#882255", "#44AA99", "#999933", "#AA4499", "#332288", "#661100")
+"""For methods without a colour of their own."""
+
+ROLES = {"direct_transfer": "floor", "follower": "ceiling"}
+"""Rows that bound the others: no grounding at all; a controller that never was in a simulator."""
+
+SIMULATED = "#E07B00"
+"""The simulator that a policy was trained in (the paper's Fig. 3)."""
+
+DEPLOYED = "#0060A8"
+"""The target environment (the paper's Fig. 3)."""
+
+INK = "#2B2B2B"
+FAINT = "#8A8A8A"
+WALL = "#D9D9D6"
+
+_RC = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "axes.labelsize": 9.0,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "#E8E8E6",
+    "grid.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.8,
+    "lines.solid_capstyle": "round",
+    "hatch.linewidth": 0.9,
+    "figure.facecolor": "white",
+    "figure.dpi": 200,
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw in the figures' style, whatever the caller's matplotlib settings are."""
+    with context(_RC, after_reset=True):
+        yield
+
+
+def is_plus(method: str) -> bool:
+    """Tell whether a row is the variant of another row."""
+    return method.endswith(PLUS)
+
+
+def method_title(method: str) -> str:
+    """Return the title of a row: "astra_plus" is "ASTRA+"."""
+    base = method.removesuffix(PLUS)
+    title = TITLES.get(base, base.replace("_", " ").capitalize())
+    return f"{title}+" if is_plus(method) else title
+
+
+def method_colour(method: str) -> str:
+    """Return the colour of a row as "#rrggbb": a variant's is its base row's, darker."""
+    base = method.removesuffix(PLUS)
+    spare = SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
+    colour = COLOURS.get(base, spare)
+    if is_plus(method):
+        red, green, blue = to_rgb(colour)
+        return to_hex((0.68 * red, 0.68 * green, 0.68 * blue))
+    return colour.lower()
+
+
+def png(figure: Figure) -> bytes:
+    """Render a figure as PNG, without a display."""
+    buffer = BytesIO()
+    with style():
+        figure.savefig(buffer, format="png")
+    return buffer.getvalue()

@@ -1,0 +1,1 @@
+"""Policy optimisation on any batched environment, with TorchRL's losses."""

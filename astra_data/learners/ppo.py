@@ -1,0 +1,233 @@
+"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
+
+One iteration collects a stretch of steps from every environment and makes a few passes over it. Whole
+stretches are kept together, so the same code trains policies with and without memory. Every iteration
+seeds torch from (seed, iteration): a run that resumes from a checkpoint repeats what an uninterrupted run
+would have done.
+"""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
+from astra_data.batched import BatchedEnv
+from astra_data.models.actor_critic import ActorCritic
+from astra_data.recipe import Config
+from astra_data.seeding import derive
+
+
+class PpoConfig(Config):
+    """Settings of proximal policy optimisation."""
+
+    total_steps: int = 4_000_000
+    rollout_steps: int = 64
+    """Steps of every environment per iteration."""
+    epochs: int = 5
+    minibatches: int = 4
+    learning_rate: float = 5e-4
+    """At the start; falls linearly to zero."""
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    entropy_weight: float = 0.003
+    value_weight: float = 0.5
+    gradient_norm: float = 0.5
+    reward_scale: float = 0.1
+
+
+class Ppo:
+    """A training in progress.
+
+    Attributes:
+        policy: the networks being trained. steps: environment steps done.
+    """
+
+    def __init__(
+        self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
+    ) -> None:
+        """Prepare to train `policy` in `env`.
+
+        Args:
+            env: the world. policy: the networks. config: settings.
+            horizon: rows are restarted after so many steps, without ending the task.
+            seed: of all randomness.
+        """
+        self.env, self.policy, self.config = env, policy, config
+        self.horizon, self.seed = horizon, seed
+        self.steps = 0
+        self._iteration = 0
+        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
+        self._loss = _ppo_loss(policy, config)
+        torch.manual_seed(derive(seed, "first reset"))
+        self._observation = env.reset()
+        device = self._observation.device
+        self._previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
+        self._hidden = policy.initial_hidden(env.num_envs)
+        self._start = torch.ones(env.num_envs, device=device)
+        # Staggered ages: restarts by the horizon do not all fall into one iteration.
+        self._age = torch.randint(horizon, (env.num_envs,), device=device)
+
+    @property
+    def done(self) -> bool:
+        """Whether all steps are done."""
+        return self.steps >= self.config.total_steps
+
+    def iterate(self) -> dict[str, float]:
+        """Collect one stretch and learn from it; return the success rate and return of finished episodes."""
+        torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
+        share_left = 1.0 - self.steps / self.config.total_steps
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * share_left
+        rollout, metrics = self._collect()
+        self._learn(rollout)
+        self.steps += self.env.num_envs * self.config.rollout_steps
+        self._iteration += 1
+        metrics["std"] = float(self.policy.log_std.detach().exp().mean())
+        return metrics
+
+    @torch.no_grad()
+    def _collect(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        env, policy = self.env, self.policy
+        columns: dict[str, list[Tensor]] = {}
+        finished = succeeded = returned = 0.0
+        first_hidden = self._hidden.clone()
+        for _ in range(self.config.rollout_steps):
+            row = {
+                "observation": self._observation,
+                "previous_action": self._previous_action,
+                "start": self._start,
+            }
+            hidden = self._hidden * (1.0 - self._start).unsqueeze(-1)
+            features, hidden = policy.remember(self._observation, self._previous_action, hidden)
+            mean, std = policy.policy(features)
+            action = torch.normal(mean, std)
+            step = env.step(action)
+            self._age += 1
+            expired = (self._age >= self.horizon) & ~step.terminated
+            done = step.terminated | expired
+            value = policy.value(features)
+            row |= {
+                "action": action,
+                "action_log_prob": torch.distributions.Normal(mean, std).log_prob(action).sum(-1),
+                "value": value,
+                "reward": step.reward * self.config.reward_scale,
+                "terminated": step.terminated,
+                "done": done,
+                "beyond": torch.zeros_like(value),
+            }
+            executed = action.clamp(-1.0, 1.0)
+            if bool(expired.any()):
+                beyond, _ = policy.remember(step.observation[expired], executed[expired], hidden[expired])
+                row["beyond"][expired] = policy.value(beyond)
+            for name, values in row.items():
+                columns.setdefault(name, []).append(values)
+            finished += float(done.sum())
+            succeeded += float(step.success.sum())
+            returned += float(step.reward.sum())
+            self._age = torch.where(done, 0, self._age)
+            self._observation = env.reset(done) if bool(done.any()) else step.observation
+            self._previous_action = executed * (~done).unsqueeze(-1)
+            self._hidden = hidden
+            self._start = done.float()
+        rollout = {name: torch.stack(values, dim=1) for name, values in columns.items()}
+        hidden = self._hidden * (1.0 - self._start).unsqueeze(-1)
+        last, _ = policy.remember(self._observation, self._previous_action, hidden)
+        following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
+        following = torch.where(rollout["done"], rollout["beyond"], following)
+        advantage, target = vec_generalized_advantage_estimate(
+            self.config.discount,
+            self.config.gae_lambda,
+            *(
+                rollout[name].unsqueeze(-1) if isinstance(name, str) else name.unsqueeze(-1)
+                for name in ("value", following, "reward", "done", "terminated")
+            ),
+        )
+        rollout |= {"advantage": advantage, "value_target": target, "hidden": first_hidden}
+        count = max(finished, 1.0)
+        return rollout, {"success": succeeded / count, "return": returned / count, "episodes": finished}
+
+    def _learn(self, rollout: dict[str, Tensor]) -> None:
+        config, policy = self.config, self.policy
+        advantage = rollout["advantage"]
+        rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        count = len(advantage)
+        size = count // config.minibatches
+        for _ in range(config.epochs):
+            order = torch.randperm(count, device=advantage.device)
+            for rows in order.split(size):
+                batch = {name: values[rows] for name, values in rollout.items()}
+                features = policy.remember_sequence(
+                    batch["observation"], batch["previous_action"], batch["hidden"], batch["start"]
+                )
+                losses = self._loss(
+                    TensorDict(
+                        {
+                            "features": features,
+                            **{k: batch[k] for k in ("action", "action_log_prob", "advantage", "value_target")},
+                        },
+                        batch_size=features.shape[:2],
+                    )
+                )
+                total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+                self._optimizer.zero_grad()
+                total.backward()
+                nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
+                self._optimizer.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything but the environment's own state; see `load_state_dict`."""
+        return {
+            "policy": self.policy.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "steps": self.steps,
+            "iteration": self._iteration,
+            "previous_action": self._previous_action,
+            "hidden": self._hidden,
+            "start": self._start,
+            "age": self._age,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
+        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        self.policy.load_state_dict(state["policy"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self.steps, self._iteration = state["steps"], state["iteration"]
+        self._previous_action, self._hidden = state["previous_action"], state["hidden"]
+        self._start, self._age = state["start"], state["age"]
+        self._observation = observation
+
+
+def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> ClipPPOLoss:
+    actor = ProbabilisticActor(
+        TensorDictModule(_Policy(policy), in_keys=["features"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"tanh_loc": False},
+    )
+    critic = ValueOperator(policy.critic, in_keys=["features"])
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=config.clip,
+        entropy_coeff=config.entropy_weight,
+        critic_coeff=config.value_weight,
+        loss_critic_type="l2",
+    )
+    loss.set_keys(value_target="value_target", advantage="advantage", sample_log_prob="action_log_prob")
+    return loss
+
+
+class _Policy(nn.Module):
+    def __init__(self, policy: ActorCritic) -> None:
+        super().__init__()
+        self.actor, self.log_std = policy.actor, policy.log_std
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        mean = torch.tanh(self.actor(features))
+        return mean, self.log_std.exp().expand_as(mean)

@@ -1,0 +1,22 @@
+"""Every method by name; each file holds only what is different about its method."""
+
+from astra_data.errors import BadInputError
+from astra_data.method import Method
+from astra_data.methods.astra import ASTRA
+from astra_data.methods.direct_transfer import DIRECT_TRANSFER
+from astra_data.methods.follower import FOLLOWER
+from astra_data.methods.nas import NAS
+
+METHODS: dict[str, Method] = {method.name: method for method in (DIRECT_TRANSFER, NAS, ASTRA, FOLLOWER)}
+
+
+def method_named(row: str) -> Method:
+    """Return the method of a row: `astra` for "astra" and for "astra_plus".
+
+    Raises:
+        BadInputError: there is no such method.
+    """
+    name = row.removesuffix("_plus")
+    if name not in METHODS:
+        raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with _plus")
+    return METHODS[name]

@@ -1,0 +1,9 @@
+"""NAS in the paper's sense: the correction alone, λ = (0, 0, 1) (Section V-E; after Golemo et al. 2018).
+
+The reward is the task's own on corrected states, as Golemo et al. recompute it.
+"""
+
+from astra_data.method import Method
+from astra_data.models.grounding import LossWeights
+
+NAS = Method(name="nas", title="NAS", loss_weights=LossWeights(latent=0.0, reward=0.0, state=1.0))

@@ -1,0 +1,1 @@
+"""Networks. They know no environment and no dataset."""

@@ -1,0 +1,65 @@
+"""The target encoder ψ^t and the discrepancy that aligns it with the source encoder (paper, Section IV-B)."""
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.models.history import HistoryEncoder
+
+
+class TargetEncoder(nn.Module):
+    """ψ^t: encode histories of full target states into the source encoder's latent space."""
+
+    def __init__(
+        self, state_size: int, goal_size: int, action_size: int, *, embedding_size: int, latent_size: int
+    ) -> None:
+        super().__init__()
+        self.encoder = HistoryEncoder(
+            state_size + goal_size + action_size, embedding_size=embedding_size, latent_size=latent_size
+        )
+        for name, size in {"state": state_size, "goal": goal_size}.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.state_mean: Tensor
+        self.state_std: Tensor
+        self.goal_mean: Tensor
+        self.goal_std: Tensor
+
+    def set_scales(self, state: Tensor, goal: Tensor) -> None:
+        """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G)."""
+        for name, values in {"state": state, "goal": goal}.items():
+            getattr(self, f"{name}_mean").copy_(values.mean(0))
+            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble [s_i, goal, a_{i-1}] (..., I), states clipped to ±5 standard deviations."""
+        normal_state = ((state - self.state_mean) / self.state_std).clamp(-5.0, 5.0)
+        return torch.cat([normal_state, (goal - self.goal_mean) / self.goal_std, previous_action], dim=-1)
+
+
+def gaussian_mmd(
+    mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor
+) -> Tensor:
+    """Return the squared MMD between two diagonal Gaussians in closed form.
+
+    With the kernel k(x, y) = exp(-|x - y|² / 2h²), the mean of k over N(m1, v1) and N(m2, v2) is
+    Π_d sqrt(h² / (h² + v1 + v2)) exp(-(m1 - m2)² / 2(h² + v1 + v2)).
+
+    Args:
+        mean_1, variance_1, mean_2, variance_2: (..., Z).
+        bandwidths: h, (K,); the kernels are averaged. h near sqrt(Z) keeps the gradient alive.
+
+    Returns:
+        MMD² of each pair, (...).
+    """
+
+    def mean_kernel(m1: Tensor, v1: Tensor, m2: Tensor, v2: Tensor) -> Tensor:
+        squared = bandwidths.square().unsqueeze(-1)
+        spread = squared + (v1 + v2).unsqueeze(-2)
+        exponent = 0.5 * ((squared / spread).log() - (m1 - m2).unsqueeze(-2).square() / spread)
+        return exponent.sum(-1).exp().mean(-1)
+
+    return (
+        mean_kernel(mean_1, variance_1, mean_1, variance_1)
+        + mean_kernel(mean_2, variance_2, mean_2, variance_2)
+        - 2.0 * mean_kernel(mean_1, variance_1, mean_2, variance_2)
+    )

@@ -1,0 +1,194 @@
+"""ASTRA's grounding model: history encoder, latent dynamics, reward, correction; and their joint loss.
+
+Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: the correction alone.
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from astra_data.models.history import HistoryEncoder, PositionFeatures, mlp
+
+TargetKind = Literal["ema", "detach", "online"]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """λ1, λ2, λ3 of the paper's total loss."""
+
+    latent: float = 1.0
+    reward: float = 1.0
+    state: float = 1.0
+
+
+@dataclass(frozen=True)
+class GroundingShape:
+    """Sizes of the networks; the paper prints none.
+
+    Attributes:
+        state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
+        position_octaves: of `PositionFeatures`; 0 leaves positions as they are.
+    """
+
+    state_size: int
+    action_size: int
+    goal_size: int
+    latent_size: int = 128
+    embedding_size: int = 64
+    head_sizes: tuple[int, ...] = (128, 128)
+    position_octaves: int = 4
+    log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Stretches of paired episodes; T steps each, the mask marks the real ones.
+
+    Attributes:
+        state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
+        goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
+        next_state: φ(s_{i+1}), (B, T, X). reward: r_i, (B, T). toppled: (B, T), the target ended badly.
+        mask: (B, T), 1 on real steps.
+    """
+
+    state: Tensor
+    action: Tensor
+    previous_action: Tensor
+    goal: Tensor
+    simulated_next: Tensor
+    next_state: Tensor
+    reward: Tensor
+    toppled: Tensor
+    mask: Tensor
+
+
+class GroundingModel(nn.Module):
+    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone, plus a topple head that does not shape the latent.
+
+    Scales are buffers, set from the training episodes by `set_scales`, so a checkpoint carries them.
+    """
+
+    def __init__(self, shape: GroundingShape, target: TargetKind = "ema") -> None:
+        super().__init__()
+        self.shape = shape
+        self.target = target
+        states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
+        self.position_features = PositionFeatures(shape.position_octaves)
+        features = states + self.position_features.size
+        self.encoder = HistoryEncoder(
+            features + shape.goal_size + actions,
+            embedding_size=shape.embedding_size,
+            latent_size=latent,
+        )
+        heads = shape.head_sizes
+        self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
+        self.reward_head = mlp((latent + actions, *heads, 1))
+        self.correction = mlp((latent + actions + features, *heads, states))
+        self.topple_head = mlp((latent + actions + features, *heads, 1))
+        # An untrained correction is the identity: the raw simulator.
+        nn.init.zeros_(self.correction[-1].weight)
+        nn.init.zeros_(self.correction[-1].bias)
+        self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
+        for name, size in {"state": states, "goal": shape.goal_size, "correction": states, "reward": 1}.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.register_buffer("residual_factor", torch.zeros(states, states))
+        self.state_mean: Tensor
+        self.state_std: Tensor
+        self.goal_mean: Tensor
+        self.goal_std: Tensor
+        self.correction_std: Tensor
+        self.reward_mean: Tensor
+        self.reward_std: Tensor
+        self.residual_factor: Tensor
+
+    def set_scales(self, columns: Mapping[str, Tensor]) -> None:
+        """Take means and standard deviations from training steps: state, goal, correction, reward (N, ...)."""
+        for name, values in columns.items():
+            getattr(self, f"{name}_mean").copy_(values.mean(0))
+            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+
+    def state_features(self, state: Tensor) -> Tensor:
+        """Normalise abstract states (..., X) and append the features of their position."""
+        normal = (state - self.state_mean) / self.state_std
+        return torch.cat([normal, self.position_features(state[..., :2])], dim=-1)
+
+    def normal_goal(self, goal: Tensor) -> Tensor:
+        """Normalise goals (..., G)."""
+        return (goal - self.goal_mean) / self.goal_std
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
+        return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
+
+    def predict_latent(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """P_lat: return mean and log-variance (..., Z) of the next latent."""
+        mean, raw = self.latent_dynamics(torch.cat([latent, action], dim=-1)).chunk(2, dim=-1)
+        low, high = self.shape.log_variance_bounds
+        return mean, low + (high - low) * torch.sigmoid(raw)
+
+    def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        """R_pred: return the target's reward (...)."""
+        normal = self.reward_head(torch.cat([latent, action], dim=-1)).squeeze(-1)
+        return normal * self.reward_std + self.reward_mean
+
+    def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """f_abs: return the corrected next abstract state (..., X)."""
+        inputs = torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
+        return simulated_next + self.correction(inputs) * self.correction_std
+
+    def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """Return the log-odds (...) that the target topples on the way to `next_state`."""
+        inputs = torch.cat([latent, action, self.state_features(next_state)], dim=-1)
+        return torch.as_tensor(self.topple_head(inputs).squeeze(-1))
+
+    def update_target(self, rate: float) -> None:
+        """Move the EMA target encoder by `rate` toward the encoder."""
+        with torch.no_grad():
+            for slow, fast in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
+                slow.lerp_(fast, rate)
+
+    def losses(self, windows: Windows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the joint loss (paper, Section IV-A) and its parts, each a mean over real steps and dims."""
+        inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        latent, _ = self.encoder(inputs)
+        action, mask = windows.action, windows.mask
+        parts: dict[str, Tensor] = {}
+        total = torch.zeros((), device=mask.device)
+        if weights.latent > 0:
+            following = self._following_latent(inputs, latent)
+            mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
+            nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
+            both = mask[:, :-1] * mask[:, 1:]
+            parts["latent"] = (nll * both).sum() / both.sum()
+            total = total + weights.latent * parts["latent"]
+        if weights.reward > 0:
+            error = (self.predict_reward(latent, action) - windows.reward) / self.reward_std
+            parts["reward"] = _masked_mean(error.square(), mask)
+            total = total + weights.reward * parts["reward"]
+        corrected = self.correct(latent, action, windows.simulated_next)
+        error = (corrected - windows.next_state) / self.correction_std
+        parts["state"] = _masked_mean(error.square().mean(-1), mask)
+        total = total + weights.state * parts["state"]
+        logit = self.topple_logit(latent.detach(), action, windows.next_state)
+        entropy = functional.binary_cross_entropy_with_logits(logit, windows.toppled, reduction="none")
+        parts["topple"] = _masked_mean(entropy, mask)
+        return total + parts["topple"], parts
+
+    def _following_latent(self, inputs: Tensor, latent: Tensor) -> Tensor:
+        if self.target == "online":
+            return latent[:, 1:]
+        if self.target == "detach":
+            return latent[:, 1:].detach()
+        with torch.no_grad():
+            slow, _ = self.target_encoder(inputs)
+        return torch.as_tensor(slow[:, 1:])
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    return (values * mask).sum() / mask.sum()

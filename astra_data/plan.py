@@ -1,0 +1,259 @@
+"""What a recipe asks for: its model, and the artefacts that its rows and seeds need.
+
+    collect ── pair ──┬── ground ──┬── train ──┬── evaluate ── report
+                      │            └── align ──┘
+                      └── (rows without grounding train on the pairs alone)
+
+A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` settings; it shares the
+grounding and the alignment of `<method>`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from astra_data.methods import METHODS
+from astra_data.recipe import Config, did_you_mean
+from astra_data.schedule import Item
+from astra_data.stages.align import AlignConfig, align
+from astra_data.stages.collect import CollectConfig, collect
+from astra_data.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.stages.ground import GroundConfig, ground
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.stages.report import ReportConfig, report
+from astra_data.stages.train import TrainConfig, train
+from astra_data.tasks import TASKS
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "collect": (),
+    "pair": ("collect",),
+    "ground": ("pair",),
+    "train": ("pair", "ground"),
+    "align": ("pair", "ground"),
+    "evaluate": ("train", "ground", "align"),
+    "report": ("evaluate",),
+}
+"""Each stage, in order, and the stages whose artefacts it reads."""
+
+PLUS = "_plus"
+
+
+class Recipe(Config):
+    """One experiment: which methods, on which task, with which seeds and settings."""
+
+    task: str
+    """A name in `astra_data.tasks.TASKS`."""
+    methods: tuple[str, ...] = Field(min_length=1)
+    """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
+    seeds: tuple[int, ...] = Field(min_length=1)
+    """Each seed repeats everything, from the collected dataset on."""
+    collect: CollectConfig
+    pair: PairConfig
+    ground: GroundConfig
+    train: TrainConfig
+    align: AlignConfig
+    evaluate: EvaluateConfig
+    report: ReportConfig
+    plus: TrainConfig
+    """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _add_empty_sections(cls, tables: dict[str, Any]) -> dict[str, Any]:
+        return {stage: {} for stage in (*STAGES, "plus")} | tables
+
+    @field_validator("plus", mode="before")
+    @classmethod
+    def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
+        train = info.data.get("train")
+        if train is None or not isinstance(overrides, dict):
+            return overrides
+        return train.model_dump() | overrides
+
+    @field_validator("task")
+    @classmethod
+    def _is_known_task(cls, task: str) -> str:
+        if task not in TASKS:
+            raise ValueError(f"unknown task '{task}'{did_you_mean(task, TASKS)}")
+        return task
+
+    @field_validator("methods")
+    @classmethod
+    def _are_known_methods(cls, rows: tuple[str, ...]) -> tuple[str, ...]:
+        for row in rows:
+            if base_method(row) not in METHODS:
+                raise ValueError(f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}")
+        return rows
+
+    @model_validator(mode="after")
+    def _has_no_repeats(self) -> Self:
+        for name, values in (("methods", self.methods), ("seeds", self.seeds)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"expected each of {name} once, got {list(values)}")
+        return self
+
+
+def base_method(row: str) -> str:
+    """Return the method of a row: its name without `_plus`."""
+    return row.removesuffix(PLUS)
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What the report is about, in few words that travel to another process."""
+
+    name: str
+    task: str
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+
+def plan(
+    recipe: Recipe, path: Path, folder: Path, *, device: str = "cpu", publish: bool = False
+) -> tuple[Item, ...]:
+    """Return every artefact of `recipe`, each after those it reads.
+
+    Args:
+        recipe: what to make.
+        path: the recipe's file.
+        folder: where it is made, such as `runs/antmaze_long`; an item's artefact is at `folder / key`.
+        device: torch device of the networks.
+        publish: whether the report copies its results into `results/` beside the recipe.
+    """
+    bases = tuple(dict.fromkeys(base_method(row) for row in recipe.methods))
+    items: list[Item] = []
+    for seed in recipe.seeds:
+        items.append(_collect(recipe, folder, seed))
+        items.append(_pair(recipe, folder, seed))
+        items += (_ground(recipe, folder, base, seed, device) for base in bases if METHODS[base].grounds)
+        trained = [row for row in recipe.methods if METHODS[base_method(row)].trains]
+        items += (_train(recipe, folder, row, seed, device) for row in trained)
+        items += (_align(recipe, folder, base, seed, device) for base in bases if METHODS[base].aligns)
+        items += (_evaluate(recipe, folder, row, seed, device) for row in recipe.methods)
+    items.append(_report(recipe, path, folder, publish))
+    # Stage by stage, so that work on every seed begins before any seed is finished.
+    return tuple(sorted(items, key=lambda item: list(STAGES).index(stage_of(item))))
+
+
+def stage_of(item: Item) -> str:
+    """Return the stage that makes `item`."""
+    return item.key.partition("/")[0]
+
+
+def select(
+    items: tuple[Item, ...], stage: str, *, method: str | None = None, seed: int | None = None
+) -> Iterator[Item]:
+    """Yield the items of `stage`, of `method` and of `seed` only where they are given."""
+    for item in items:
+        parts = item.key.split("/")
+        if parts[0] == stage and method in (None, *parts[1:-1]) and seed in (None, _seed(parts[-1])):
+            yield item
+
+
+def _seed(part: str) -> int | None:
+    return int(part.removeprefix("seed_")) if part.startswith("seed_") else None
+
+
+def _collect(recipe: Recipe, folder: Path, seed: int) -> Item:
+    key = f"collect/seed_{seed}"
+    return Item(key, (), partial(collect, recipe.task, recipe.collect, seed=seed, out=folder / key))
+
+
+def _pair(recipe: Recipe, folder: Path, seed: int) -> Item:
+    key, dataset = f"pair/seed_{seed}", f"collect/seed_{seed}"
+    call = partial(pair, recipe.task, recipe.pair, dataset=folder / dataset, out=folder / key)
+    return Item(key, (dataset,), call)
+
+
+def _ground(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> Item:
+    key, dataset = f"ground/{base}/seed_{seed}", f"pair/seed_{seed}"
+    call = partial(
+        ground,
+        recipe.task,
+        base,
+        recipe.ground,
+        dataset=folder / dataset,
+        seed=seed,
+        out=folder / key,
+        device=device,
+    )
+    return Item(key, (dataset,), call)
+
+
+def _train(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> Item:
+    key, dataset = f"train/{row}/seed_{seed}", f"pair/seed_{seed}"
+    grounding = _grounding(row, seed)
+    call = partial(
+        train,
+        recipe.task,
+        row,
+        recipe.plus if row.endswith(PLUS) else recipe.train,
+        dataset=folder / dataset,
+        grounding=folder / grounding if grounding else None,
+        seed=seed,
+        out=folder / key,
+        device=device,
+    )
+    return Item(key, _existing(dataset, grounding), call)
+
+
+def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> Item:
+    key, dataset, grounding = f"align/{base}/seed_{seed}", f"pair/seed_{seed}", f"ground/{base}/seed_{seed}"
+    call = partial(
+        align,
+        recipe.task,
+        base,
+        recipe.align,
+        dataset=folder / dataset,
+        grounding=folder / grounding,
+        seed=seed,
+        out=folder / key,
+        device=device,
+    )
+    return Item(key, (dataset, grounding), call)
+
+
+def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> Item:
+    key, base = f"evaluate/{row}/seed_{seed}", base_method(row)
+    policy = f"train/{row}/seed_{seed}" if METHODS[base].trains else None
+    grounding = _grounding(row, seed)
+    target_encoder = f"align/{base}/seed_{seed}" if METHODS[base].aligns else None
+    call = partial(
+        evaluate,
+        recipe.task,
+        row,
+        recipe.evaluate,
+        policy=folder / policy if policy else None,
+        grounding=folder / grounding if grounding else None,
+        target_encoder=folder / target_encoder if target_encoder else None,
+        seed=seed,
+        out=folder / key,
+        device=device,
+    )
+    return Item(key, _existing(policy, grounding, target_encoder), call)
+
+
+def _report(recipe: Recipe, path: Path, folder: Path, publish: bool) -> Item:
+    inputs = tuple(f"evaluate/{row}/seed_{seed}" for row in recipe.methods for seed in recipe.seeds)
+    call = partial(
+        report,
+        Reported(path.stem, recipe.task, recipe.methods, recipe.seeds),
+        root=folder,
+        command=f"astra-data run {path}",
+        publish=path.parent / "results" if publish else None,
+        config=recipe.report,
+    )
+    return Item("report", inputs, call)
+
+
+def _grounding(row: str, seed: int) -> str | None:
+    base = base_method(row)
+    return f"ground/{base}/seed_{seed}" if METHODS[base].grounds else None
+
+
+def _existing(*keys: str | None) -> tuple[str, ...]:
+    return tuple(key for key in keys if key is not None)

@@ -1,0 +1,9 @@
+"""What a recipe's runs amount to.
+
+artefacts     read the JSON that the other stages left behind, strictly
+runs          find those files for all rows and seeds
+model         Results: what results.json holds
+assembly      artefacts → Results
+page          Results → Markdown
+provenance    commit, machine and package versions
+"""

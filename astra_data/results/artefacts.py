@@ -1,0 +1,168 @@
+"""Read what the other stages left behind: a missing key is an error, an extra one is not."""
+
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from astra_data.errors import BadInputError
+
+EVALUATION = "evaluation.json"
+TRAJECTORIES = "trajectories.safetensors"
+
+
+class Artefact(BaseModel):
+    """A file that a stage wrote, with the seconds that the stage took where it says so."""
+
+    model_config = ConfigDict(frozen=True)
+
+    wall_seconds: float | None = None
+    """How long the stage ran, in s."""
+
+
+class Outcomes(BaseModel):
+    """How a policy's episodes went, one number per episode."""
+
+    model_config = ConfigDict(frozen=True)
+
+    success: list[float]
+    """1 where the goal was reached, else 0."""
+    topple: list[float]
+    """1 where the robot fell over, else 0."""
+    wall_contact: list[float]
+    """Share of the episode's steps in contact with a wall."""
+    steps: list[float]
+    """Length of the episode in control steps."""
+    returns: list[float] = Field(alias="return")
+    """Undiscounted sum of rewards."""
+
+    def means(self) -> dict[str, float]:
+        """Return the mean of each measure over the episodes, by its name in the file."""
+        measures = self.model_dump(by_alias=True)
+        return {name: float(np.mean(values)) for name, values in measures.items()}
+
+
+class Evaluation(Artefact):
+    """evaluation.json of one row and seed."""
+
+    task: str
+    method: str
+    seed: int
+    episodes: int = Field(ge=1)
+    dataset_version: str | None = None
+    dataset_hash: str | None = None
+    target_steps_per_second: float | None = None
+    target: Outcomes
+    simulated: Outcomes | None = None
+    """None for a row that was in no simulator."""
+    encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """Mean of each measure by encoder, where there is more than one."""
+
+    @model_validator(mode="after")
+    def _one_number_per_episode(self) -> Self:
+        wrong = [
+            f"{world}.{name} has {len(values)}"
+            for world, outcomes in (("target", self.target), ("simulated", self.simulated))
+            if outcomes is not None
+            for name, values in outcomes.model_dump(by_alias=True).items()
+            if len(values) != self.episodes
+        ]
+        if wrong:
+            raise ValueError(f"expected {self.episodes} episodes, but {', '.join(wrong)}")
+        return self
+
+
+class Point(BaseModel):
+    """One moment of a training."""
+
+    model_config = ConfigDict(frozen=True)
+
+    steps: float
+    success: float | None
+    """None where no episode had ended."""
+    returns: float | None = Field(alias="return")
+
+
+class CurveFile(Artefact):
+    """curve.json of one row and seed."""
+
+    steps_per_second: float | None = None
+    points: list[Point] = Field(min_length=1)
+
+
+class Metrics(Artefact):
+    """metrics.json of one row and seed's grounding or alignment."""
+
+    windows_per_second: float | None = None
+
+
+class Band(BaseModel):
+    """An error at each horizon."""
+
+    model_config = ConfigDict(frozen=True)
+
+    mean: list[float]
+    low: list[float]
+    high: list[float]
+
+
+class Gap(Artefact):
+    """gap.json: open-loop error by horizon, for each quantity."""
+
+    horizons: list[int]
+    """Steps ahead."""
+    grounded: dict[str, Band]
+    raw: dict[str, Band]
+
+    @model_validator(mode="after")
+    def _one_number_per_horizon(self) -> Self:
+        if set(self.grounded) != set(self.raw):
+            raise ValueError(f"grounded has {sorted(self.grounded)}, but raw has {sorted(self.raw)}")
+        for name, band in [*self.grounded.items(), *self.raw.items()]:
+            lengths = {len(band.mean), len(band.low), len(band.high)}
+            if lengths != {len(self.horizons)}:
+                raise ValueError(f"expected {len(self.horizons)} numbers for {name}, got {sorted(lengths)}")
+        return self
+
+
+class DatasetFile(Artefact):
+    """meta/astra/dataset.json of a dataset."""
+
+    name: str
+    version: str
+    content_hash: str
+
+
+def read_json[T: Artefact](model: type[T], path: Path) -> T:
+    """Read one of the files above.
+
+    Raises:
+        BadInputError: the file does not hold what its stage writes; the message lists every mismatch.
+    """
+    try:
+        return model.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        wrong = "; ".join(
+            f"{'.'.join(map(str, item['loc'])) or 'file'}: {item['msg']}" for item in error.errors()
+        )
+        raise BadInputError(f"{path} is not what its stage writes: {wrong}; run that stage again") from None
+
+
+def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
+    """Read a safetensors file that holds at least `names`.
+
+    Raises:
+        BadInputError: the file is no safetensors file, or lacks a tensor.
+    """
+    try:
+        tensors = load_file(path)
+    except SafetensorError as error:
+        raise BadInputError(f"{path} is no whole safetensors file ({error}); run its stage again") from None
+    missing = [name for name in names if name not in tensors]
+    if missing:
+        raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")
+    return {name: tensor.astype(np.float64) for name, tensor in tensors.items()}

@@ -1,0 +1,143 @@
+"""Results: what results.json holds. Lists are over seeds, in the order of `Results.seeds`."""
+
+from typing import Annotated, Literal
+
+from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
+
+from astra_data.statistics import Comparison, Summary
+
+
+def _nan_for_null(value: object) -> object:
+    return float("nan") if value is None else value
+
+
+Number = Annotated[float, BeforeValidator(_nan_for_null)]
+"""JSON knows no NaN: it is written as null and read back."""
+
+
+class Part(BaseModel):
+    """A frozen part of the results."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Machine(Part):
+    """The machine that wrote the report."""
+
+    cpu: str
+    cores: int
+    memory_gib: float
+
+
+class Dataset(Part):
+    """A dataset that the recipe wrote."""
+
+    stage: str
+    seed: int
+    name: str
+    version: str
+    content_hash: str
+
+
+class DatasetUse(Part):
+    """The dataset of each seed, as the evaluations of rows recorded it."""
+
+    versions: list[str | None]
+    hashes: list[str | None]
+    methods: list[str]
+
+
+class Learning(Part):
+    """One seed's training."""
+
+    steps: list[float]
+    success: list[Number]
+    returns: list[Number] = Field(
+        validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
+    )
+
+
+class BandMeans(Part):
+    """An error at each horizon, averaged over seeds."""
+
+    mean: list[Number]
+    low: list[Number]
+    high: list[Number]
+
+
+class GapMeans(Part):
+    """Open-loop error by horizon for each quantity, averaged over seeds."""
+
+    horizons: list[int]
+    """Steps ahead."""
+    grounded: dict[str, BandMeans]
+    raw: dict[str, BandMeans]
+
+
+class MethodResults(Part):
+    """One row. Each measure is a list over seeds of means over episodes in the target."""
+
+    title: str
+    role: str | None
+    """"floor" or "ceiling" for the rows that bound the others."""
+    success: list[float]
+    topple: list[float]
+    wall_contact: list[float]
+    """Share of steps in contact with a wall."""
+    steps: list[float]
+    """Length of an episode in control steps."""
+    returns: list[float] = Field(
+        validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
+    )
+    simulated_success: list[float] | None
+    """Success in the simulator that the policy was trained in; None for a row that was in none."""
+    encoders: dict[str, dict[str, list[float]]]
+    """The same measures by encoder, where a row has more than one."""
+    summary: dict[str, Summary]
+    """Every measure above over seeds."""
+    grounding: str | None
+    """Name of the row's folder of groundings, which rows may share."""
+    gap: GapMeans | None
+    learning: list[Learning]
+    """Empty for a row that is not trained."""
+
+
+class Improvement(Part):
+    """How likely a seed of the best ASTRA row beats a seed of another row."""
+
+    best: str
+    over: dict[str, Comparison]
+
+
+class Results(Part):
+    """All that the page and the figures show."""
+
+    format: Literal[1] = 1
+    recipe: str
+    task: str
+    command: str
+    """The command that produced these results."""
+    commit: str | None
+    dirty: bool | None
+    """Whether the checkout differed from `commit`."""
+    machine: Machine
+    wall_seconds: dict[str, float]
+    """By stage over all rows and seeds, and "total"; stages that record no time are left out."""
+    packages: dict[str, str]
+    datasets: list[Dataset]
+    evaluated_with: list[DatasetUse]
+    seeds: list[int]
+    episodes: int
+    """Per row and seed."""
+    methods: dict[str, MethodResults]
+    probability_of_improvement: Improvement | None
+    throughput: dict[str, dict[str, dict[str, list[float]]]]
+    """stage → figure → row, or grounding that rows share → one value per seed."""
+
+    def gaps(self) -> dict[str, GapMeans]:
+        """Return each grounding's gap once, though rows share it."""
+        return {
+            row.grounding: row.gap
+            for row in self.methods.values()
+            if row.grounding is not None and row.gap is not None
+        }

@@ -1,0 +1,101 @@
+"""Find the artefacts of all rows and seeds of a recipe."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from astra_data.errors import BadInputError, MissingStageError
+from astra_data.figures import PLUS
+from astra_data.results.artefacts import Artefact, DatasetFile, read_json
+
+SHARED = ("ground", "align")
+"""Stages whose artefacts a "_plus" row takes from its base row."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The artefacts of one recipe: `root`/<stage>/<method>/seed_<seed>/.
+
+    Attributes:
+        recipe: the recipe's name.
+        root: its folder of runs.
+        methods: the rows.
+        seeds: the seeds of every row.
+    """
+
+    recipe: str
+    root: Path
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Check that there is something to report."""
+        if not self.methods or not self.seeds:
+            raise BadInputError(
+                f"{self.recipe}: expected methods and seeds, got none; name some in the recipe"
+            )
+
+    def owner(self, stage: str, method: str) -> str:
+        """Return the name of a row's folder: a "_plus" row shares the grounding and alignment of its base."""
+        if stage in SHARED and not (self.root / stage / method).is_dir():
+            return method.removesuffix(PLUS)
+        return method
+
+    def path(self, stage: str, method: str, seed: int, name: str) -> Path:
+        """Return where a stage leaves a file of one row and seed."""
+        return self.root / stage / self.owner(stage, method) / f"seed_{seed}" / name
+
+    def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, list[T]]:
+        """Read a file of every row and seed."""
+        self.require(stage, name, self.methods)
+        return self._read(stage, name, model, self.methods)
+
+    def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, list[T]]:
+        """Read a file of the rows that have it, by `owner`: for all of their seeds, or for none."""
+        present = [
+            method
+            for method in self.methods
+            if any(self.path(stage, method, seed, name).exists() for seed in self.seeds)
+        ]
+        self.require(stage, name, present)
+        return self._read(stage, name, model, present)
+
+    def datasets(self, stage: str) -> dict[int, DatasetFile]:
+        """Read what is known of the datasets that a stage wrote, by seed."""
+        paths = {
+            seed: self.root / stage / f"seed_{seed}" / "meta" / "astra" / "dataset.json"
+            for seed in self.seeds
+        }
+        return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}
+
+    def require(self, stage: str, name: str, methods: Sequence[str]) -> None:
+        """Check that the rows have a file for every seed.
+
+        Raises:
+            MissingStageError: some have not; the message lists them and says how to make the first.
+        """
+        missing = [
+            (method, seed)
+            for method in methods
+            for seed in self.seeds
+            if not self.path(stage, method, seed, name).exists()
+        ]
+        if not missing:
+            return
+        method, seed = missing[0]
+        absent = ", ".join(f"{method} seed {seed}" for method, seed in missing)
+        option = "" if self.root.parent == Path("runs") else f" --root {self.root.parent}"
+        raise MissingStageError(
+            f"expected {name} in {self.root / stage}/<method>/seed_<seed>/, found none for {absent}; "
+            f"run `astra-data {stage} recipes/{self.recipe}.toml --method {method} --seed {seed}{option}`"
+        )
+
+    def _read[T: Artefact](
+        self, stage: str, name: str, model: type[T], methods: Sequence[str]
+    ) -> dict[str, list[T]]:
+        return {
+            self.owner(stage, method): [
+                read_json(model, self.path(stage, method, seed, name)) for seed in self.seeds
+            ]
+            for method in methods
+        }

@@ -1,0 +1,158 @@
+"""Run recipes: every stage for every row and seed, each artefact once, from where the last run stopped."""
+
+import json
+import os
+from collections.abc import Collection
+from functools import partial
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from astra_data.display import display
+from astra_data.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.plan import STAGES, Recipe, base_method, plan, select, stage_of
+from astra_data.recipe import did_you_mean, load_recipe
+from astra_data.schedule import Item, execute
+
+RUNS = Path("runs")
+ALWAYS_NEW = {"report"}
+"""Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+
+
+def run(
+    recipe_path: Path,
+    *,
+    root: Path = RUNS,
+    jobs: int | None = None,
+    device: str = "cpu",
+    until: str | None = None,
+) -> Path:
+    """Make every artefact of a recipe that is not finished yet; return the recipe's folder.
+
+    Args:
+        recipe_path: the recipe.
+        root: where the recipe's folder is.
+        jobs: number of items at a time; by default one per core.
+        device: torch device of the networks.
+        until: the last stage to run; by default all.
+
+    Raises:
+        RecipeError: the recipe has faults, or differs from the one that made what is there.
+        AstraDataError: an item failed.
+    """
+    _check_stage(until or "report")
+    recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
+    wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
+    items = [item for item in plan(recipe, recipe_path, folder, device=device) if stage_of(item) in wanted]
+    items = [item for item in items if not _finished(item, folder)]
+    _make(recipe, folder, items, jobs, device)
+    return folder
+
+
+def run_stage(
+    recipe_path: Path,
+    stage: str,
+    *,
+    method: str | None = None,
+    seed: int | None = None,
+    root: Path = RUNS,
+    jobs: int | None = None,
+    device: str = "cpu",
+    publish: bool = False,
+) -> Path:
+    """Make the artefacts of one stage of a recipe, of one `method` or `seed` only where given.
+
+    Raises:
+        MissingStageError: an artefact that the stage reads is not finished.
+        RecipeError: the recipe has faults, or differs from the one that made what is there.
+        AstraDataError: an item failed.
+    """
+    _check_stage(stage)
+    recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
+    planned = plan(recipe, recipe_path, folder, device=device, publish=publish)
+    items = _selected(recipe, planned, stage, method, seed)
+    items = [item for item in items if not _finished(item, folder)]
+    missing = next((key for item in items for key in item.inputs if not (folder / key).is_dir()), None)
+    if missing:
+        option = "" if root == RUNS else f" --root {root}"
+        command = f"astra-data {missing.partition('/')[0]} {recipe_path}{option}"
+        raise MissingStageError(f"{folder / missing} is missing: run `{command}` first")
+    _make(recipe, folder, items, jobs, device)
+    return folder / stage
+
+
+def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
+    """Validate a recipe without running it; return each planned artefact and whether it is finished."""
+    recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
+    _check_unchanged(recipe, folder)
+    return {item.key: _finished(item, folder) for item in plan(recipe, recipe_path, folder)}
+
+
+def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | None, device: str) -> None:
+    _check_device(device)
+    _check_unchanged(recipe, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    partial_file = folder / ".recipe.json.partial"
+    partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
+    os.replace(partial_file, folder / "recipe.json")
+    jobs = jobs or os.cpu_count() or 1
+    # One thread each: faster for networks this small, and idle threads of one item slow down the others.
+    prepare = partial(torch.set_num_threads, 1)
+    with display(len(items), Console()) as watch:
+        execute(items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+
+
+def _finished(item: Item, folder: Path) -> bool:
+    return stage_of(item) not in ALWAYS_NEW and (folder / item.key).is_dir()
+
+
+def _selected(
+    recipe: Recipe, items: tuple[Item, ...], stage: str, method: str | None, seed: int | None
+) -> list[Item]:
+    if method is not None and method not in recipe.methods:
+        raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
+    if seed is not None and seed not in recipe.seeds:
+        raise BadInputError(f"the recipe has no seed {seed}; its seeds: {', '.join(map(str, recipe.seeds))}")
+    if method is not None and stage in ("ground", "align"):
+        method = base_method(method)
+    selected = list(select(items, stage, method=method, seed=seed))
+    if not selected:
+        raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
+    return selected
+
+
+def _check_stage(stage: str) -> None:
+    if stage not in STAGES:
+        raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
+
+
+def _check_device(device: str) -> None:
+    try:
+        wanted = torch.device(device)
+    except RuntimeError:
+        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'") from None
+    count = torch.cuda.device_count()
+    if wanted.type == "cuda" and (wanted.index or 0) >= count:
+        raise BadInputError(f"device '{device}' is not here: torch sees {count} CUDA devices")
+
+
+def _check_unchanged(recipe: Recipe, folder: Path) -> None:
+    """Refuse settings that differ from those that made what is already there, finished or begun."""
+    record = folder / "recipe.json"
+    if not record.is_file():
+        return
+    before, now = json.loads(record.read_text()), json.loads(recipe.model_dump_json())
+    changed = {key for key in now.keys() - {"methods", "seeds"} if before.get(key) != now[key]}
+    stale: set[str] = set()
+    for stage, reads in STAGES.items():
+        sections = {"task", stage} | ({"plus"} if stage == "train" else set())
+        if changed & sections or stale.intersection(reads):
+            stale.add(stage)
+    present = [str(folder / stage) for stage in STAGES if stage in stale - ALWAYS_NEW]
+    present = [stage for stage in present if Path(stage).exists()]
+    if present:
+        raise RecipeError(
+            f"{' and '.join(sorted(changed))} changed in the recipe since {folder} was made: "
+            f"give the recipe another name, or remove {' '.join(present)}"
+        )

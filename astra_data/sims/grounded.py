@@ -1,0 +1,98 @@
+"""The grounded simulator: an abstract simulator corrected after every step by a history model (Algorithm 2)."""
+
+import torch
+from torch import Tensor
+
+from astra_data.free_space import FreeSpace
+from astra_data.models.grounding import GroundingModel
+from astra_data.simulator import AbstractSimulator
+
+
+class GroundedSimulator:
+    """Step the simulator, correct where it landed, set it back there, and encode the history anew.
+
+    The corrected position is kept out of blocked cells by sliding along them from the previous position.
+
+    Attributes:
+        state: corrected abstract states, (B, X). latent: z, (B, Z).
+        blocked: (B,) bool, the last correction was stopped at a wall or at the edge of the support.
+    """
+
+    def __init__(
+        self,
+        simulator: AbstractSimulator,
+        model: GroundingModel,
+        free: FreeSpace,
+        *,
+        scatter: Tensor | None = None,
+    ) -> None:
+        """Wrap `simulator`.
+
+        Args:
+            simulator: the abstract simulator.
+            model: a trained grounding model; only read.
+            free: where corrected positions may be.
+            scatter: factor (X, X) of the noise that stands for the target's scatter around the correction.
+        """
+        self.simulator = simulator
+        self.model = model
+        self.free = free
+        self.scatter = scatter
+        count, device = len(simulator.state), simulator.state.device
+        shape = model.shape
+        self.hidden = torch.zeros(count, shape.latent_size, device=device)
+        self.goal = torch.zeros(count, shape.goal_size, device=device)
+        self.blocked = torch.zeros(count, dtype=torch.bool, device=device)
+
+    @property
+    def state(self) -> Tensor:
+        """The corrected abstract states, (B, X)."""
+        return self.simulator.state
+
+    @property
+    def latent(self) -> Tensor:
+        """The latents (B, Z) of the histories so far."""
+        return self.model.encoder.latent(self.hidden)
+
+    @torch.no_grad()
+    def reset_to(
+        self,
+        state: Tensor,
+        rows: Tensor,
+        goal: Tensor,
+        *,
+        hidden: Tensor | None = None,
+        previous_action: Tensor | None = None,
+    ) -> None:
+        """Set `rows` (n,) to `state` (n, X) with `goal` (n, G), at the start or within a known history.
+
+        Args:
+            state: abstract states. rows: which. goal: their goals.
+            hidden: hidden states (n, Z) of the history before `state`, by default none.
+            previous_action: the actions (n, A) that led to `state`, by default zero.
+        """
+        self.simulator.reset_to(state, rows)
+        self.goal[rows] = goal
+        if previous_action is None:
+            previous_action = torch.zeros(len(state), self.model.shape.action_size, device=state.device)
+        if hidden is None:
+            hidden = torch.zeros(len(state), self.model.shape.latent_size, device=state.device)
+        self.hidden[rows] = self.model.encoder.step(
+            self.model.encoder_input(state, goal, previous_action), hidden
+        )
+        self.blocked[rows] = False
+
+    @torch.no_grad()
+    def step(self, action: Tensor) -> Tensor:
+        """Apply `action` (B, A); return the corrected state (B, X)."""
+        before = self.simulator.state
+        corrected = self.model.correct(self.latent, action, self.simulator.step(action))
+        if self.scatter is not None:
+            corrected = corrected + torch.randn_like(corrected) @ self.scatter.T
+        position, self.blocked = self.free.slide(before[:, :2], corrected[:, :2])
+        state = torch.cat([position, corrected[:, 2:]], dim=-1)
+        self.simulator.reset_to(state)
+        self.hidden = self.model.encoder.step(
+            self.model.encoder_input(state, self.goal, action), self.hidden
+        )
+        return state

@@ -1,0 +1,26 @@
+"""What the toolkit needs of an abstract simulator; bring your own by writing these three."""
+
+from typing import Protocol
+
+from torch import Tensor
+
+
+class AbstractSimulator(Protocol):
+    """B abstract states that can be set and stepped.
+
+    Attributes:
+        state: (B, X) float32.
+    """
+
+    @property
+    def state(self) -> Tensor:
+        """The present states, (B, X)."""
+        ...
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set `rows` (n,), by default all, to `state` (n, X)."""
+        ...
+
+    def step(self, action: Tensor) -> Tensor:
+        """Apply `action` (B, A); return the new states (B, X)."""
+        ...

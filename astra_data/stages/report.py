@@ -1,0 +1,229 @@
+"""Report: what all rows and seeds of a recipe gave, as results.json, results.md and figures."""
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pydantic import Field
+
+from astra_data.checkpoint import finished_folder
+from astra_data.figures import (
+    Curve,
+    OpenLoop,
+    Panel,
+    dynamics_mismatch,
+    learning_curves,
+    open_loop_error,
+    png,
+    success_bars,
+    trajectories,
+)
+from astra_data.mazes import Maze
+from astra_data.progress import Progress
+from astra_data.recipe import Config
+from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
+from astra_data.results.assembly import assemble
+from astra_data.results.model import BandMeans, Results
+from astra_data.results.page import HOW_TO_READ, render
+from astra_data.statistics import REPLICATES
+from astra_data.tasks import TASKS
+
+Floats = NDArray[np.float64]
+
+
+class ReportConfig(Config):
+    """How a report is drawn."""
+
+    trajectory_methods: tuple[str, ...] = ()
+    """Rows whose trajectories are drawn; all rows when empty."""
+
+    trajectory_episodes: int = Field(default=12, ge=1)
+    """Episodes drawn per row and world, the first ones of the first seed."""
+
+    bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
+    """Resamples behind each interval."""
+
+
+DEFAULTS = ReportConfig()
+
+
+class Reported(Protocol):
+    """What a report needs to know of a recipe."""
+
+    @property
+    def name(self) -> str:
+        """Name of the recipe's file, without its ending."""
+
+    @property
+    def task(self) -> str:
+        """Name of a task."""
+
+    @property
+    def methods(self) -> Iterable[str]:
+        """Rows, in the order of the table."""
+
+    @property
+    def seeds(self) -> Iterable[int]:
+        """Seeds of every row."""
+
+
+def report(
+    recipe: Reported,
+    *,
+    root: Path,
+    command: str,
+    publish: Path | None,
+    progress: Progress,
+    config: ReportConfig = DEFAULTS,
+) -> None:
+    """Write results.json, results.md and the figures to `root`/report.
+
+    Args:
+        recipe: names the task, the rows and the seeds.
+        root: the recipe's folder of runs.
+        command: the command line to print as the results' origin.
+        publish: a folder for copies named after the recipe, or None.
+        progress: told the share done and what was written.
+        config: how to draw.
+
+    Raises:
+        MissingStageError: a row has not been evaluated, or other artefacts for some of its seeds only.
+        BadInputError: an artefact is malformed, or rows were evaluated differently.
+    """
+    results = assemble(
+        recipe.name,
+        recipe.task,
+        tuple(recipe.methods),
+        tuple(recipe.seeds),
+        root=root,
+        command=command,
+        replicates=config.bootstrap_replicates,
+    )
+    progress(0.5, f"{len(results.methods)} rows, {len(results.seeds)} seeds")
+    images = {name: png(figure) for name, figure in _figures(results, root, config).items()}
+    progress(0.9, f"{len(images)} figures")
+    with finished_folder(root / "report", replace=True) as folder:
+        _write(results, images, folder, "results", {name: f"{name}.png" for name in images})
+    if publish is not None:
+        _publish(results, images, publish)
+    progress(1.0, _headline(results))
+
+
+def _figures(results: Results, root: Path, config: ReportConfig) -> dict[str, Figure]:
+    figures = {
+        "success": _success(results),
+        "trajectories": _trajectories(results, root, TASKS[results.task].maze, config),
+    }
+    mismatch = root / "evaluate" / "mismatch.safetensors"
+    if mismatch.exists():
+        tensors = read_tensors(mismatch, ("time_s", "command", "simulated", "target"))
+        figures["mismatch"] = dynamics_mismatch(
+            tensors["time_s"], tensors["command"], tensors["simulated"], tensors["target"]
+        )
+    curves = _curves(results)
+    if curves:
+        figures["learning"] = learning_curves(curves)
+    gaps = _gaps(results)
+    if gaps:
+        figures["gap"] = open_loop_error(gaps)
+    return figures
+
+
+def _success(results: Results) -> Figure:
+    rows = results.methods
+    intervals = {}
+    for method, row in rows.items():
+        summary = row.summary["success"]
+        low, high = (np.nan if end is None else end for end in (summary.low, summary.high))
+        intervals[method] = (summary.iqm, low, high)
+    return success_bars(
+        {method: np.array(row.success) for method, row in rows.items()},
+        intervals,
+        {
+            method: row.summary["simulated_success"].mean
+            for method, row in rows.items()
+            if row.simulated_success is not None
+        },
+    )
+
+
+def _trajectories(results: Results, root: Path, maze: Maze, config: ReportConfig) -> Figure:
+    panels = []
+    for method in config.trajectory_methods or results.methods:
+        folder = root / "evaluate" / method / f"seed_{results.seeds[0]}"
+        evaluation = read_json(Evaluation, folder / EVALUATION)
+        tensors = read_tensors(folder / TRAJECTORIES, ("target.position", "goal"))
+        count = config.trajectory_episodes
+        simulated = [] if evaluation.simulated is None else evaluation.simulated.success[:count]
+        panels.append(
+            Panel(
+                method=method,
+                success=results.methods[method].summary["success"].mean,
+                target=tensors["target.position"][:count],
+                target_success=np.array(evaluation.target.success[:count], dtype=bool),
+                simulated=tensors.get("simulated.position", np.empty((0, 1, 2)))[: len(simulated)],
+                simulated_success=np.array(simulated, dtype=bool),
+                goal=tensors["goal"][:count],
+            )
+        )
+    return trajectories(maze, panels)
+
+
+def _curves(results: Results) -> dict[str, list[Curve]]:
+    curves = {
+        method: [Curve(np.array(seed.steps), np.array(seed.success)) for seed in row.learning]
+        for method, row in results.methods.items()
+    }
+    return {
+        method: seeds
+        for method, seeds in curves.items()
+        if seeds and all(np.isfinite(seed.success).any() for seed in seeds)
+    }
+
+
+def _gaps(results: Results) -> dict[str, OpenLoop]:
+    def stack(band: BandMeans) -> Floats:
+        return np.array([band.mean, band.low, band.high])
+
+    return {
+        name: OpenLoop(
+            horizons=np.array(gap.horizons, dtype=float),
+            grounded={quantity: stack(band) for quantity, band in gap.grounded.items()},
+            raw={quantity: stack(band) for quantity, band in gap.raw.items()},
+        )
+        for name, gap in results.gaps().items()
+    }
+
+
+def _publish(results: Results, images: dict[str, bytes], folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in HOW_TO_READ:
+        (folder / f"{results.recipe}_{name}.png").unlink(missing_ok=True)
+    names = {name: f"{results.recipe}_{name}.png" for name in images}
+    _write(results, images, folder, results.recipe, names)
+
+
+def _write(
+    results: Results, images: dict[str, bytes], folder: Path, stem: str, names: dict[str, str]
+) -> None:
+    (folder / f"{stem}.json").write_text(_json(results), encoding="utf-8")
+    (folder / f"{stem}.md").write_text(render(results, names), encoding="utf-8")
+    for name, image in images.items():
+        (folder / names[name]).write_bytes(image)
+
+
+def _json(results: Results) -> str:
+    """Return indented JSON in which a list of numbers takes one line."""
+    values = json.loads(results.model_dump_json(by_alias=True))
+    text = json.dumps(values, indent=2, ensure_ascii=False)
+    return re.sub(r"\[\n[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+
+
+def _headline(results: Results) -> str:
+    best = max(results.methods.values(), key=lambda row: row.summary["success"].mean)
+    return f"best: {best.title}  success {best.summary['success'].mean:.2f}"

@@ -1,0 +1,113 @@
+"""TASKS: each a target environment, an abstract simulator, the map between them, and what to achieve."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from astra_data.abstraction import ant_to_point_mass
+from astra_data.ant import TIMESTEP_S
+from astra_data.columns import ACTION, GOAL, NEXT_STATE, STATE, Column
+from astra_data.envs.antmaze import AntMazeEnv
+from astra_data.errors import BadInputError
+from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
+from astra_data.navigation import Navigation
+from astra_data.recipe import did_you_mean
+from astra_data.sims.point_mass import PointMass
+
+
+@dataclass(frozen=True)
+class Task:
+    """A problem of abstract sim2real.
+
+    Attributes:
+        name: in recipes. instruction: what LeRobot calls the task.
+        navigation: maze, horizon, reward and success.
+        abstraction: φ, target states (..., S) to abstract states (..., X).
+        state_columns: the columns that hold states, goal and action, with units, frames and roles.
+        abstract_names: of the abstract state's entries.
+        timestep_s: the control period.
+    """
+
+    name: str
+    instruction: str
+    navigation: Navigation
+    abstraction: Callable[[Any], Any]
+    state_columns: tuple[Column, ...]
+    abstract_names: tuple[str, ...]
+    timestep_s: float
+
+    @property
+    def maze(self) -> Maze:
+        """The maze."""
+        return self.navigation.maze
+
+    @property
+    def fps(self) -> int:
+        """Control steps per second."""
+        return round(1.0 / self.timestep_s)
+
+    def target(self, num_envs: int, **options: Any) -> AntMazeEnv:  # noqa: ANN401 - handed on
+        """Build `num_envs` target environments; `options` as for `AntMazeEnv`."""
+        return AntMazeEnv(self.navigation, num_envs, **options)
+
+    def simulator(self, num_envs: int, device: str = "cpu") -> PointMass:
+        """Build `num_envs` abstract simulators."""
+        return PointMass(self.maze, num_envs, timestep_s=self.timestep_s, device=device)
+
+
+def _roles(names: tuple[str, ...], units: list[str], frames: list[str], roles: list[str]) -> dict[str, Any]:
+    return {"names": names, "astra": {"unit": units, "frame": frames, "role": roles}}
+
+
+_JOINTS = tuple(f"{joint}_{leg}" for leg in range(1, 5) for joint in ("hip", "ankle"))
+_ANT_STATE = _roles(
+    (
+        *("x", "y", "z", "qw", "qx", "qy", "qz", *_JOINTS),
+        *("vx", "vy", "vz", "wx", "wy", "wz", *(f"{joint}_rate" for joint in _JOINTS)),
+    ),
+    ["m"] * 3 + ["1"] * 4 + ["rad"] * 8 + ["m/s"] * 3 + ["rad/s"] * 11,
+    ["world"] * 7 + ["joint"] * 8 + ["world"] * 3 + ["body"] * 3 + ["joint"] * 8,
+    ["position"] * 2
+    + ["invariant"]
+    + ["quaternion"] * 4
+    + ["invariant"] * 8
+    + ["vector"] * 2
+    + ["invariant"] * 12,
+)
+_GOAL = _roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
+_COMMAND = _roles(("command_vx", "command_vy"), ["m/s"] * 2, ["world"] * 2, ["vector"] * 2)
+_ANT_COLUMNS = (
+    Column(STATE, size=29, meaning="qpos (15) and qvel (14) of the ant", **_ANT_STATE),
+    Column(GOAL, size=2, meaning="where to go", **_GOAL),
+    Column(ACTION, size=2, meaning="commanded planar velocity, ±1 m/s per axis", **_COMMAND),
+    Column(NEXT_STATE, size=29, meaning="qpos and qvel one control step later", **_ANT_STATE),
+)
+
+
+def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
+    return Task(
+        name=name,
+        instruction="walk through the maze to the goal",
+        navigation=Navigation(maze, horizon),
+        abstraction=ant_to_point_mass,
+        state_columns=_ANT_COLUMNS,
+        abstract_names=("x", "y", "vx", "vy"),
+        timestep_s=TIMESTEP_S,
+    )
+
+
+TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (_antmaze("antmaze-umaze", U_MAZE, 700), _antmaze("antmaze-long", LONG_MAZE, 1000))
+}
+
+
+def task_named(name: str) -> Task:
+    """Return a task.
+
+    Raises:
+        BadInputError: there is no such task.
+    """
+    if name not in TASKS:
+        raise BadInputError(f"unknown task '{name}'{did_you_mean(name, TASKS)}")
+    return TASKS[name]

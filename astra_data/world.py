@@ -1,0 +1,179 @@
+"""The navigation task in an abstract simulator, raw or grounded: the worlds that policies are trained in."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.batched import Step
+from astra_data.mazes import Maze
+from astra_data.navigation import Navigation
+from astra_data.sims.grounded import GroundedSimulator
+from astra_data.sims.point_mass import PointMass
+from astra_data.sims.randomized import RandomizedSimulator
+
+RewardSource = Literal["abstract", "predicted", "blend"]
+Simulator = PointMass | RandomizedSimulator | GroundedSimulator
+
+
+@dataclass(frozen=True)
+class DataStarts:
+    """Moments of recorded episodes to start from.
+
+    Attributes:
+        state: φ(s_i), (N, X). goal: (N, G). previous_action: a_{i-1}, (N, A).
+        hidden: the encoder's hidden state before s_i, (N, Z); None where there is no encoder.
+    """
+
+    state: Tensor
+    goal: Tensor
+    previous_action: Tensor
+    hidden: Tensor | None
+
+
+def policy_observation(maze: Maze, state: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
+    """Assemble what a policy sees: latent (..., Z) where there is one, position, velocity, goal; (..., O)."""
+    half = torch.tensor(maze.half_extent, dtype=state.dtype, device=state.device)
+    parts = [state[..., :2] / half, state[..., 2:], goal / half, goal - state[..., :2]]
+    return torch.cat(parts if latent is None else [latent, *parts], dim=-1)
+
+
+class NavigationWorld:
+    """A batched environment over an abstract simulator.
+
+    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2); "blend", the
+    task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the topple head
+    and ends the episode. All randomness comes from torch's global generator.
+    """
+
+    action_size = 2
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        simulator: Simulator,
+        *,
+        reward: RewardSource = "abstract",
+        topple: bool = False,
+        blocked_reward: float = 0.0,
+        starts: DataStarts | None = None,
+        data_start_share: float = 0.0,
+    ) -> None:
+        """Put the task into `simulator`.
+
+        Args:
+            navigation: the task.
+            simulator: raw or grounded.
+            reward: where the reward comes from.
+            topple: end episodes by the topple head.
+            blocked_reward: added in steps in which the simulator was stopped at the edge of its space.
+            starts: recorded moments to start from.
+            data_start_share: share of the episodes that start from `starts`.
+        """
+        self.navigation = navigation
+        self.simulator = simulator
+        self.grounded = simulator if isinstance(simulator, GroundedSimulator) else None
+        self.reward = reward
+        self.topple = topple
+        self.blocked_reward = blocked_reward
+        self.starts = starts
+        self.data_start_share = data_start_share
+        self.device = simulator.state.device
+        self.num_envs = len(simulator.state)
+        self.goal = torch.zeros(self.num_envs, 2, device=self.device)
+        self.toppled = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.observation_size = self._observe().shape[1]
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Start the rows in `mask` (B,) anew, by default all; return observations (B, O)."""
+        rows = torch.arange(self.num_envs, device=self.device) if mask is None else mask.nonzero().squeeze(1)
+        if len(rows):
+            from_data = torch.rand(len(rows), device=self.device) < self.data_start_share
+            self._start_task(rows[~from_data])
+            if self.starts is not None:
+                self._start_from_data(rows[from_data], self.starts)
+        return self._observe()
+
+    def _start_task(self, rows: Tensor) -> None:
+        rng = np.random.default_rng(int(torch.randint(2**62, ())))
+        position = self.navigation.draw_starts(rng, len(rows))
+        goal = self.navigation.draw_goals(rng, len(rows))
+        state = np.concatenate([position, np.zeros_like(position)], axis=1)
+        self._set(rows, self._tensor(state), self._tensor(goal))
+
+    def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
+        moments = torch.randint(len(starts.state), (len(rows),), device=self.device)
+        hidden = None if starts.hidden is None else starts.hidden[moments]
+        self._set(
+            rows, starts.state[moments], starts.goal[moments], hidden, starts.previous_action[moments]
+        )
+
+    def _set(
+        self,
+        rows: Tensor,
+        state: Tensor,
+        goal: Tensor,
+        hidden: Tensor | None = None,
+        previous_action: Tensor | None = None,
+    ) -> None:
+        self.goal[rows] = goal
+        if isinstance(self.simulator, GroundedSimulator):
+            self.simulator.reset_to(state, rows, goal, hidden=hidden, previous_action=previous_action)
+        else:
+            self.simulator.reset_to(state, rows)
+
+    def _tensor(self, values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values).float().to(self.device)
+
+    def step(self, action: Tensor) -> Step:
+        """Apply `action` (B, 2), clipped to ±1."""
+        action = action.clamp(-1.0, 1.0)
+        before = self.simulator.state
+        latent = None if self.grounded is None else self.grounded.latent
+        after = self.simulator.step(action)
+        success = self.navigation.reached(after[:, :2], self.goal)
+        self.toppled = torch.zeros_like(success)
+        penalty = self.blocked_reward * self.simulator.blocked
+        if self.grounded is not None and latent is not None and (self.topple or self.reward == "blend"):
+            with torch.no_grad():
+                risk = self.grounded.model.topple_logit(latent, action, after).sigmoid()
+            if self.topple:
+                self.toppled = (torch.rand_like(risk) < risk) & ~success
+            else:
+                penalty = penalty + self.navigation.topple_reward * risk
+        if self.reward == "predicted" and self.grounded is not None and latent is not None:
+            with torch.no_grad():
+                reward = self.grounded.model.predict_reward(latent, action)
+        else:
+            reward = self.navigation.reward(before[:, :2], after[:, :2], self.goal, self.toppled)
+        return Step(
+            observation=self._observe(),
+            reward=reward + penalty,
+            terminated=success | self.toppled,
+            success=success,
+        )
+
+    def _observe(self) -> Tensor:
+        latent = None if self.grounded is None else self.grounded.latent
+        return policy_observation(self.navigation.maze, self.simulator.state, self.goal, latent)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return everything that a later `load_state_dict` needs to go on from here."""
+        state = {"state": self.simulator.state, "goal": self.goal}
+        if self.grounded is not None:
+            state["hidden"] = self.grounded.hidden
+        return state
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
+        """Go on from `state`; return the observations (B, O)."""
+        self.goal = state["goal"].clone()
+        if isinstance(self.simulator, GroundedSimulator):
+            self.simulator.simulator.reset_to(state["state"])
+        else:
+            self.simulator.reset_to(state["state"])
+        if self.grounded is not None:
+            self.grounded.goal = state["goal"].clone()
+            self.grounded.hidden = state["hidden"].clone()
+        return self._observe()

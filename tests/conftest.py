@@ -1,0 +1,27 @@
+import importlib
+from typing import TYPE_CHECKING
+
+import fake_stages
+import pytest
+from pydantic import create_model
+
+if TYPE_CHECKING:
+    from astra_data.plan import Recipe
+
+
+@pytest.fixture
+def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
+    """Replace the stages, methods and tasks by fake ones, and return the model of their recipes."""
+    # Imported here, so that tests of other parts need not wait for every stage.
+    plan = importlib.import_module("astra_data.plan")
+    sections = {name: (fake_stages.FakeConfig, ...) for name in (*plan.STAGES, "plus")}
+    model: type[Recipe] = create_model("FakeRecipe", __base__=plan.Recipe, **sections)  # type: ignore[call-overload]
+    for stage in plan.STAGES:
+        monkeypatch.setattr(plan, stage, getattr(fake_stages, stage))
+    monkeypatch.setattr(plan, "METHODS", fake_stages.METHODS)
+    monkeypatch.setattr(plan, "TASKS", {"maze": None})
+    monkeypatch.setattr("astra_data.run.Recipe", model)
+    # Without torch and the real stages, the spawned processes start at once.
+    monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
+    monkeypatch.setattr("torch.set_num_threads", int)
+    return model

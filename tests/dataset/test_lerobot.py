@@ -1,0 +1,146 @@
+"""What we write, seen by lerobot: its loader opens it, and the constants that we repeat are its own."""
+
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from fake_dataset import COLUMNS, LENGTHS, write_fake
+
+from astra_data.columns import ACTION, REWARD, STATE
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+
+@pytest.fixture(scope="module")
+def lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
+    """The modules of lerobot that the tests need, with a cache of their own and no network."""
+    patch = pytest.MonkeyPatch()
+    patch.setenv("HF_HUB_OFFLINE", "1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        modules = SimpleNamespace(
+            package=import_module("lerobot.datasets"),
+            features=import_module("lerobot.datasets.feature_utils"),
+            dataset=import_module("lerobot.datasets.lerobot_dataset"),
+            files=import_module("lerobot.datasets.utils"),
+            names=import_module("lerobot.utils.constants"),
+        )
+    cache = tmp_path_factory.mktemp("cache")
+    patch.setattr(import_module("datasets").config, "HF_DATASETS_CACHE", cache)
+    yield modules
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_fake(tmp_path_factory.mktemp("lerobot") / "set")
+
+
+@pytest.fixture(scope="module")
+def reference(lerobot: SimpleNamespace, fake: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same values, written by lerobot itself."""
+    root = tmp_path_factory.mktemp("reference") / "set"
+    columns = [*COLUMNS, layout.EPISODE_UID_COLUMN]
+    features = {column.name: column.feature() | {"shape": (column.size,)} for column in columns}
+    written = lerobot.dataset.LeRobotDataset.create("a/b", 20, features, root=root, use_videos=False)
+    for episode in fake.episodes():
+        for frame in range(len(episode)):
+            values = {name: np.atleast_1d(column[frame]) for name, column in episode.columns.items()}
+            written.add_frame({**values, "episode_uid": np.array([episode.uid]), "task": "run"})
+        written.save_episode()
+    written.finalize()
+    return root
+
+
+def test_constants_are_lerobots(lerobot: SimpleNamespace) -> None:
+    files = lerobot.files
+    assert layout.CODEBASE_VERSION == lerobot.package.CODEBASE_VERSION
+    assert layout.CHUNK_SIZE == files.DEFAULT_CHUNK_SIZE
+    assert layout.DATA_FILE_SIZE_MB == files.DEFAULT_DATA_FILE_SIZE_IN_MB
+    assert layout.VIDEO_FILE_SIZE_MB == files.DEFAULT_VIDEO_FILE_SIZE_IN_MB
+    assert (layout.INFO_PATH, layout.STATS_PATH) == (files.INFO_PATH, files.STATS_PATH)
+    assert layout.TASKS_PATH == files.DEFAULT_TASKS_PATH
+    assert layout.EPISODES_PATH == files.DEFAULT_EPISODES_PATH
+    assert layout.DATA_PATH == files.DEFAULT_DATA_PATH
+    assert list(layout.QUANTILES) == lerobot.package.DEFAULT_QUANTILES
+    defaults = {c.name: c.feature() | {"shape": (c.size,)} for c in layout.DEFAULT_COLUMNS}
+    assert defaults == lerobot.names.DEFAULT_FEATURES
+
+
+def test_the_arrow_schema_is_lerobots(lerobot: SimpleNamespace) -> None:
+    stored = layout.stored_columns(COLUMNS)
+    features = {column.name: column.feature() | {"shape": (column.size,)} for column in stored}
+    expected = lerobot.features.get_hf_features_from_features(features).arrow_schema
+    ours = layout.data_schema(stored)
+    assert ours.remove_metadata().equals(expected.remove_metadata())
+    assert json.loads(ours.metadata[b"huggingface"]) == json.loads(expected.metadata[b"huggingface"])
+
+
+def test_info_has_lerobots_fields(lerobot: SimpleNamespace, fake: Dataset) -> None:
+    info = lerobot.files.DatasetInfo.from_dict(json.loads((fake.root / "meta/info.json").read_text()))
+    assert info.to_dict() == fake.info
+    assert set(asdict(info)) - set(fake.info) == {"tools"}
+
+
+def test_files_equal_those_that_lerobot_writes(fake: Dataset, reference: Path) -> None:
+    def strip(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{key: row[key] for key in row if not key.startswith("stats/")} for row in rows]
+
+    assert json.loads((reference / "meta/info.json").read_text()) == fake.info
+    for name in ("data", "meta/episodes"):
+        path = f"{name}/chunk-000/file-000.parquet"
+        ours, theirs = pq.read_table(fake.root / path), pq.read_table(reference / path)
+        assert ours.schema.remove_metadata().equals(theirs.schema.remove_metadata().empty_table().schema)
+        assert strip(ours.to_pylist()) == strip(theirs.to_pylist())
+    theirs, ours = (pq.read_table(root / "meta/tasks.parquet").to_pandas() for root in (reference, fake.root))
+    assert ours.equals(theirs)
+    assert ours.index.name == theirs.index.name == "task"
+
+
+def test_statistics_agree_with_lerobots_where_its_own_are_exact(fake: Dataset, reference: Path) -> None:
+    ours, theirs = (json.loads((root / "meta/stats.json").read_text()) for root in (fake.root, reference))
+    assert set(ours) == set(theirs)
+    for name, stats in theirs.items():
+        assert set(stats) == set(ours[name])
+        for key in ("min", "max", "mean", "count"):
+            np.testing.assert_allclose(ours[name][key], stats[key], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours[ACTION]["std"], theirs[ACTION]["std"], rtol=1e-4)
+
+
+def test_lerobots_loader_sees_every_value(lerobot: SimpleNamespace, fake: Dataset) -> None:
+    loaded = lerobot.dataset.LeRobotDataset("a/b", root=fake.root, video_backend="pyav")
+    assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (len(LENGTHS), sum(LENGTHS), 20)
+    ours = fake.columns(list(fake.features))
+    items = [loaded[index] for index in range(len(loaded))]
+    assert {item["task"] for item in items} == {"run"}
+    for name, values in ours.items():
+        np.testing.assert_array_equal(np.stack([item[name].numpy() for item in items]), values)
+    assert loaded.meta.features[STATE]["astra"]["role"] == ["position", "position", "heading"]
+
+
+def test_lerobots_windows_are_cut_from_our_columns(lerobot: SimpleNamespace, fake: Dataset) -> None:
+    offsets = np.array([-2, -1, 0, 1])
+    names = (STATE, ACTION, REWARD)
+    deltas = {name: (offsets / 20).tolist() for name in names}
+    loaded = lerobot.dataset.LeRobotDataset(
+        "a/b", root=fake.root, delta_timestamps=deltas, video_backend="pyav"
+    )
+    ours = fake.columns(names)
+    for start, length in zip(fake.starts, fake.lengths, strict=True):
+        for frame in range(length):
+            item = loaded[int(start + frame)]
+            inside = (frame + offsets >= 0) & (frame + offsets < length)
+            rows = start + np.clip(frame + offsets, 0, length - 1)
+            for name in names:
+                np.testing.assert_array_equal(item[name].numpy(), ours[name][rows])
+                np.testing.assert_array_equal(item[f"{name}_is_pad"].numpy(), ~inside)

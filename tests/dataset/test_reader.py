@@ -1,0 +1,207 @@
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_episodes, write_fake, writer
+
+from astra_data.columns import STATE, TIMESTAMP, Episode
+from astra_data.dataset import Dataset, parquet
+from astra_data.errors import BadInputError, CorruptDatasetError
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_fake(tmp_path_factory.mktemp("reader") / "set")
+
+
+def test_columns_come_back_whole(fake: Dataset) -> None:
+    columns = fake.columns([column.name for column in COLUMNS])
+    for name, values in columns.items():
+        expected = concatenated(name)
+        assert values.dtype == expected.dtype
+        assert values.flags.c_contiguous
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_starts_and_lengths_cut_columns_into_episodes(fake: Dataset) -> None:
+    assert fake.lengths.tolist() == list(LENGTHS)
+    assert fake.starts.tolist() == [0, 7, 8, 20, 50]
+    frame = fake.columns([TIMESTAMP])[TIMESTAMP]
+    assert (frame[fake.starts] == 0).all()
+
+
+@pytest.mark.parametrize("block_rows", [1, 10, 2**16])
+def test_episodes_come_back_one_by_one(
+    fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int
+) -> None:
+    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
+    for found, expected in zip(fake.episodes(), fake_episodes(), strict=True):
+        assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
+        assert list(found.columns) == list(expected.columns)
+        for name, values in expected.columns.items():
+            assert found.columns[name].flags.writeable
+            np.testing.assert_array_equal(found.columns[name], values)
+    assert [list(episode.columns) for episode in fake.episodes([STATE])] == [[STATE]] * len(LENGTHS)
+
+
+@pytest.mark.parametrize("rows", [3, 1000])
+def test_files_cut_without_regard_for_episodes_read_the_same(tmp_path: Path, rows: int) -> None:
+    dataset = write_fake(tmp_path / "set")
+    [path] = dataset.paths
+    pq.write_table(pq.read_table(path), path, row_group_size=rows, compression="zstd")
+    again = Dataset.open(dataset.root)
+    assert again.verify() == []
+    for found, expected in zip(again.episodes(), fake_episodes(), strict=True):
+        np.testing.assert_array_equal(found.columns[STATE], expected.columns[STATE])
+
+
+def test_what_the_writer_was_told_comes_back(fake: Dataset) -> None:
+    assert fake.schema == list(COLUMNS)
+    assert fake.features[STATE]["astra"]["role"] == ["position", "position", "heading"]
+    assert fake.uids.tolist() == [13, 4, 2**53 + 1, 6, 0]
+    assert fake.metadata["success"] == [True, False, True, False, False]
+    assert fake.metadata["source_episode"] == [None, None, 2**53, 5, -1]
+    assert fake.description["config"] == {"episodes": 5, "noise_m": 0.1}
+    assert fake.info["fps"] == 20
+    assert fake.reference == "fake@data-1.0.0"
+    assert repr(fake).startswith(
+        "Dataset(fake@data-1.0.0, 5 episodes, 55 steps, observation.state (3) float32"
+    )
+
+
+def test_subsets_are_nested_and_follow_the_uid(fake: Dataset, tmp_path: Path) -> None:
+    subsets = [fake.subset(count) for count in range(1, 6)]
+    assert all(small == large[: len(small)] for small, large in itertools.pairwise(subsets))
+    assert sorted(subsets[-1]) == [0, 1, 2, 3, 4]
+    with writer(tmp_path / "reversed") as open_writer:
+        for episode in fake_episodes()[::-1]:
+            open_writer.add(episode)
+    other = Dataset.open(tmp_path / "reversed")
+    assert other.uids[other.subset(3)].tolist() == fake.uids[fake.subset(3)].tolist()
+    assert write_fake(tmp_path / "seeded", subset_seed=1).subset(5) != fake.subset(5)
+    with pytest.raises(BadInputError, match="a subset of 6 episodes, expected 1 to 5"):
+        fake.subset(6)
+
+
+def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
+    with pytest.raises(BadInputError, match=r"has no column reward; it has observation\.state, action"):
+        fake.columns(["reward"])
+
+
+def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no dataset there"):
+        Dataset.open(tmp_path / "typo")
+
+
+def truncate(name: str) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-20])
+
+
+def edit(name: str, **changes: object) -> Callable[[Path], None]:
+    def change(root: Path) -> None:
+        path = root / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return change
+
+
+def drop_rows(root: Path) -> None:
+    path = root / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(path).slice(0, 50).drop_columns(["action"]), path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (truncate("data/chunk-000/file-000.parquet"), ["file-000.parquet is truncated"]),
+        (truncate("meta/episodes/chunk-000/file-000.parquet"), ["file-000.parquet cannot be read"]),
+        (truncate("meta/astra/episodes.parquet"), ["episodes.parquet cannot be read"]),
+        (truncate("meta/info.json"), ["info.json is no JSON"]),
+        (lambda root: (root / "data/chunk-000/file-000.parquet").unlink(), ["file-000.parquet is missing"]),
+        (lambda root: (root / "meta/stats.json").unlink(), ["meta/stats.json missing"]),
+        (
+            lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
+            ["meta/episodes or meta/astra/episodes.parquet has no rows"],
+        ),
+        (
+            edit("meta/info.json", total_frames=54, total_episodes=4),
+            ["has 5 episodes, expected 4", "expected 54"],
+        ),
+        (edit("meta/info.json", codebase_version="v2.1"), ["the format is v2.1, expected v3.0"]),
+        (edit("meta/astra/subsets.json", uids=[1, 2]), ["lists other episodes"]),
+        (drop_rows, ["has 50 rows, expected 55", "lacks column action"]),
+        (
+            lambda root: (root / "data/chunk-000/file-001.parquet").write_bytes(b""),
+            ["file-001.parquet does not belong"],
+        ),
+        (
+            lambda root: (root / "meta/info.json").write_text('{"codebase_version": "v3.0"}'),
+            ["'features' is missing"],
+        ),
+    ],
+)
+def test_damage_is_told_in_one_line(
+    tmp_path: Path, damage: Callable[[Path], object], parts: list[str]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    damage(root)
+    with pytest.raises(CorruptDatasetError) as caught:
+        Dataset.open(root)
+    message = str(caught.value)
+    assert message.startswith(f"{root} is incomplete or was altered: ")
+    assert message.endswith("or delete the folder and run the stage that wrote it again.")
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_damage_behind_an_open_dataset_is_told_too(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    truncate("data/chunk-000/file-000.parquet")(dataset.root)
+    with pytest.raises(CorruptDatasetError, match="cannot be read"):
+        dataset.columns([STATE])
+    assert "cannot be read" in dataset.verify()[0]
+
+
+def test_verify_finds_altered_values(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    [path] = dataset.paths
+    table = pq.read_table(path)
+    frame = table.column_names.index("frame_index")
+    changed = table.column("frame_index").to_numpy().copy()
+    changed[9] = 7
+    pq.write_table(table.set_column(frame, table.schema.field(frame), [changed]), path)
+    faults = Dataset.open(dataset.root).verify()
+    assert faults[0] == "frame_index has a wrong value in episode 2 frame 1"
+    assert faults[1].startswith("the content hash is ")
+    assert len(faults) == 2
+
+
+def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:
+    fake = write_fake(tmp_path / "one")
+    renamed = write_fake(tmp_path / "two", task="walk", description={"name": "other", "stage": "import"})
+    assert renamed.content_hash == fake.content_hash
+    columns = fake_columns(7, seed=13)
+    columns[STATE][3, 0] = np.nextafter(columns[STATE][3, 0], np.float32(9))
+    with writer(tmp_path / "three") as open_writer:
+        open_writer.add(Episode(13, columns))
+        for episode in fake_episodes()[1:]:
+            open_writer.add(episode)
+    assert Dataset.open(tmp_path / "three").content_hash != fake.content_hash
+
+
+def test_reading_needs_neither_torch_nor_lerobot_nor_pandas(fake: Dataset) -> None:
+    code = (
+        "import sys; from pathlib import Path; from astra_data.dataset import Dataset; "
+        "Dataset.open(Path(sys.argv[1])).columns(['action']); "
+        "print([name for name in ('torch', 'lerobot', 'datasets', 'pandas') if name in sys.modules])"
+    )
+    command = [sys.executable, "-c", code, str(fake.root)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,167 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import fake_dataset
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from fake_dataset import COLUMNS, fake_columns, fake_episode, fake_episodes, write_fake, writer
+
+from astra_data.columns import ACTION, REWARD, STATE, Column, Episode
+from astra_data.dataset import Dataset, episode_rows, parquet
+from astra_data.errors import BadInputError
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def test_the_same_episodes_give_the_same_bytes_in_every_file(tmp_path: Path) -> None:
+    write_fake(tmp_path / "one")
+    write_fake(tmp_path / "two" / "deeper")
+    assert files(tmp_path / "one") == files(tmp_path / "two" / "deeper")
+    assert sorted(files(tmp_path / "one")) == [
+        "data/chunk-000/file-000.parquet",
+        "meta/astra/dataset.json",
+        "meta/astra/episodes.parquet",
+        "meta/astra/subsets.json",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+    ]
+
+
+def test_one_row_group_per_episode_in_encodings_that_suit_the_values(tmp_path: Path) -> None:
+    [path] = write_fake(tmp_path / "set").paths
+    metadata = pq.read_metadata(path)
+    lengths = [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)]
+    assert lengths == list(fake_dataset.LENGTHS)
+    chunks = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
+    encodings = {chunk.path_in_schema: chunk.encodings for chunk in chunks}
+    assert "BYTE_STREAM_SPLIT" in encodings["observation.state.list.element"]
+    assert "BYTE_STREAM_SPLIT" in encodings["next.reward"]
+    assert "DELTA_BINARY_PACKED" in encodings["mode"]
+    assert {chunk.compression for chunk in chunks} == {"SNAPPY"}
+
+
+def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = write_fake(tmp_path / "whole")
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
+    monkeypatch.setattr(parquet, "CHUNK_SIZE", 2)
+    monkeypatch.setattr(episode_rows, "ROWS_AT_ONCE", 2)
+    split = write_fake(tmp_path / "split")
+    names = [str(path.relative_to(split.root)) for path in split.paths]
+    assert names[:3] == [
+        f"data/chunk-{at}.parquet" for at in ("000/file-000", "000/file-001", "001/file-000")
+    ]
+    assert len(list((split.root / "meta/episodes").glob("*/*.parquet"))) == 3
+    assert split.verify() == []
+    assert split.content_hash == whole.content_hash
+    for name in whole.features:
+        np.testing.assert_array_equal(whole.columns([name])[name], split.columns([name])[name])
+
+
+@pytest.mark.parametrize("moment", ["adding", "validating", "renaming"])
+def test_a_kill_leaves_nothing_and_the_next_run_succeeds(tmp_path: Path, moment: str) -> None:
+    root = tmp_path / "set"
+    command = [sys.executable, fake_dataset.__file__, str(root), moment]
+    done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False)
+    assert done.returncode == -signal.SIGKILL
+    [left] = tmp_path.iterdir()
+    assert left.name.startswith(".set.tmp-")
+    assert write_fake(root).verify() == []
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def test_an_exception_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), writer(tmp_path / "set") as open_writer:
+        open_writer.add(fake_episode(1, 5))
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    before = files(write_fake(tmp_path / "set").root)
+    with pytest.raises(BadInputError, match="exists already; delete it or choose another"):
+        write_fake(tmp_path / "set")
+    assert files(tmp_path / "set") == before
+
+
+def test_two_writers_do_not_meet(tmp_path: Path) -> None:
+    with writer(tmp_path / "set") as first:
+        first.add(fake_episode(1, 5))
+        with pytest.raises(BadInputError, match="being written right now"), writer(tmp_path / "set"):
+            pass
+    assert Dataset.open(tmp_path / "set").verify() == []
+
+
+def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_path: Path) -> None:
+    bad = fake_columns(4, seed=0) | {"extra": np.zeros(4, np.float32), "mode": np.zeros(4, bool)}
+    del bad[REWARD]
+    bad[ACTION] = np.zeros((4, 3), np.float32)
+    with pytest.raises(BadInputError) as caught, writer(tmp_path / "set") as open_writer:
+        open_writer.add(fake_episode(1, 5))
+        open_writer.add(Episode(1, bad, {"return": 1, "length": 4}))
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in (
+        "Episode 1",
+        "next.reward: missing",
+        "extra: unknown column",
+        "action: shape (4, 3), expected (T, 2)",
+        "mode: dtype bool, expected int64",
+        "metadata return: int, earlier episodes have float",
+        "metadata length: is the writer's",
+        "same uid",
+    ):
+        assert part in message
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_refused_episode_leaves_the_others_alone(tmp_path: Path) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for episode in fake_episodes():
+            open_writer.add(episode)
+            with pytest.raises(BadInputError):
+                open_writer.add(episode)
+    assert files(tmp_path / "set") == files(write_fake(tmp_path / "other").root)
+
+
+def test_a_dataset_needs_an_episode(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no episodes"), writer(tmp_path / "set"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_arguments_are_checked_together(tmp_path: Path) -> None:
+    columns = [*COLUMNS, Column("index", "int64"), COLUMNS[0]]
+    with pytest.raises(BadInputError, match=f"{STATE} is given twice; .*index is the writer's.*; fps 0"):
+        writer(tmp_path / "set", columns=columns, fps=0)
+    description = {"name": "a b", "versoin": "1", "parents": [{"name": "x"}], "config": {"x": float("inf")}}
+    with pytest.raises(BadInputError) as caught:
+        writer(tmp_path / "set", description=description)
+    for part in (
+        "'a b'",
+        "unknown key 'versoin'",
+        "stage None",
+        "expected name, version and hash",
+        "plain JSON",
+    ):
+        assert part in str(caught.value)
+
+
+def test_the_dataset_says_where_it_comes_from(tmp_path: Path) -> None:
+    raw = write_fake(tmp_path / "raw")
+    description = {"name": "fake", "version": "1.1.0", "stage": "pair", "parents": [raw.identity]}
+    paired = write_fake(tmp_path / "paired", description=description)
+    said = json.loads((paired.root / "meta/astra/dataset.json").read_text())
+    assert said["parents"] == [{"name": "fake", "version": "1.0.0", "hash": raw.content_hash}]
+    assert paired.reference == "fake@data-1.1.0"
+    assert set(said["packages"]) == {"astra-data", "gymnasium-robotics", "lerobot", "mujoco"}
+    assert said["packages"]["mujoco"]
+    assert "git_commit" in said

@@ -1,0 +1,42 @@
+"""Items for the scheduler that import nothing slow; spawned processes find them by name."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from astra_data.errors import MissingStageError
+from astra_data.progress import Progress
+
+
+def touch(path: Path, needs: tuple[Path, ...], *, progress: Progress) -> None:
+    assert all(need.exists() for need in needs)
+    progress(0.5, "half")
+    path.touch()
+
+
+def rendezvous(mine: Path, theirs: Path, *, progress: Progress) -> None:
+    """Finish only if another item runs at the same time."""
+    mine.touch()
+    until = time.monotonic() + 20
+    while not theirs.exists():
+        assert time.monotonic() < until, "the other item did not start"
+        time.sleep(0.01)
+
+
+def fail(*, progress: Progress) -> None:
+    raise MissingStageError("nothing to eat")
+
+
+def crash(*, progress: Progress) -> None:
+    print("about to crash")
+    raise ValueError("a bug")
+
+
+def kill_itself(*, progress: Progress) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def hang(path: Path, *, progress: Progress) -> None:
+    path.write_text(str(os.getpid()))
+    time.sleep(600)

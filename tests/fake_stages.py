@@ -1,0 +1,136 @@
+"""Stages with the real signatures that only write down what they were asked.
+
+Spawned processes find them by name; nothing slow is imported.
+"""
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from astra_data.errors import BadInputError
+from astra_data.progress import Progress
+from astra_data.recipe import Config
+
+
+@dataclass(frozen=True)
+class Reported:
+    name: str
+    task: str
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+
+class FakeConfig(Config):
+    steps: int = 1
+    rate: float = 0.5
+    fails: bool = False
+
+
+class FakeMethod:
+    def __init__(self, grounds: bool, aligns: bool, trains: bool) -> None:
+        self.grounds, self.aligns, self.trains = grounds, aligns, trains
+
+
+METHODS = {
+    "follower": FakeMethod(grounds=False, aligns=False, trains=False),
+    "direct_transfer": FakeMethod(grounds=False, aligns=False, trains=True),
+    "nas": FakeMethod(grounds=True, aligns=False, trains=True),
+    "astra": FakeMethod(grounds=True, aligns=True, trains=True),
+}
+
+
+def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -> None:
+    folder = out.with_name(f".{out.name}.partial")
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "attempts").open("a") as file:
+        file.write(".")
+    progress(0.5, "half")
+    if config.fails:
+        raise BadInputError("told to fail")
+    (folder / "asked.json").write_text(json.dumps(asked | {"steps": config.steps}, default=str))
+    os.replace(folder, out)
+
+
+def collect(task: str, config: FakeConfig, *, seed: int, out: Path, progress: Progress) -> None:
+    _write(config, out, progress, task=task, seed=seed)
+
+
+def pair(task: str, config: FakeConfig, *, dataset: Path, out: Path, progress: Progress) -> None:
+    _write(config, out, progress, task=task, dataset=dataset)
+
+
+def ground(
+    task: str,
+    method: str,
+    config: FakeConfig,
+    *,
+    dataset: Path,
+    seed: int,
+    out: Path,
+    device: str,
+    progress: Progress,
+) -> None:
+    _write(config, out, progress, task=task, method=method, dataset=dataset, seed=seed, device=device)
+
+
+def train(
+    task: str,
+    method: str,
+    config: FakeConfig,
+    *,
+    dataset: Path,
+    grounding: Path | None,
+    seed: int,
+    out: Path,
+    device: str,
+    progress: Progress,
+) -> None:
+    _write(config, out, progress, task=task, method=method, dataset=dataset, grounding=grounding, seed=seed)
+
+
+def align(
+    task: str,
+    method: str,
+    config: FakeConfig,
+    *,
+    dataset: Path,
+    grounding: Path,
+    seed: int,
+    out: Path,
+    device: str,
+    progress: Progress,
+) -> None:
+    _write(config, out, progress, task=task, method=method, dataset=dataset, grounding=grounding, seed=seed)
+
+
+def evaluate(
+    task: str,
+    method: str,
+    config: FakeConfig,
+    *,
+    policy: Path | None,
+    grounding: Path | None,
+    target_encoder: Path | None,
+    seed: int,
+    out: Path,
+    device: str,
+    progress: Progress,
+) -> None:
+    asked = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
+    _write(config, out, progress, task=task, method=method, seed=seed, **asked)
+
+
+def report(
+    recipe: Reported,
+    *,
+    root: Path,
+    command: str,
+    publish: Path | None,
+    progress: Progress,
+    config: FakeConfig,
+) -> None:
+    asked = {"name": recipe.name, "methods": recipe.methods, "command": command, "publish": publish}
+    shutil.rmtree(root / "report", ignore_errors=True)
+    _write(config, root / "report", progress, **asked)

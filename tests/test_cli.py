@@ -1,0 +1,61 @@
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from astra_data import cli
+from astra_data.errors import BadInputError
+
+HEAVY = {"torch", "numpy", "pydantic", "lerobot", "mujoco", "matplotlib"}
+
+
+def test_help_loads_nothing_slow() -> None:
+    code = "import sys, astra_data.cli; print(*sorted(name for name in sys.modules if '.' not in name))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not HEAVY & set(loaded.split())
+
+
+def test_help_answers_at_once() -> None:
+    command = [sys.executable, "-m", "astra_data.cli", "--help"]
+
+    def processor_seconds() -> float:
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return usage.ru_utime + usage.ru_stime
+
+    # Processor time rather than the clock's, so that other work on the machine does not count.
+    before = processor_seconds()
+    subprocess.run(command, check=True, capture_output=True)
+    assert processor_seconds() - before < 0.5
+
+
+def test_version() -> None:
+    result = CliRunner().invoke(cli.app, ["--version"])
+    assert result.exit_code == 0
+    assert result.output.startswith("astra-data 0.")
+
+
+def test_bad_input_is_one_line_and_exit_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["astra-data", "check", str(tmp_path / "none.toml")])
+    with pytest.raises(SystemExit, match="1"):
+        cli.main()
+    assert capsys.readouterr().err == f"error: {tmp_path / 'none.toml'} does not exist\n"
+
+
+def test_debugging_shows_the_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken() -> None:
+        raise BadInputError("expected this")
+
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(SystemExit, match="1"):
+        cli.main()
+    assert capsys.readouterr().err == "error: expected this\n"
+    monkeypatch.setenv("ASTRA_DATA_DEBUG", "1")
+    with pytest.raises(BadInputError):
+        cli.main()

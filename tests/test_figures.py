@@ -1,0 +1,165 @@
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+
+from astra_data.figures import (
+    Curve,
+    OpenLoop,
+    Panel,
+    dynamics_mismatch,
+    learning_curves,
+    method_colour,
+    method_title,
+    open_loop_error,
+    png,
+    success_bars,
+    trajectories,
+)
+from astra_data.figures.style import COLOURS, DEPLOYED, SIMULATED
+from astra_data.mazes import U_MAZE
+
+ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "astra_plus", "follower")
+
+
+def legend(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def panel(method: str, *, in_simulator: bool = True) -> Panel:
+    target = np.full((3, 10, 2), np.nan)
+    target[0] = np.linspace([-4, 4], [4, 4], 10)
+    target[1, :4] = np.linspace([-4, 4], [0, 4], 4)
+    target[2, :6] = np.linspace([-4, 4], [1, 4], 6)
+    simulated = target[:1] if in_simulator else np.empty((0, 1, 2))
+    return Panel(
+        method=method,
+        success=1 / 3,
+        target=target,
+        target_success=np.array([True, False, False]),
+        simulated=simulated,
+        simulated_success=np.ones(len(simulated), dtype=bool),
+        goal=np.full((3, 2), -4.0),
+    )
+
+
+def test_titles_follow_from_the_names() -> None:
+    assert [method_title(row) for row in ROWS] == [
+        "Direct transfer",
+        "NAS",
+        "ASTRA",
+        "Direct transfer+",
+        "NAS+",
+        "ASTRA+",
+        "Careful follower",
+    ]
+    assert method_title("my_own_plus") == "My own+"
+
+
+def test_every_row_has_its_own_colour_and_a_plus_row_its_base_rows_darker() -> None:
+    assert len({method_colour(row) for row in ROWS}) == len(ROWS)
+    for base in (*COLOURS, "my_own"):
+        light, dark = to_rgb(method_colour(base)), to_rgb(method_colour(f"{base}_plus"))
+        assert sum(dark) < sum(light)
+        assert dark == pytest.approx([0.68 * channel for channel in light], abs=0.01)
+    assert method_colour("my_own") == method_colour("my_own")
+
+
+def test_success_bars_show_bars_seeds_and_intervals() -> None:
+    scores = {"nas": np.array([0.2, 0.4, 0.3]), "astra_plus": np.array([0.8]), "follower": np.array([1.0])}
+    intervals = {
+        "nas": (0.3, 0.2, 0.4),
+        "astra_plus": (0.8, np.nan, np.nan),
+        "follower": (1.0, np.nan, np.nan),
+    }
+    figure = success_bars(scores, intervals, {"nas": 0.9, "astra_plus": 0.95})
+    axes = figure.axes[0]
+    assert [bar.get_height() for bar in axes.patches] == [0.3, 0.8, 1.0]  # type: ignore[attr-defined]
+    assert [bool(bar.get_hatch()) for bar in axes.patches] == [False, True, False]
+    assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [method_colour(row) for row in scores]
+    dots = [line for line in axes.lines if line.get_marker() == "o"]
+    assert [sorted(np.asarray(line.get_ydata())) for line in dots] == [[0.2, 0.3, 0.4], [0.8], [1.0]]
+    assert sum(line.get_marker() == "D" for line in axes.lines) == 2
+    assert sum(line.get_marker() == "None" for line in axes.lines) == 1  # one interval
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert labels == ["NAS", "ASTRA+", "Careful\nfollower\n(ceiling)"]
+    assert [text.get_text() for text in axes.texts] == ["0.30", "0.80", "1.00"]
+    assert "in its own simulator" in legend(figure)
+
+
+def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
+    curves = {
+        "nas": [
+            Curve(np.array([0.0, 100.0]), np.array([0.0, 1.0])),
+            Curve(np.array([0.0, 50.0, 200.0]), np.array([np.nan, 0.5, 0.5])),
+        ],
+        "astra_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
+    }
+    figure = learning_curves(curves)
+    axes = figure.axes[0]
+    assert legend(figure) == ["NAS", "ASTRA+"]
+    assert len(axes.collections) == 1  # a band needs two seeds
+    nas, astra = axes.lines
+    assert (nas.get_linestyle(), astra.get_linestyle()) == ("-", "--")
+    steps, success = np.asarray(nas.get_xdata()), np.asarray(nas.get_ydata())
+    assert (steps[0], steps[-1]) == (50.0, 100.0)
+    assert (success[0], success[-1]) == pytest.approx((0.5, 0.75))
+
+
+def test_trajectories_draw_a_panel_per_row_with_crosses_where_episodes_fail() -> None:
+    figure = trajectories(U_MAZE, [panel("astra"), panel("follower", in_simulator=False)])
+    astra, follower = figure.axes
+    assert (astra.get_title(loc="left"), astra.get_title(loc="right")) == ("ASTRA", "0.33")
+    assert follower.get_title(loc="left") == "Careful follower"
+    paths = [line for line in astra.lines if line.get_linestyle() != "None"]
+    looks = [(line.get_color(), line.get_linestyle()) for line in paths]
+    assert looks == [(DEPLOYED, "-")] * 3 + [(SIMULATED, "--")]
+    crosses = [line for line in astra.lines if line.get_marker() == "x" and line.get_color() == DEPLOYED]
+    assert [(line.get_xdata()[0], line.get_ydata()[0]) for line in crosses] == [(0.0, 4.0), (1.0, 4.0)]  # type: ignore[index]
+    assert sum(line.get_marker() == "*" for line in astra.lines) == 1
+    assert not [line for line in follower.lines if line.get_color() == SIMULATED]
+    (walls,) = astra.collections
+    assert len(walls.get_paths()) == len(U_MAZE.wall_cells())
+
+
+def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:
+    time_s = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
+    simulated = np.tile([1.0, 2.0, 3.0, 4.0], (5, 1))
+    target = np.stack([simulated, simulated + 1])
+    target[1, 4] = np.nan
+    figure = dynamics_mismatch(time_s, np.zeros((5, 2)), simulated, target)
+    x, y, speed, command = figure.axes
+    labels = [axes.get_ylabel() for axes in (x, y, speed, command)]
+    assert labels == ["x (m)", "y (m)", "speed (m/s)", "command"]
+    for axes in (x, y, speed):
+        assert len(axes.collections) == 2
+        assert len(axes.lines) == 2
+    mean, one = x.lines
+    assert np.asarray(mean.get_ydata()).tolist() == [1.5, 1.5, 1.5, 1.5, 1.0]
+    assert to_hex(str(one.get_color())) == DEPLOYED.lower()
+    assert np.asarray(speed.lines[1].get_ydata()).tolist() == [5.0] * 5
+
+
+def test_open_loop_error_is_logarithmic_and_draws_a_shared_raw_simulator_once() -> None:
+    horizons = np.array([1.0, 10.0])
+    grounded = {"position_m": np.array([[0.1, 0.2], [0.05, 0.1], [0.2, 0.4]])}
+    raw = {"position_m": np.array([[1.0, 2.0], [0.5, 1.0], [2.0, 4.0]])}
+    gaps = {name: OpenLoop(horizons, grounded, raw) for name in ("nas", "astra")}
+    figure = open_loop_error(gaps)
+    (axes,) = figure.axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    assert axes.get_ylabel() == "position error (m)"
+    assert legend(figure) == ["no grounding", "NAS", "ASTRA"]
+    assert np.asarray(axes.lines[0].get_ydata()).tolist() == [1.0, 2.0]
+    assert len(axes.collections) == 3
+
+
+def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    before = dict(matplotlib.rcParams)
+    image = png(success_bars({"nas": np.array([0.5])}, {"nas": (0.5, np.nan, np.nan)}, {}))
+    assert image.startswith(b"\x89PNG")
+    assert dict(matplotlib.rcParams) == before

@@ -1,0 +1,131 @@
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from astra_data import cli
+from astra_data.errors import AstraDataError, BadInputError, MissingStageError, RecipeError
+from astra_data.run import check, run, run_stage
+
+pytestmark = pytest.mark.usefixtures("fake_recipe")
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "r.toml"
+    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[plus]\nsteps = 5\n')
+    return path
+
+
+def asked(folder: Path) -> dict[str, object]:
+    content: dict[str, object] = json.loads((folder / "asked.json").read_text())
+    return content
+
+
+def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = run(recipe, root=tmp_path, jobs=2)
+    assert folder == tmp_path / "r"
+    assert asked(folder / "train/astra_plus/seed_0") == {
+        "task": "maze",
+        "method": "astra_plus",
+        "dataset": str(folder / "pair/seed_0"),
+        "grounding": str(folder / "ground/astra/seed_0"),
+        "seed": 0,
+        "steps": 5,
+    }
+    assert asked(folder / "evaluate/astra/seed_0")["target_encoder"] == str(folder / "align/astra/seed_0")
+    assert asked(folder / "report")["methods"] == ["astra", "astra_plus"]
+    assert json.loads((folder / "recipe.json").read_text())["plus"]["steps"] == 5
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"report  finished in [\d.]+ s  \(9 of 9\)", lines[-1])
+
+    unfinished = [key for key, is_finished in check(recipe, root=tmp_path).items() if not is_finished]
+    assert unfinished == ["report"]
+    run(recipe, root=tmp_path, jobs=1)
+    assert (folder / "train/astra/seed_0/attempts").read_text() == "."
+
+
+def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
+    text = recipe.read_text()
+    recipe.write_text(text + "[pair]\nfails = true\n")
+    with pytest.raises(BadInputError, match=r"^pair/seed_0: told to fail$"):
+        run(recipe, root=tmp_path, jobs=1)
+    assert (tmp_path / "r/collect/seed_0").is_dir()
+    assert not (tmp_path / "r/pair/seed_0").exists()
+    (tmp_path / "r/recipe.json").unlink()
+    recipe.write_text(text)
+    run(recipe, root=tmp_path, jobs=1, until="pair")
+    assert (tmp_path / "r/pair/seed_0/attempts").read_text() == ".."
+    assert not (tmp_path / "r/ground").exists()
+
+
+def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingStageError) as caught:
+        run_stage(recipe, "train", method="astra", root=tmp_path)
+    root = tmp_path / "r"
+    assert str(caught.value) == (
+        f"{root / 'pair/seed_0'} is missing: run `astra-data pair {recipe} --root {tmp_path}` first"
+    )
+
+
+def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, tmp_path: Path) -> None:
+    text, folder = recipe.read_text(), tmp_path / "r"
+    run(recipe, root=tmp_path, jobs=2)
+    recipe.write_text(text.replace("steps = 5", "steps = 6"))
+    with pytest.raises(RecipeError) as caught:
+        check(recipe, root=tmp_path)
+    assert str(caught.value) == (
+        f"plus changed in the recipe since {folder} was made: "
+        f"give the recipe another name, or remove {folder / 'train'} {folder / 'evaluate'}"
+    )
+    shutil.rmtree(folder / "train")
+    shutil.rmtree(folder / "evaluate")
+    assert [key for key, is_finished in check(recipe, root=tmp_path).items() if is_finished] == [
+        "collect/seed_0",
+        "pair/seed_0",
+        "ground/astra/seed_0",
+        "align/astra/seed_0",
+    ]
+    recipe.write_text(text.replace("seeds = [0]", "seeds = [0, 1]"))
+    assert check(recipe, root=tmp_path)["collect/seed_1"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stage": "trian"}, "unknown stage 'trian': did you mean 'train'?"),
+        ({"stage": "train", "method": "astr"}, "the recipe has no method 'astr': did you mean 'astra'?"),
+        ({"stage": "train", "seed": 3}, "the recipe has no seed 3; its seeds: 0"),
+        ({"stage": "collect", "device": "gpu"}, "expected a device such as cpu, cuda or cuda:1, got 'gpu'"),
+    ],
+)
+def test_bad_arguments(recipe: Path, tmp_path: Path, arguments: dict[str, str], message: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        run_stage(recipe, root=tmp_path, **arguments)  # type: ignore[arg-type]
+    assert str(caught.value) == message
+
+
+def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) -> None:
+    def call(*arguments: str) -> str:
+        result = CliRunner().invoke(cli.app, [*arguments, "--root", str(tmp_path)], catch_exceptions=False)
+        assert result.exit_code == 0
+        return result.output
+
+    assert "0 of 9 items are finished" in call("check", str(recipe))
+    assert "collect/seed_0  finished" in call("collect", str(recipe), "--seed", "0")
+    assert "  finished  collect/seed_0\n  to do     pair/seed_0\n" in call("check", str(recipe))
+    with pytest.raises(AstraDataError, match="unknown stage 'x'"):
+        call("run", str(recipe), "--until", "x")
+
+
+def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("astra_data.run.execute", interrupted)
+    result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
+    assert result.exit_code == 130
+    assert "run the same command again" in result.output
