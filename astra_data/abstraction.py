@@ -3,18 +3,14 @@
 Each maps target states (..., S) to abstract states (..., X), numpy in, numpy out, torch in, torch out.
 """
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-Array = TypeVar("Array", NDArray[np.float32], NDArray[np.float64], Tensor)
-
 _ANT_PLANAR = [0, 1, 15, 16]
 
 
-def ant_to_point_mass(state: Array) -> Array:
+def ant_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
     """Keep the planar position and velocity of an ant's state: (..., 29) to [x, y, vx, vy] (..., 4).
 
     Position in m and velocity in m/s, both of the torso in the world frame. Dropped: height, orientation,

@@ -46,6 +46,10 @@ class BatchedEnv(Protocol):
         """Apply `action` (B, A) to every row."""
         ...
 
+
+class ResumableEnv(BatchedEnv, Protocol):
+    """An environment that a training can be resumed in."""
+
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything that `load_state_dict` needs to go on from here."""
         ...

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from astra_data.errors import BadInputError
@@ -33,8 +33,19 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
     partial = path.with_name(f".{path.name}.partial")
     # safetensors refuses tensors that share memory, such as tied weights or views.
     own = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
-    save_file(own, partial, {key: json.dumps(value) for key, value in metadata.items()})
+    data = save(own, {key: json.dumps(value) for key, value in metadata.items()})
+    partial.write_bytes(_with_sorted_metadata(data))
     os.replace(partial, path)
+
+
+def _with_sorted_metadata(data: bytes) -> bytes:
+    """Sort the metadata in a safetensors file's header, so that the same content gives the same bytes."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:start])
+    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[start:]
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
 from astra_data.mazes import FIELD_CELL_M, Maze
@@ -27,6 +27,9 @@ class FreeSpace:
     def __init__(self, blocked: Tensor, half_extent: Tensor) -> None:
         self.blocked = blocked
         self.half_extent = half_extent
+        depth = torch.from_numpy(distance_transform_edt(blocked.cpu().numpy()))
+        # How far a blocked cell is from the free ones, in cells; 0 in free ones.
+        self._depth = depth.float().to(blocked.device)
         self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
 
     @classmethod
@@ -52,17 +55,19 @@ class FreeSpace:
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Move points from `start` to `end`, both (B, 2) in m, stopping each axis at blocked cells.
 
+        A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
+
         Returns:
             where the points come to rest (B, 2), and which of them were stopped (B,).
         """
         here = self._cells(start)
         there = self._cells(end)
-        # A start in a blocked cell (possible after a reset) may leave it, but not go deeper.
-        stuck = self.blocked[here[:, 1], here[:, 0]]
-        stop_x = self.blocked[here[:, 1], there[:, 0]] & (here[:, 0] != there[:, 0]) & ~stuck
+        depth = self._depth[here[:, 1], here[:, 0]]
+        depth_x = self._depth[here[:, 1], there[:, 0]]
+        stop_x = depth_x > depth
         x = torch.where(stop_x, self._face(start[:, 0], here[:, 0], there[:, 0], 0), end[:, 0])
         column = torch.where(stop_x, here[:, 0], there[:, 0])
-        stop_y = self.blocked[there[:, 1], column] & (here[:, 1] != there[:, 1]) & ~stuck
+        stop_y = self._depth[there[:, 1], column] > torch.where(stop_x, depth, depth_x)
         y = torch.where(stop_y, self._face(start[:, 1], here[:, 1], there[:, 1], 1), end[:, 1])
         return torch.stack([x, y], dim=-1), stop_x | stop_y
 

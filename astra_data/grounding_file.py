@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
@@ -22,7 +23,9 @@ def save_grounding(path: Path, model: GroundingModel, episodes: PairedEpisodes) 
 def load_grounding(path: Path, device: str = "cpu") -> GroundingModel:
     """Read a grounding model; its parameters are frozen."""
     tensors, told = load_tensors(path)
-    shape = {key: tuple(value) if isinstance(value, list) else value for key, value in told["shape"].items()}
+    shape: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in told["shape"].items()
+    }
     model = GroundingModel(GroundingShape(**shape), told["target"])
     model.load_state_dict(tensors)
     return model.to(device).requires_grad_(False).eval()

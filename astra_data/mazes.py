@@ -70,7 +70,7 @@ class Maze:
         rows = np.floor((half_height - points[..., 1]) / self.scale).astype(int)
         height, width = self.walls.shape
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        return inside & ~self.walls[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+        return np.asarray(inside & ~self.walls[rows.clip(0, height - 1), columns.clip(0, width - 1)])
 
     @cached_property
     def fine_walls(self) -> NDArray[np.bool_]:
@@ -124,9 +124,7 @@ class Maze:
         return np.asarray(field[tuple(nearest)] + into_wall * FIELD_CELL_M)
 
 
-def _shifted(
-    shape: tuple[int, ...], dy: int, dx: int
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def _shifted(shape: tuple[int, ...], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     height, width = shape
     left, right = max(0, -dx), width - max(0, dx)
     here = (slice(0, height - dy), slice(left, right))

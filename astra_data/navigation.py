@@ -47,6 +47,16 @@ class Navigation:
         """Path lengths to goals near the maze's goal cell."""
         return GoalDistance.of_maze(self.maze)
 
+    @cached_property
+    def _goal_distances(self) -> dict[torch.device, GoalDistance]:
+        return {}
+
+    def _goal_distance_on(self, device: torch.device) -> GoalDistance:
+        # Kept, for the fields are too large to be moved to an accelerator in every step.
+        if device not in self._goal_distances:
+            self._goal_distances[device] = self.goal_distance.to(device)
+        return self._goal_distances[device]
+
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw start positions (count, 2) in m around the maze's start cell."""
         return self._around(self.maze.start, rng, count)
@@ -62,25 +72,23 @@ class Navigation:
         cell = self.maze.half_extent * 2 / self.maze.fine_walls.shape[::-1]
         within = rng.random((count, 2))
         corner = np.stack([columns[chosen], rows[chosen]], axis=-1)
-        return (corner + within) * cell - self.maze.half_extent
+        return np.asarray((corner + within) * cell - self.maze.half_extent)
 
-    def _around(
-        self, cell: tuple[int, int], rng: np.random.Generator, count: int
-    ) -> NDArray[np.float64]:
+    def _around(self, cell: tuple[int, int], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         noise = rng.normal(0.0, self.spread_m, (count, 2)).clip(-3 * self.spread_m, 3 * self.spread_m)
-        return np.array(self.maze.cell_centre(*cell)) + noise
+        return np.asarray(np.array(self.maze.cell_centre(*cell)) + noise)
 
     def reached(self, position: Tensor, goal: Tensor) -> Tensor:
         """Tell which of `position` (B, 2) are at their `goal` (B, 2)."""
-        return (position - goal).square().sum(-1) <= self.success_radius_m**2
+        return (position - goal).square().sum(-1).le(self.success_radius_m**2)
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
         """Return the metres gained toward `goal` between `before` and `after`, all (B, 2); (B,)."""
         if self.reward_kind == "geodesic":
-            distance = self.goal_distance.to(goal.device)
+            distance = self._goal_distance_on(goal.device)
             return distance(before, goal) - distance(after, goal)
         if self.reward_kind == "euclidean":
-            return (before - goal).norm(dim=-1) - (after - goal).norm(dim=-1)
+            return torch.pairwise_distance(before, goal, eps=0) - torch.pairwise_distance(after, goal, eps=0)
         return torch.zeros(len(goal), device=goal.device)
 
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, toppled: Tensor) -> Tensor:

@@ -81,8 +81,12 @@ def world_parts(
             inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
             _, after = model.encoder(inputs)
             hidden = episodes.steps(functional.pad(after[:, :-1], (0, 0, 1, 0)))
-        columns = (windows.state, windows.goal, windows.previous_action)
-        starts = DataStarts(*(episodes.steps(column) for column in columns), hidden)
+        starts = DataStarts(
+            state=episodes.steps(windows.state),
+            goal=episodes.steps(windows.goal),
+            previous_action=episodes.steps(windows.previous_action),
+            hidden=hidden,
+        )
     return WorldParts(free, config.residual_noise * scatter, starts)
 
 
@@ -90,7 +94,9 @@ def _supported(free: FreeSpace, positions: Tensor, least: int) -> Tensor:
     height, width = free.blocked.shape
     cells = ((positions + free.half_extent) / (FIELD_CELL_M * _SUPPORT_CELL)).long()
     columns = width // _SUPPORT_CELL
-    counts = torch.bincount(cells[:, 1] * columns + cells[:, 0], minlength=(height // _SUPPORT_CELL) * columns)
+    counts = torch.bincount(
+        cells[:, 1] * columns + cells[:, 0], minlength=(height // _SUPPORT_CELL) * columns
+    )
     coarse = counts.reshape(-1, columns) >= least
     return coarse.repeat_interleave(_SUPPORT_CELL, 0).repeat_interleave(_SUPPORT_CELL, 1)
 

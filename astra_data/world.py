@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.batched import Step
@@ -106,9 +107,7 @@ class NavigationWorld:
     def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
         moments = torch.randint(len(starts.state), (len(rows),), device=self.device)
         hidden = None if starts.hidden is None else starts.hidden[moments]
-        self._set(
-            rows, starts.state[moments], starts.goal[moments], hidden, starts.previous_action[moments]
-        )
+        self._set(rows, starts.state[moments], starts.goal[moments], hidden, starts.previous_action[moments])
 
     def _set(
         self,
@@ -124,7 +123,7 @@ class NavigationWorld:
         else:
             self.simulator.reset_to(state, rows)
 
-    def _tensor(self, values: np.ndarray) -> Tensor:
+    def _tensor(self, values: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(values).float().to(self.device)
 
     def step(self, action: Tensor) -> Step:

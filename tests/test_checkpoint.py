@@ -150,3 +150,12 @@ def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
     with finished_folder(tmp_path / "out", replace=True) as folder:
         (folder / "new").touch()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["new"]
+
+
+def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
+    metadata = {name: ["ä", {"of": name}] for name in "abcdefgh"}
+    paths = [tmp_path / f"{number}.safetensors" for number in range(4)]
+    for path in paths:
+        save_tensors(path, {"x": torch.arange(3.0), "y": torch.ones(2, 2)}, metadata)
+    assert len({path.read_bytes() for path in paths}) == 1
+    assert load_tensors(paths[0])[1] == metadata

@@ -12,7 +12,7 @@ README = (HOUSE / "README.md").read_text()
 GROUP = get_command(app)
 assert isinstance(GROUP, TyperGroup)
 COMMANDS = GROUP.commands
-SET_UP = "pip install uv && uv sync"
+SET_UP = "pip install uv && uv run astra-data run recipes/quickstart.toml"
 TEST = "pip install uv && uv run pytest"
 
 

@@ -1,6 +1,6 @@
 """Paired episodes as tensors: whole episodes side by side, and windows cut from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from astra_data.columns import (
     STATE,
     SUCCESS,
     TERMINATED,
+    Array,
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.errors import BadInputError
@@ -58,7 +59,7 @@ class PairedEpisodes:
         columns = dataset.columns(_COLUMNS)
         ends = np.cumsum(dataset.lengths)[:-1]
 
-        def padded(values: np.ndarray) -> Tensor:
+        def padded(values: Array) -> Tensor:
             pieces = [torch.from_numpy(piece).float() for piece in np.split(values, ends)]
             return pad_sequence(pieces, batch_first=True).to(device)
 
@@ -107,21 +108,24 @@ class PairedEpisodes:
         return values[self.windows.mask.bool()]
 
     def draw_windows(self, count: int, length: int) -> tuple[Windows, Tensor]:
-        """Draw windows of `length` steps, each step of the data equally likely; from torch's global generator.
+        """Draw windows of `length` steps, each step equally likely; from torch's global generator.
+
+        A window that is drawn across an end of its episode is moved inside, and its mask marks only the
+        steps that were drawn. Without those, the last steps, where episodes topple, would hardly be seen.
 
         Returns:
             the windows (count, length, ...), and the target states in them (count, length, S).
         """
         length = min(length, self.windows.mask.shape[1])
-        lengths = self.lengths
-        episodes = torch.multinomial(lengths.float(), count, replacement=True)
-        # A window may begin before its episode's first full window ends: the first steps count as well.
-        latest = (lengths[episodes] - length).clamp_min(0)
-        first = (torch.rand(count, device=latest.device) * (latest + length // 2 + 1)).long() - length // 2
-        first = torch.minimum(first.clamp_min(0), latest)
+        beginnings = self.lengths + length - 1
+        episodes = torch.multinomial(beginnings.float(), count, replacement=True)
+        drawn = (torch.rand(count, device=episodes.device) * beginnings[episodes]).long() - (length - 1)
+        first = drawn.clamp_min(0).minimum((self.lengths[episodes] - length).clamp_min(0))
         steps = first[:, None] + torch.arange(length, device=first.device)
         rows = (episodes[:, None], steps)
-        return _gather(self.windows, rows), self.target_state[rows]
+        windows = _gather(self.windows, rows)
+        is_drawn = (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
+        return replace(windows, mask=windows.mask * is_drawn), self.target_state[rows]
 
 
 def _gather(windows: Windows, rows: Tensor | tuple[Tensor, Tensor]) -> Windows:

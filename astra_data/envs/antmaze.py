@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.ant import (
@@ -71,12 +72,16 @@ class AntMazeEnv:
         walls = wall_geoms(model)
         assert walls is not None
         self._walls = walls
-        self._rng = np.random.default_rng(seed)
+        self.reseed(seed)
 
     @property
     def state(self) -> Tensor:
         """The full target states, (B, 29) float32."""
         return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
+
+    def reseed(self, seed: int) -> None:
+        """Draw later starts, goals and headings from `seed`."""
+        self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Stand the ants in `mask` (B,) up at new starts with random headings, by default all."""
@@ -92,7 +97,7 @@ class AntMazeEnv:
         self.reset_to(rows, np.concatenate([qpos, np.zeros((count, STATE_SIZE - POSITIONS))], axis=1))
         return self._observe()
 
-    def reset_to(self, rows: np.ndarray, state: Floats) -> None:
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
         """Set the ants `rows` (n,) to `state` (n, 29)."""
         self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
         self.toppled[rows] = False

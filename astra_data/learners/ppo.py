@@ -6,6 +6,7 @@ seeds torch from (seed, iteration): a run that resumes from a checkpoint repeats
 would have done.
 """
 
+import time
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from astra_data.batched import BatchedEnv
+from astra_data.batched import ResumableEnv
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.recipe import Config
 from astra_data.seeding import derive
@@ -26,19 +27,29 @@ class PpoConfig(Config):
     """Settings of proximal policy optimisation."""
 
     total_steps: int = 4_000_000
+    """Environment steps in all."""
     rollout_steps: int = 64
     """Steps of every environment per iteration."""
     epochs: int = 5
+    """Passes over the collected steps per iteration."""
     minibatches: int = 4
+    """Updates per pass; each takes whole stretches of a share of the environments."""
     learning_rate: float = 5e-4
     """At the start; falls linearly to zero."""
     discount: float = 0.99
+    """Of the reward, per step."""
     gae_lambda: float = 0.95
+    """Decay of the advantage's n-step mixture, per step."""
     clip: float = 0.2
+    """Largest change of an action's probability ratio that still earns."""
     entropy_weight: float = 0.003
+    """Of the policy's entropy in the loss."""
     value_weight: float = 0.5
+    """Of the critic's squared error in the loss."""
     gradient_norm: float = 0.5
+    """Gradients are clipped to this norm."""
     reward_scale: float = 0.1
+    """Factor on the reward that the critic learns from."""
 
 
 class Ppo:
@@ -46,21 +57,25 @@ class Ppo:
 
     Attributes:
         policy: the networks being trained. steps: environment steps done.
+        world_seconds: the part of the time since the start, or since resuming, that the world took.
     """
 
     def __init__(
-        self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
+        self, env: ResumableEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
     ) -> None:
         """Prepare to train `policy` in `env`.
 
         Args:
-            env: the world. policy: the networks. config: settings.
+            env: the world.
+            policy: the networks.
+            config: settings.
             horizon: rows are restarted after so many steps, without ending the task.
             seed: of all randomness.
         """
         self.env, self.policy, self.config = env, policy, config
         self.horizon, self.seed = horizon, seed
         self.steps = 0
+        self.world_seconds = 0.0
         self._iteration = 0
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
         self._loss = _ppo_loss(policy, config)
@@ -107,7 +122,9 @@ class Ppo:
             features, hidden = policy.remember(self._observation, self._previous_action, hidden)
             mean, std = policy.policy(features)
             action = torch.normal(mean, std)
+            began = time.perf_counter()
             step = env.step(action)
+            self.world_seconds += time.perf_counter() - began
             self._age += 1
             expired = (self._age >= self.horizon) & ~step.terminated
             done = step.terminated | expired
@@ -157,23 +174,16 @@ class Ppo:
         advantage = rollout["advantage"]
         rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         count = len(advantage)
-        size = count // config.minibatches
         for _ in range(config.epochs):
             order = torch.randperm(count, device=advantage.device)
-            for rows in order.split(size):
+            for rows in order.chunk(config.minibatches):
                 batch = {name: values[rows] for name, values in rollout.items()}
                 features = policy.remember_sequence(
                     batch["observation"], batch["previous_action"], batch["hidden"], batch["start"]
                 )
-                losses = self._loss(
-                    TensorDict(
-                        {
-                            "features": features,
-                            **{k: batch[k] for k in ("action", "action_log_prob", "advantage", "value_target")},
-                        },
-                        batch_size=features.shape[:2],
-                    )
-                )
+                learned = ("action", "action_log_prob", "advantage", "value_target")
+                columns = {"features": features} | {name: batch[name] for name in learned}
+                losses = self._loss(TensorDict(columns, batch_size=features.shape[:2]))
                 total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
                 self._optimizer.zero_grad()
                 total.backward()
@@ -198,8 +208,9 @@ class Ppo:
         self.policy.load_state_dict(state["policy"])
         self._optimizer.load_state_dict(state["optimizer"])
         self.steps, self._iteration = state["steps"], state["iteration"]
-        self._previous_action, self._hidden = state["previous_action"], state["hidden"]
-        self._start, self._age = state["start"], state["age"]
+        device = observation.device
+        self._previous_action, self._hidden = state["previous_action"].to(device), state["hidden"].to(device)
+        self._start, self._age = state["start"].to(device), state["age"].to(device)
         self._observation = observation
 
 

@@ -1,6 +1,7 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 from tensordict import TensorDict
@@ -17,16 +18,21 @@ class SacConfig(Config):
     """Settings of soft actor-critic."""
 
     env_steps: int = 1_000_000
-    random_steps: int = 10_000
-    """Steps with uniform actions before learning starts."""
+    """Environment steps in all."""
     updates_per_step: int = 8
     """Gradient updates per batched step."""
     batch_size: int = 256
+    """Transitions per update."""
     buffer_size: int = 1_000_000
+    """The most recent transitions that are kept."""
     hidden_sizes: tuple[int, ...] = (128, 128)
-    learning_rate: float = 3e-4
-    discount: float = 0.99
+    """Of actor and critics."""
+    learning_rate: float = 1e-3
+    """Of actor, critics and temperature."""
+    discount: float = 0.97
+    """Of the reward, per step."""
     target_rate: float = 0.005
+    """Share by which the target critics follow, per update."""
     episode_steps: int = 1000
     """Rows are restarted after so many steps, without ending the task."""
 
@@ -35,16 +41,21 @@ def actor_network(observation_size: int, action_size: int, hidden_sizes: tuple[i
     """Build the actor's network: observation (B, O) to location and scale parameters (B, 2A)."""
     sizes = (observation_size, *hidden_sizes)
     layers: list[nn.Module] = []
-    for size_in, size_out in zip(sizes, sizes[1:], strict=False):
+    for size_in, size_out in pairwise(sizes):
         layers += [nn.Linear(size_in, size_out), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * action_size))
 
 
 class _Critic(nn.Module):
+    """Action values; layer-normalised, which keeps them from diverging at this learning rate."""
+
     def __init__(self, observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> None:
         super().__init__()
-        self.network = actor_network(observation_size + action_size, 1, hidden_sizes)
-        self.network[-1] = nn.Linear(hidden_sizes[-1], 1)
+        sizes = (observation_size + action_size, *hidden_sizes)
+        layers: list[nn.Module] = []
+        for size_in, size_out in pairwise(sizes):
+            layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU()]
+        self.network = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         return torch.as_tensor(self.network(torch.cat([observation, action], dim=-1)))
@@ -69,9 +80,10 @@ def train_sac(
     """
     torch.manual_seed(seed)
     network = network or actor_network(env.observation_size, env.action_size, config.hidden_sizes)
+    parameters = NormalParamExtractor(scale_lb=1e-3)
     actor = ProbabilisticActor(
         TensorDictModule(
-            nn.Sequential(network, NormalParamExtractor(scale_lb=1e-3)),
+            nn.Sequential(network, parameters),
             in_keys=["observation"],
             out_keys=["loc", "scale"],
         ),
@@ -84,7 +96,11 @@ def train_sac(
         in_keys=["observation", "action"],
     )
     loss = SACLoss(
-        actor, critic, num_qvalue_nets=2, loss_function="l2", target_entropy=-float(env.action_size),
+        actor,
+        critic,
+        num_qvalue_nets=2,
+        loss_function="l2",
+        target_entropy=-float(env.action_size),
         alpha_init=0.2,
     )
     loss.make_value_estimator(gamma=config.discount)
@@ -95,12 +111,8 @@ def train_sac(
     age = torch.zeros(env.num_envs)
     steps = 0
     while steps < config.env_steps:
-        if steps < config.random_steps:
-            action = torch.rand(env.num_envs, env.action_size) * 2 - 1
-        else:
-            with torch.no_grad():
-                location, scale = network(observation).chunk(2, dim=-1)
-                action = TanhNormal(location, _positive(scale)).sample()
+        with torch.no_grad():
+            action = TanhNormal(*parameters(network(observation))).sample()
         step = env.step(action)
         buffer.add(observation, action, step.reward, step.observation, step.terminated)
         age += 1
@@ -108,21 +120,15 @@ def train_sac(
         age[restart] = 0
         observation = env.reset(restart) if bool(restart.any()) else step.observation
         steps += env.num_envs
-        if steps >= config.random_steps:
-            for _ in range(config.updates_per_step):
-                losses = loss(buffer.sample(config.batch_size))
-                total = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
-                optimizer.zero_grad()
-                total.backward()
-                optimizer.step()
-                target.step()
+        for _ in range(config.updates_per_step):
+            losses = loss(buffer.sample(config.batch_size))
+            total = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
+            optimizer.zero_grad()
+            total.backward()
+            optimizer.step()
+            target.step()
         on_step(steps, network)
     return network
-
-
-def _positive(raw_scale: Tensor) -> Tensor:
-    _, scale = NormalParamExtractor(scale_lb=1e-3)(torch.cat([raw_scale, raw_scale], dim=-1))
-    return torch.as_tensor(scale)
 
 
 class _Buffer:

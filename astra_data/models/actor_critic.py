@@ -47,11 +47,11 @@ class ActorCritic(nn.Module):
         self.critic = mlp((features, *shape.hidden_sizes, 1))
         self.log_std = nn.Parameter(torch.full((shape.action_size,), shape.initial_log_std))
         for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
-            for layer in network:
-                if isinstance(layer, nn.Linear):
-                    nn.init.orthogonal_(layer.weight, 2**0.5)
-                    nn.init.zeros_(layer.bias)
-            nn.init.orthogonal_(network[-1].weight, gain)
+            layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+            for layer in layers:
+                nn.init.orthogonal_(layer.weight, 2**0.5)
+                nn.init.zeros_(layer.bias)
+            nn.init.orthogonal_(layers[-1].weight, gain)
 
     def initial_hidden(self, count: int) -> Tensor:
         """Return the memory (count, M) at the start of an episode."""

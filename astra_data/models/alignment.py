@@ -45,7 +45,10 @@ def gaussian_mmd(
     Π_d sqrt(h² / (h² + v1 + v2)) exp(-(m1 - m2)² / 2(h² + v1 + v2)).
 
     Args:
-        mean_1, variance_1, mean_2, variance_2: (..., Z).
+        mean_1: m1, (..., Z).
+        variance_1: v1, (..., Z).
+        mean_2: m2, (..., Z).
+        variance_2: v2, (..., Z).
         bandwidths: h, (K,); the kernels are averaged. h near sqrt(Z) keeps the gradient alive.
 
     Returns:

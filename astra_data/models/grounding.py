@@ -38,7 +38,7 @@ class GroundingShape:
     state_size: int
     action_size: int
     goal_size: int
-    latent_size: int = 128
+    latent_size: int = 64
     embedding_size: int = 64
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4
@@ -91,10 +91,15 @@ class GroundingModel(nn.Module):
         self.correction = mlp((latent + actions + features, *heads, states))
         self.topple_head = mlp((latent + actions + features, *heads, 1))
         # An untrained correction is the identity: the raw simulator.
-        nn.init.zeros_(self.correction[-1].weight)
-        nn.init.zeros_(self.correction[-1].bias)
+        for parameter in self.correction[-1].parameters():
+            nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
-        for name, size in {"state": states, "goal": shape.goal_size, "correction": states, "reward": 1}.items():
+        for name, size in {
+            "state": states,
+            "goal": shape.goal_size,
+            "correction": states,
+            "reward": 1,
+        }.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("residual_factor", torch.zeros(states, states))
@@ -108,7 +113,7 @@ class GroundingModel(nn.Module):
         self.residual_factor: Tensor
 
     def set_scales(self, columns: Mapping[str, Tensor]) -> None:
-        """Take means and standard deviations from training steps: state, goal, correction, reward (N, ...)."""
+        """Take means and deviations from training steps: state, goal, correction, reward (N, ...)."""
         for name, values in columns.items():
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
@@ -134,13 +139,14 @@ class GroundingModel(nn.Module):
 
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
         """R_pred: return the target's reward (...)."""
-        normal = self.reward_head(torch.cat([latent, action], dim=-1)).squeeze(-1)
+        normal: Tensor = self.reward_head(torch.cat([latent, action], dim=-1)).squeeze(-1)
         return normal * self.reward_std + self.reward_mean
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
         inputs = torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
-        return simulated_next + self.correction(inputs) * self.correction_std
+        correction: Tensor = self.correction(inputs)
+        return simulated_next + correction * self.correction_std
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
         """Return the log-odds (...) that the target topples on the way to `next_state`."""

@@ -1,5 +1,7 @@
 """The history encoder: a GRU over states and actions whose layer-normalised hidden state is the latent."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -8,7 +10,7 @@ from torch.nn import functional
 def mlp(sizes: tuple[int, ...]) -> nn.Sequential:
     """Build linear layers of `sizes` with ELU between them."""
     layers: list[nn.Module] = []
-    for size_in, size_out in zip(sizes, sizes[1:], strict=False):
+    for size_in, size_out in pairwise(sizes):
         layers += [nn.Linear(size_in, size_out), nn.ELU()]
     return nn.Sequential(*layers[:-1])
 
@@ -37,7 +39,8 @@ class HistoryEncoder(nn.Module):
 
     x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). The hidden state is
     handed in and out, never kept; the latent is the hidden state after a LayerNorm without gain, which
-    fixes its scale (the printed latent loss would otherwise shrink it without limit).
+    fixes each latent's length (the printed latent loss would otherwise shrink it without limit). That
+    different histories keep different latents is up to the target of that loss.
     """
 
     def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
@@ -58,15 +61,8 @@ class HistoryEncoder(nn.Module):
 
     def step(self, inputs: Tensor, hidden: Tensor) -> Tensor:
         """Take in one step `inputs` (B, I); return the next hidden state (B, Z)."""
-        gru = self.recurrence
-        return torch.gru_cell(
-            functional.elu(self.embedding(inputs)),
-            hidden,
-            gru.weight_ih_l0,
-            gru.weight_hh_l0,
-            gru.bias_ih_l0,
-            gru.bias_hh_l0,
-        )
+        (weights,) = self.recurrence.all_weights
+        return torch.gru_cell(functional.elu(self.embedding(inputs)), hidden, *weights)
 
     def latent(self, hidden: Tensor) -> Tensor:
         """Return the latent of a hidden state (..., Z)."""

@@ -1,4 +1,4 @@
-"""The grounded simulator: an abstract simulator corrected after every step by a history model (Algorithm 2)."""
+"""The grounded simulator: an abstract simulator corrected every step by a history model (Algorithm 2)."""
 
 import torch
 from torch import Tensor
@@ -67,7 +67,9 @@ class GroundedSimulator:
         """Set `rows` (n,) to `state` (n, X) with `goal` (n, G), at the start or within a known history.
 
         Args:
-            state: abstract states. rows: which. goal: their goals.
+            state: abstract states.
+            rows: which.
+            goal: their goals.
             hidden: hidden states (n, Z) of the history before `state`, by default none.
             previous_action: the actions (n, A) that led to `state`, by default zero.
         """
@@ -92,7 +94,5 @@ class GroundedSimulator:
         position, self.blocked = self.free.slide(before[:, :2], corrected[:, :2])
         state = torch.cat([position, corrected[:, 2:]], dim=-1)
         self.simulator.reset_to(state)
-        self.hidden = self.model.encoder.step(
-            self.model.encoder_input(state, self.goal, action), self.hidden
-        )
+        self.hidden = self.model.encoder.step(self.model.encoder_input(state, self.goal, action), self.hidden)
         return state

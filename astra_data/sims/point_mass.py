@@ -42,7 +42,8 @@ class PointMass:
         if rows is None:
             self.state = state.clone()
         else:
-            self.state[rows] = state
+            # A new tensor, so that states handed out earlier stay as they were.
+            self.state = self.state.index_copy(0, rows, state)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2), clipped to ±1 m/s per axis; return the new state (B, 4)."""

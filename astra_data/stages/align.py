@@ -23,15 +23,21 @@ class AlignConfig(Config):
     """How the target encoder is fitted. The paper prints none of these."""
 
     updates: int = 1000
+    """Gradient updates in all."""
     batch_windows: int = 32
+    """Windows per update."""
     window: int = 100
+    """Steps per window, in backpropagation through time."""
     learning_rate: float = 1e-3
+    """At the start; falls to zero along a half cosine."""
     gradient_norm: float = 1.0
+    """Gradients are clipped to this norm."""
     bandwidths: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
     """Of the MMD's kernels, in units of the square root of the latent's size."""
     paired_weight: float = 0.0
     """Weight of the direct distance between paired latents; 0 is the paper's loss."""
     held_out_share: float = 0.1
+    """Share of the episodes that only measure the agreement; the same ones as in `ground`."""
 
 
 def align(

@@ -18,6 +18,7 @@ from astra_data.columns import (
     SUCCESS,
     TERMINATED,
     TRUNCATED,
+    Array,
     Episode,
 )
 from astra_data.dataset.writer import DatasetWriter
@@ -33,7 +34,9 @@ class CollectConfig(Config):
     behavior: Literal["random"] = "random"
     """"random": commands drawn from U[-1, 1]² m/s, each held for a while."""
     episodes: int = 200
+    """Recorded side by side."""
     max_steps: int = 500
+    """Longest episode, in control steps; longer ones are truncated."""
     hold_s: tuple[float, float] = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
 
@@ -82,7 +85,7 @@ def collect(task: str, config: CollectConfig, *, seed: int, out: Path, progress:
 
 def _record(
     task: Task, config: CollectConfig, seed: int, progress: Progress
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
+) -> tuple[dict[str, Array], Array]:
     """Return columns (T, B, ...) of all episodes side by side, and their lengths (B,)."""
     count = config.episodes
     env = task.target(count, seed=derive(seed, "collect"), start_anywhere=True)

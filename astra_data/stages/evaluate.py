@@ -12,6 +12,7 @@ from torch import Tensor
 
 from astra_data.checkpoint import finished_folder, save_tensors
 from astra_data.deployment import DeployedPolicy, EncoderKind
+from astra_data.errors import BadInputError
 from astra_data.free_space import FreeSpace
 from astra_data.grounding_file import load_grounding
 from astra_data.methods import method_named
@@ -31,6 +32,7 @@ class EvaluateConfig(Config):
     """How policies are tested; 100 episodes are the paper's."""
 
     episodes: int = 100
+    """Run side by side, in the target and in simulation each."""
     encoder: EncoderKind = "target"
     """Whose latents an aligned policy is deployed with for the headline figures; both are reported."""
     leg_scale: float = 1.0
@@ -39,7 +41,16 @@ class EvaluateConfig(Config):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What happened in N episodes: a list per quantity, and the path of each, (N, T + 1, 2) with NaN after the end."""
+    """What happened in N episodes: a list per quantity, and every path.
+
+    Attributes:
+        success: 1 or 0.
+        topple: 1 or 0.
+        wall_contact: share of the steps.
+        steps: until the end.
+        returns: sum of rewards.
+        position: (N, T + 1, 2) in m, from the start on, NaN after the end.
+    """
 
     success: list[float]
     topple: list[float]
@@ -79,7 +90,11 @@ def evaluate(
     Raises:
         BadInputError: an input is not there or not what was expected.
     """
-    world = task_named(task)
+    world, base = task_named(task), method_named(method)
+    if base.trains and policy is None:
+        raise BadInputError(f"method '{method}' has a policy to test: run the stage `train` first")
+    if base.grounds and grounding is None:
+        raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     began = time.perf_counter()
     told: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
     tensors: dict[str, Tensor] = {}
@@ -90,9 +105,7 @@ def evaluate(
     else:
         trained = PolicyFile.load(policy / "policy.safetensors")
         model = load_grounding(grounding / "grounding.safetensors") if grounding else None
-        encoders: dict[EncoderKind, DeployedPolicy] = {
-            "source": DeployedPolicy(world, trained.policy, model)
-        }
+        encoders: dict[EncoderKind, DeployedPolicy] = {"source": DeployedPolicy(world, trained.policy, model)}
         if target_encoder is not None:
             aligned = load_target_encoder(target_encoder / "target_encoder.safetensors")
             encoders["target"] = DeployedPolicy(world, trained.policy, model, aligned)

@@ -27,16 +27,21 @@ class GroundConfig(Config):
     """How the grounding model is fitted. The paper prints none of these."""
 
     updates: int = 1500
+    """Gradient updates in all."""
     batch_windows: int = 48
+    """Windows per update."""
     window: int = 100
     """Steps per window, in backpropagation through time."""
     learning_rate: float = 1e-3
     """At the start; falls to zero along a half cosine."""
     gradient_norm: float = 1.0
+    """Gradients are clipped to this norm."""
     target: TargetKind = "ema"
     """Where the next latent of the latent loss comes from; "online" is the printed loss, unbounded below."""
     ema_rate: float = 0.01
-    latent_size: int = 128
+    """Share by which the slow encoder of "ema" follows, per update."""
+    latent_size: int = 64
+    """Z, also the size of the encoder's memory."""
     position_octaves: int = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position."""
     held_out_share: float = 0.1
@@ -200,6 +205,8 @@ def _fit_residual(model: GroundingModel, held_out: PairedEpisodes) -> None:
     windows = held_out.windows
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
     latent, _ = model.encoder(inputs)
-    residual = held_out.steps(windows.next_state - model.correct(latent, windows.action, windows.simulated_next))
+    residual = held_out.steps(
+        windows.next_state - model.correct(latent, windows.action, windows.simulated_next)
+    )
     covariance = torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=residual.device)
     model.residual_factor.copy_(torch.linalg.cholesky(covariance))

@@ -13,6 +13,7 @@ from astra_data.columns import (
     ACTION,
     NEXT_STATE,
     STATE,
+    Array,
     Column,
     Episode,
 )
@@ -83,8 +84,8 @@ def pair(task: str, config: PairConfig, *, dataset: Path, out: Path, progress: P
 
 
 def pair_steps(
-    task: Task, state: np.ndarray, action: np.ndarray, next_state: np.ndarray, tolerance: float
-) -> dict[str, np.ndarray]:
+    task: Task, state: Array, action: Array, next_state: Array, tolerance: float
+) -> dict[str, Array]:
     """Return the `abstract.*` columns (T, X) for target steps `state` (T, S), `action` (T, A), (T, S)."""
     abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
     simulator = task.simulator(len(state))

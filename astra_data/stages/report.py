@@ -24,6 +24,7 @@ from astra_data.figures import (
     trajectories,
 )
 from astra_data.mazes import Maze
+from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
 from astra_data.recipe import Config
 from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
@@ -119,12 +120,8 @@ def _figures(results: Results, root: Path, config: ReportConfig) -> dict[str, Fi
         "success": _success(results),
         "trajectories": _trajectories(results, root, TASKS[results.task].maze, config),
     }
-    mismatch = root / "evaluate" / "mismatch.safetensors"
-    if mismatch.exists():
-        tensors = read_tensors(mismatch, ("time_s", "command", "simulated", "target"))
-        figures["mismatch"] = dynamics_mismatch(
-            tensors["time_s"], tensors["command"], tensors["simulated"], tensors["target"]
-        )
+    replay = replay_commands(TASKS[results.task])
+    figures["mismatch"] = dynamics_mismatch(replay.time_s, replay.command, replay.simulated, replay.target)
     curves = _curves(results)
     if curves:
         figures["learning"] = learning_curves(curves)

@@ -27,8 +27,10 @@ class TrainConfig(WorldConfig, PpoConfig):
     """How policies are trained: PPO's settings, the world's switches, and the sizes below."""
 
     num_envs: int = 256
+    """Worlds stepped side by side."""
     hidden_sizes: tuple[int, ...] = (64, 64)
-    memory_size: int = 128
+    """Of actor and critic."""
+    memory_size: int = 64
     """Of the policy's own GRU, where no grounding provides a latent."""
 
 
@@ -69,7 +71,7 @@ def train(
     ).to(device)
     ppo = Ppo(env, policy, config, horizon=world.navigation.horizon, seed=seed)
     with finished_folder(out) as folder:
-        curve = _optimise(ppo, folder, progress)
+        curve = _optimise(ppo, folder, device, progress)
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
         PolicyFile(
             policy, parts.free.blocked, parts.scatter, switches, episodes.reference, episodes.content_hash
@@ -79,16 +81,17 @@ def train(
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
 
 
-def _optimise(ppo: Ppo, folder: Path, progress: Progress) -> dict[str, Any]:
+def _optimise(ppo: Ppo, folder: Path, device: str, progress: Progress) -> dict[str, Any]:
     points: list[dict[str, float]] = []
     seconds = 0.0
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
-        ppo.load_state_dict(state["ppo"], ppo.env.load_state_dict(state["world"]))
+        world = {name: values.to(device) for name, values in state["world"].items()}
+        ppo.load_state_dict(state["ppo"], ppo.env.load_state_dict(world))
         points, seconds = told["points"], told["seconds"]
-    began = time.perf_counter() - seconds
+    began, first = time.perf_counter() - seconds, ppo.steps
     while not ppo.done:
         metrics = ppo.iterate()
         points.append({"steps": ppo.steps, **metrics})
@@ -102,6 +105,7 @@ def _optimise(ppo: Ppo, folder: Path, progress: Progress) -> dict[str, Any]:
             save_tensors(checkpoint, flatten(state), {"points": points, "seconds": seconds})
     return {
         "steps_per_second": ppo.steps / max(seconds, 1e-9),
+        "simulator_steps_per_second": (ppo.steps - first) / max(ppo.world_seconds, 1e-9),
         "wall_seconds": seconds,
         "points": points,
     }

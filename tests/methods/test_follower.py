@@ -1,0 +1,29 @@
+import numpy as np
+import torch
+
+from astra_data.methods.follower import CarefulFollower
+from astra_data.tasks import TASKS
+
+
+def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
+    task = TASKS["antmaze-umaze"]
+    navigation, maze = task.navigation, task.maze
+    rng = np.random.default_rng(0)
+    goal = torch.from_numpy(navigation.draw_goals(rng, 3)).float()
+    simulator = task.simulator(3)
+    start = torch.from_numpy(navigation.draw_starts(rng, 3)).float()
+    simulator.reset_to(torch.cat([start, torch.zeros(3, 2)], dim=-1))
+    follower = CarefulFollower(maze)
+    fields = follower.fields(goal)
+    reached = torch.zeros(3, dtype=torch.bool)
+    closest = np.inf
+    for _ in range(navigation.horizon):
+        command = follower.command(simulator.state[:, :2], goal, fields)
+        assert command.abs().max() <= 1.0 + 1e-6
+        place = simulator.step(command)[:, :2]
+        reached |= navigation.reached(place, goal)
+        closest = min(closest, float(maze.clearance(place.numpy().astype(np.float64)).min()))
+        if reached.all():
+            break
+    assert reached.all()
+    assert closest > 1.0

@@ -1,0 +1,30 @@
+"""A small run through all stages: a task with short episodes and settings to match."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+from astra_data.stages.align import AlignConfig
+from astra_data.stages.collect import CollectConfig
+from astra_data.stages.ground import GroundConfig
+from astra_data.stages.train import TrainConfig
+from astra_data.tasks import TASKS
+
+TASK = "antmaze-short"
+_LONG = TASKS["antmaze-umaze"]
+_SHORT = replace(_LONG, name=TASK, navigation=replace(_LONG.navigation, horizon=25))
+
+COLLECT = CollectConfig(episodes=8, max_steps=60)
+GROUND = GroundConfig(updates=30, batch_windows=4, window=20, latent_size=16, held_out_share=0.25)
+TRAIN = TrainConfig(num_envs=8, rollout_steps=8, total_steps=8 * 8 * 6, hidden_sizes=(16,), memory_size=8)
+ALIGN = AlignConfig(updates=100, batch_windows=4, window=20, held_out_share=0.25)
+
+
+@contextmanager
+def short_task() -> Iterator[None]:
+    """Let the task be known for a while."""
+    TASKS[TASK] = _SHORT
+    try:
+        yield
+    finally:
+        del TASKS[TASK]

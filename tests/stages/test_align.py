@@ -1,0 +1,32 @@
+import json
+from pathlib import Path
+
+from small_run import ALIGN
+
+from astra_data.progress import silent
+from astra_data.stages.align import align
+from astra_data.target_encoder_file import load_target_encoder
+
+
+def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
+    assert {file.name for file in aligned.iterdir()} == {
+        "config.json",
+        "metrics.json",
+        "target_encoder.safetensors",
+    }
+    metrics = json.loads((aligned / "metrics.json").read_text())
+    first, last = metrics["points"]
+    assert (first["step"], last["step"]) == (50, 100)
+    assert 0 < last["mmd"] < first["mmd"]
+    assert last["mmd"] == metrics["mmd"]
+    assert load_target_encoder(aligned / "target_encoder.safetensors").encoder.latent_size == 16
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    task: str, paired: Path, grounded: Path, aligned: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "again"
+    inputs = {"dataset": paired, "grounding": grounded}
+    align(task, "astra", ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
+    name = "target_encoder.safetensors"
+    assert (out / name).read_bytes() == (aligned / name).read_bytes()

@@ -1,0 +1,93 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from astra_data.checkpoint import load_tensors
+from astra_data.errors import BadInputError
+from astra_data.progress import silent
+from astra_data.stages.evaluate import EvaluateConfig, evaluate
+
+CONFIG = EvaluateConfig(episodes=3)
+HORIZON = 25
+Result = tuple[dict[str, Any], dict[str, Tensor]]
+
+
+def make(
+    task: str, method: str, out: Path, inputs: dict[str, Path] | None = None, config: EvaluateConfig = CONFIG
+) -> Result:
+    paths = {"policy": None, "grounding": None, "target_encoder": None} | (inputs or {})
+    evaluate(task, method, config, **paths, seed=0, out=out, device="cpu", progress=silent)
+    tensors, _ = load_tensors(out / "trajectories.safetensors")
+    return json.loads((out / "evaluation.json").read_text()), tensors
+
+
+def check_outcome(outcome: dict[str, list[float]], position: Tensor) -> None:
+    """Check the lists of one world against each other and against the paths."""
+    assert outcome.keys() == {"success", "topple", "wall_contact", "steps", "return"}
+    assert all(len(values) == CONFIG.episodes for values in outcome.values())
+    assert position.shape[0] == CONFIG.episodes
+    assert position.shape[2] == 2
+    for episode in range(CONFIG.episodes):
+        steps = int(outcome["steps"][episode])
+        assert 1 <= steps <= HORIZON
+        ended = outcome["success"][episode] + outcome["topple"][episode]
+        assert ended in ((0, 1) if steps == HORIZON else (1,))
+        assert 0 <= outcome["wall_contact"][episode] <= 1
+        assert math.isfinite(outcome["return"][episode])
+        assert torch.isfinite(position[episode, : steps + 1]).all()
+        assert position[episode, steps + 1 :].isnan().all()
+
+
+def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
+    task: str, trained: Path, grounded: Path, aligned: Path, tmp_path: Path
+) -> None:
+    inputs = {"policy": trained, "grounding": grounded, "target_encoder": aligned}
+    told, paths = make(task, "astra", tmp_path / "astra", inputs)
+    keys = {"task", "method", "seed", "episodes", "dataset_version", "dataset_hash", "wall_seconds"}
+    keys |= {"target_steps_per_second", "encoder", "target", "simulated", "encoders"}
+    assert told.keys() == keys
+    assert (told["method"], told["seed"], told["episodes"], told["encoder"]) == ("astra", 0, 3, "target")
+    assert told["encoders"].keys() == {"source", "target"}
+    assert told["dataset_version"] == "antmaze-short-random@data-1.0.0"
+    check_outcome(told["target"], paths["target.position"])
+    check_outcome(told["simulated"], paths["simulated.position"])
+    with_source = CONFIG.model_copy(update={"encoder": "source"})
+    source, other = make(task, "astra", tmp_path / "source", inputs, with_source)
+    assert source["encoder"] == "source"
+    assert not torch.equal(other["target.position"][:, 10], paths["target.position"][:, 10])
+    # Starts and goals are every method's, whatever it is.
+    follower, followed = make(task, "follower", tmp_path / "follower")
+    assert follower.keys() == keys - {"encoder", "simulated", "encoders", "dataset_version", "dataset_hash"}
+    check_outcome(follower["target"], followed["target.position"])
+    for name in ("start", "goal"):
+        assert torch.equal(followed[name], paths[name])
+        assert len(paths[name].unique(dim=0)) == CONFIG.episodes
+    assert torch.equal(followed["start"], followed["target.position"][:, 0])
+    assert torch.equal(paths["start"], paths["target.position"][:, 0])
+
+
+def test_the_same_seed_gives_the_same_outcome(
+    task: str, trained: Path, grounded: Path, tmp_path: Path
+) -> None:
+    first, second = (
+        make(task, "astra", tmp_path / name, {"policy": trained, "grounding": grounded})
+        for name in ("a", "b")
+    )
+    assert first[0]["encoder"] == "source"
+    for world in ("target", "simulated"):
+        assert first[0][world] == second[0][world]
+
+
+def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="run the stage `train` first"):
+        make(task, "astra", tmp_path / "out")
+    with pytest.raises(BadInputError, match="run the stage `ground` first"):
+        make(task, "astra", tmp_path / "out", {"policy": trained})
+    with pytest.raises(BadInputError, match=r"policy.safetensors does not exist") as caught:
+        make(task, "direct_transfer", tmp_path / "out", {"policy": tmp_path})
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,97 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from small_run import GROUND
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import BadInputError
+from astra_data.grounding_file import load_grounding
+from astra_data.progress import Progress, silent
+from astra_data.stages import ground as stage
+from astra_data.stages.ground import ground
+
+
+def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
+    ground(task, method, GROUND, dataset=dataset, seed=0, out=out, device="cpu", progress=progress)
+    return (out / "grounding.safetensors").read_bytes()
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def stop_after(updates: int) -> Progress:
+    def progress(fraction: float, note: str) -> None:
+        if fraction * GROUND.updates >= updates:
+            raise Stopped
+
+    return progress
+
+
+def test_the_artefact_is_complete(grounded: Path) -> None:
+    files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}
+    assert {file.name for file in grounded.iterdir()} == files
+    metrics = json.loads((grounded / "metrics.json").read_text())
+    assert metrics["parameters"] > 1000
+    (epoch,) = metrics["epochs"]
+    heads = {"loss_latent", "loss_reward", "loss_state", "loss_topple", "r2_latent", "r2_reward", "r2_state"}
+    assert epoch.keys() == {"step", "latent_std", "latent_rank"} | heads
+    assert epoch["step"] == GROUND.updates
+    assert 1.0 <= epoch["latent_rank"] <= GROUND.latent_size
+    gap = json.loads((grounded / "gap.json").read_text())
+    assert gap["horizons"] == [1, 10, 50]
+    for kind in ("raw", "grounded"):
+        for quantity in ("position_m", "velocity_m_s"):
+            assert {figure: len(values) for figure, values in gap[kind][quantity].items()} == {
+                "mean": 3,
+                "low": 3,
+                "high": 3,
+            }
+
+
+def test_the_residual_is_the_scatter_on_held_out_episodes(grounded: Path, paired: Path) -> None:
+    model = load_grounding(grounded / "grounding.safetensors")
+    _, held_out = PairedEpisodes.load(paired).split(GROUND.held_out_share, 0)
+    windows = held_out.windows
+    latent, _ = model.encoder(model.encoder_input(windows.state, windows.goal, windows.previous_action))
+    corrected = model.correct(latent, windows.action, windows.simulated_next)
+    wrong = held_out.steps(windows.next_state - corrected)
+    factor = model.residual_factor
+    torch.testing.assert_close(factor @ factor.T, torch.cov(wrong.T), atol=1e-5, rtol=1e-3)
+
+
+def test_the_same_seed_gives_the_same_bytes(task: str, paired: Path, grounded: Path, tmp_path: Path) -> None:
+    assert make(task, paired, tmp_path / "again") == (grounded / "grounding.safetensors").read_bytes()
+
+
+def test_after_an_interruption_it_goes_on(
+    task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 10)
+    out = tmp_path / "ground"
+    with pytest.raises(Stopped):
+        make(task, paired, out, progress=stop_after(20))
+    assert not out.exists()
+    seen: list[float] = []
+    data = make(task, paired, out, progress=lambda fraction, note: seen.append(fraction))
+    assert seen[0] == 1.0  # the last ten updates only
+    assert data == (grounded / "grounding.safetensors").read_bytes()
+    assert [epoch["step"] for epoch in json.loads((out / "metrics.json").read_text())["epochs"]] == [
+        10,
+        20,
+        30,
+    ]
+
+
+def test_methods_without_a_grounding_and_raw_datasets_are_refused(
+    task: str, paired: Path, collected: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(BadInputError, match="'direct_transfer' does not ground its simulator"):
+        make(task, paired, tmp_path / "out", method="direct_transfer")
+    with pytest.raises(BadInputError, match="expected a dataset that was paired") as caught:
+        make(task, collected, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(BadInputError, match="no dataset there"):
+        make(task, tmp_path / "nowhere", tmp_path / "out")

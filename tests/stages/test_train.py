@@ -1,0 +1,100 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from small_run import TRAIN
+
+from astra_data.errors import BadInputError
+from astra_data.policy_file import PolicyFile
+from astra_data.progress import Progress, silent
+from astra_data.stages import train as stage
+from astra_data.stages.train import TrainConfig, train
+
+SWITCHES = {
+    "topple": True,
+    "residual_noise": 1.0,
+    "support": True,
+    "support_points": 1,
+    "blocked_reward": -0.1,
+    "data_start_share": 0.5,
+}
+
+
+def make(
+    task: str,
+    method: str,
+    dataset: Path,
+    grounding: Path | None,
+    out: Path,
+    config: TrainConfig = TRAIN,
+    progress: Progress = silent,
+) -> bytes:
+    inputs = {"dataset": dataset, "grounding": grounding}
+    train(task, method, config, **inputs, seed=0, out=out, device="cpu", progress=progress)  # type: ignore[arg-type]
+    return (out / "policy.safetensors").read_bytes()
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def stop(fraction: float, note: str) -> None:
+    if fraction > 0.7:
+        raise Stopped
+
+
+def test_the_artefact_is_complete(trained: Path) -> None:
+    assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
+    curve = json.loads((trained / "curve.json").read_text())
+    assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
+    assert {"success", "return"} <= curve["points"][0].keys()
+    policy = PolicyFile.load(trained / "policy.safetensors")
+    assert policy.dataset == "antmaze-short-random@data-1.0.0"
+    assert policy.policy.memory is None
+    assert not policy.scatter.any()
+
+
+def test_a_raw_simulator_needs_a_memory(task: str, paired: Path, tmp_path: Path) -> None:
+    make(task, "direct_transfer", paired, None, tmp_path / "train")
+    policy = PolicyFile.load(tmp_path / "train" / "policy.safetensors").policy
+    assert policy.shape.memory_size == TRAIN.memory_size
+    assert policy.shape.observation_size == 8  # position, velocity, goal, relative goal
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    task: str, paired: Path, grounded: Path, trained: Path, tmp_path: Path
+) -> None:
+    again = make(task, "astra", paired, grounded, tmp_path / "again")
+    assert again == (trained / "policy.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("method", ["direct_transfer", "astra_plus"])
+def test_after_an_interruption_it_goes_on(
+    method: str, task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 2)
+    grounding = grounded if method == "astra_plus" else None
+    config = TRAIN.model_copy(update=SWITCHES)
+    expected = make(task, method, paired, grounding, tmp_path / "whole", config)
+    out = tmp_path / "interrupted"
+    with pytest.raises(Stopped):
+        make(task, method, paired, grounding, out, config, stop)
+    assert not out.exists()
+    seen: list[float] = []
+    resumed = make(task, method, paired, grounding, out, config, lambda done, note: seen.append(done))
+    assert seen == pytest.approx([5 / 6, 1.0])
+    assert resumed == expected
+    policy = PolicyFile.load(out / "policy.safetensors")
+    assert policy.world.model_dump() == policy.world.model_dump() | SWITCHES
+    assert torch.linalg.matrix_rank(policy.scatter) == 4
+
+
+def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="'follower' has no policy to train"):
+        make(task, "follower", paired, None, tmp_path / "out")
+    with pytest.raises(BadInputError, match="run the stage `ground` first"):
+        make(task, "astra", paired, None, tmp_path / "out")
+    with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
+        make(task, "astra", paired, tmp_path, tmp_path / "out")
+    assert "\n" not in str(caught.value)

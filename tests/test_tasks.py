@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+
+from astra_data.errors import BadInputError
+from astra_data.tasks import TASKS, Task, task_named
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_worlds_and_columns_fit_together(task: Task) -> None:
+    assert TASKS[task.name] is task
+    assert task.fps == 20
+    sizes = [column.size for column in task.state_columns]
+    env = task.target(2, seed=0, num_threads=1)
+    observation = env.reset()
+    assert observation.shape == (2, sizes[0] + sizes[1])
+    assert env.step(observation[:, :2] * 0).observation.shape == observation.shape
+    assert sizes[2] == env.action_size
+    abstract = task.abstraction(env.state)
+    simulator = task.simulator(2)
+    assert abstract.shape == simulator.state.shape == (2, len(task.abstract_names))
+    assert simulator.timestep_s == task.timestep_s
+    assert bool(simulator.free.is_free(abstract[:, :2]).all())
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
+    maze = task.maze
+    start = maze.fine_index(np.array(maze.cell_centre(*maze.start)))
+    metres = maze.distance_field(np.array(maze.cell_centre(*maze.goal)))[start]
+    # Below the largest command along one axis, 1 m/s, with time to spare.
+    assert metres / (task.navigation.horizon * task.timestep_s) < 0.8
+
+
+def test_an_unknown_task_answers_with_the_known_ones() -> None:
+    with pytest.raises(BadInputError, match=r"unknown task 'antmaze-umase'.*antmaze-umaze"):
+        task_named("antmaze-umase")

@@ -1,0 +1,114 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.methods import METHODS
+from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
+from astra_data.sims.grounded import GroundedSimulator
+from astra_data.sims.point_mass import PointMass
+from astra_data.sims.randomized import RandomizedSimulator
+from astra_data.tasks import TASKS
+from astra_data.training_world import WorldConfig, training_world, world_parts
+
+TASK = TASKS["antmaze-umaze"]
+HERE = torch.tensor(TASK.maze.cell_centre(1, 2), dtype=torch.float32)
+
+
+@pytest.fixture
+def episodes() -> PairedEpisodes:
+    """Return two episodes of 400 and 300 steps around the middle of a corridor."""
+    torch.manual_seed(0)
+    state = torch.cat([HERE + 0.5 * torch.rand(2, 401, 2), torch.randn(2, 401, 2)], dim=-1)
+    action = torch.rand(2, 400, 2) * 2 - 1
+    mask = torch.ones(2, 400)
+    mask[1, 300:] = 0.0
+    scale = torch.tensor([0.01, 0.02, 0.1, 0.2])
+    windows = Windows(
+        state=state[:, :-1],
+        action=action,
+        previous_action=torch.cat([torch.zeros(2, 1, 2), action[:, :-1]], dim=1),
+        goal=torch.randn(2, 400, 2),
+        simulated_next=state[:, 1:] + scale * torch.randn(2, 400, 4),
+        next_state=state[:, 1:],
+        reward=torch.zeros(2, 400),
+        toppled=torch.zeros(2, 400),
+        mask=mask,
+    )
+    return PairedEpisodes(torch.zeros(2, 400, 29), windows, "toy@data-1.0.0", "0")
+
+
+@pytest.fixture
+def model() -> GroundingModel:
+    torch.manual_seed(0)
+    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+
+
+def test_without_switches_it_is_the_plain_simulator(episodes: PairedEpisodes, model: GroundingModel) -> None:
+    config = WorldConfig()
+    for name, kind, grounding in (("direct_transfer", PointMass, None), ("astra", GroundedSimulator, model)):
+        parts = world_parts(TASK, config, episodes, grounding)
+        assert torch.equal(parts.free.blocked, TASK.simulator(1).free.blocked)
+        assert not parts.scatter.any()
+        assert parts.starts is None
+        world = training_world(TASK, METHODS[name], config, parts, grounding, num_envs=4, device="cpu")
+        assert type(world.simulator) is kind
+        assert world.reward == METHODS[name].reward
+        assert world.num_envs == 4
+
+
+def test_scatter_is_what_the_simulator_does_not_explain(
+    episodes: PairedEpisodes, model: GroundingModel
+) -> None:
+    config = WorldConfig(residual_noise=2.0)
+    parts = world_parts(TASK, config, episodes, None)
+    world = training_world(TASK, METHODS["nas"], config, parts, None, num_envs=1, device="cpu")
+    assert type(world.simulator) is RandomizedSimulator
+    deviations = (parts.scatter @ parts.scatter.T).diagonal().sqrt()
+    torch.testing.assert_close(deviations, 2 * torch.tensor([0.01, 0.02, 0.1, 0.2]), rtol=0.1, atol=0)
+    model.residual_factor.copy_(torch.eye(4))
+    assert torch.equal(world_parts(TASK, config, episodes, model).scatter, 2 * torch.eye(4))
+
+
+def test_support_closes_what_the_data_did_not_visit(episodes: PairedEpisodes) -> None:
+    free = world_parts(TASK, WorldConfig(support=True), episodes, None).free
+    visited = HERE + torch.tensor([[0.3, 0.3], [0.1, 0.45]])
+    elsewhere = HERE + torch.tensor([[-0.3, 0.0], [0.9, 0.0], [2.0, 0.0]])
+    assert free.is_free(visited).all()
+    assert not free.is_free(elsewhere).any()
+    assert TASK.simulator(1).free.is_free(elsewhere).all()
+
+
+def test_recorded_starts_come_with_the_history_before_them(
+    episodes: PairedEpisodes, model: GroundingModel
+) -> None:
+    config = WorldConfig(data_start_share=1.0)
+    starts = world_parts(TASK, config, episodes, model).starts
+    assert starts is not None
+    assert starts.hidden is not None
+    assert len(starts.state) == len(starts.hidden) == 700
+    windows = episodes.windows
+    inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
+    hidden = torch.zeros(1, 8)
+    for step in range(5):
+        row = 400 + step  # of the second episode
+        torch.testing.assert_close(starts.hidden[row : row + 1], hidden)
+        assert torch.equal(starts.state[row], windows.state[1, step])
+        assert torch.equal(starts.previous_action[row], windows.previous_action[1, step])
+        hidden = model.encoder.step(inputs[1:, step], hidden)
+
+
+def test_a_recorded_start_is_one_of_the_recorded_moments(
+    episodes: PairedEpisodes, model: GroundingModel
+) -> None:
+    few = replace(
+        episodes, windows=replace(episodes.windows, mask=(torch.arange(400) < 3) * torch.ones(2, 1))
+    )
+    config = WorldConfig(data_start_share=1.0)
+    parts = world_parts(TASK, config, few, model)
+    world = training_world(TASK, METHODS["astra"], config, parts, model, num_envs=64, device="cpu")
+    world.reset()
+    moments = few.steps(few.windows.state)
+    assert len(moments) == 6
+    assert torch.equal(world.simulator.state.unique(dim=0), moments.unique(dim=0))

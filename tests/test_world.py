@@ -1,0 +1,81 @@
+import pytest
+import torch
+
+from astra_data.mazes import U_MAZE
+from astra_data.navigation import Navigation
+from astra_data.sims.point_mass import PointMass
+from astra_data.world import DataStarts, NavigationWorld, policy_observation
+
+TASK = Navigation(U_MAZE, horizon=700)
+
+
+def world(num_envs: int = 4, **options: float) -> NavigationWorld:
+    simulator = PointMass(U_MAZE, num_envs, timestep_s=0.05)
+    return NavigationWorld(TASK, simulator, **options)  # type: ignore[arg-type]
+
+
+def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
+    state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
+    seen = policy_observation(U_MAZE, state, goal, None)
+    assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -9.0, 14.0])
+    with_latent = policy_observation(U_MAZE, state, goal, torch.tensor([[7.0]]))
+    assert with_latent.tolist() == [[7.0, *seen[0].tolist()]]
+
+
+def test_the_same_torch_seed_gives_the_same_starts() -> None:
+    observations = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        observations.append(world().reset())
+    assert torch.equal(observations[0], observations[1])
+    assert not torch.equal(observations[0], observations[2])
+
+
+def test_resumes_where_it_was() -> None:
+    first, second = world(), world()
+    first.reset()
+    first.step(torch.ones(4, 2))
+    observation = second.load_state_dict(first.state_dict())
+    for _ in range(3):
+        action = 2 * torch.rand(4, 2) - 1
+        a, b = first.step(action), second.step(action)
+        assert torch.equal(a.observation, b.observation)
+        assert torch.equal(a.reward, b.reward)
+    assert observation.shape == (4, 8)
+
+
+def test_walls_cost_what_they_are_said_to() -> None:
+    free, costly = world(2), world(2, blocked_reward=-0.25)
+    state = torch.tensor([[-4.0, 5.9 - 1e-3, 0.0, 0.0], [-4.0, 4.0, 0.0, 0.0]])
+    goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
+    steps = []
+    for one in (free, costly):
+        one.load_state_dict({"state": state, "goal": goal})
+        steps.append(one.step(torch.tensor([[0.0, 1.0]]).expand(2, 2)))
+    assert (steps[1].reward - steps[0].reward).tolist() == pytest.approx([-0.25, 0.0])
+
+
+def test_episodes_may_start_from_recorded_moments() -> None:
+    moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
+    starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)
+    torch.manual_seed(0)
+    one = world(1000, starts=starts, data_start_share=0.3)  # type: ignore[arg-type]
+    one.reset()
+    recorded = (one.simulator.state == moment).all(dim=1)
+    assert float(recorded.float().mean()) == pytest.approx(0.3, abs=0.05)
+    assert bool((one.goal[recorded] == starts.goal).all())
+    # At rest near the task's start otherwise.
+    other = one.simulator.state[~recorded]
+    assert bool((other[:, 2:] == 0).all())
+    assert float((other[:, :2] - torch.tensor([-4.0, 4.0])).abs().max()) <= 0.6 + 1e-5
+
+
+def test_reaching_the_goal_is_success() -> None:
+    one = world(1)
+    one.load_state_dict(
+        {"state": torch.tensor([[-3.54, -4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
+    )
+    step = one.step(torch.tensor([[-1.0, 0.0]]))
+    assert bool(step.success)
+    assert bool(step.terminated)
+    assert float(step.reward) == pytest.approx(10.05, abs=0.01)

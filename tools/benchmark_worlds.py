@@ -1,0 +1,157 @@
+"""Measure how fast the worlds step, against what the physics engine and a plain Gymnasium loop allow.
+
+    uv run python tools/benchmark_worlds.py
+    uv run python tools/benchmark_worlds.py --json runs/worlds.json
+
+All figures come from one process, the target's in turns over the same stretches of time, so that their
+ratios hold even on a machine that does other work too.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Annotated
+
+import gymnasium
+import gymnasium_robotics
+import mujoco
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from astra_data.ant import CONTROL_SUBSTEPS, VelocityController, ant_model
+from astra_data.envs.antmaze import AntMazeEnv
+from astra_data.physics import Floats
+from astra_data.tasks import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+GYMNASIUM_ID = "AntMaze_UMaze-v5"
+
+gymnasium.register_envs(gymnasium_robotics)
+
+Stretch = Callable[[], int]
+"""Do some work; return how many control steps that was."""
+
+
+def main(
+    num_envs: Annotated[int, typer.Option(help="Ants.")] = 128,
+    num_points: Annotated[int, typer.Option(help="Point masses.")] = 4096,
+    rounds: Annotated[int, typer.Option(help="Turns that each candidate takes.")] = 6,
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures there.")] = None,
+) -> None:
+    """Print control steps per second of the target and of the abstract simulator, and the ratios."""
+    torch.set_num_threads(1)
+    threads = os.cpu_count() or 1
+    figures = measure_target(num_envs, threads, rounds)
+    figures["point_mass"] = rate([point_mass_stretch(num_points, steps=100)], rounds)[0]
+    ratios = {
+        "target / physics limit": figures["target"] / figures["physics_limit"],
+        "target / Gymnasium loop": figures["target"] / figures["gymnasium_loop"],
+    }
+    table = Table("steps/s", "", title=f"{num_envs} ants, {num_points} points, {threads} threads")
+    for name, figure in figures.items():
+        table.add_row(name.replace("_", " "), f"{figure:,.0f}")
+    table.add_section()
+    for name, ratio in ratios.items():
+        table.add_row(name, f"{ratio:.2f}")
+    Console().print(table)
+    if json_path is not None:
+        report = {"num_envs": num_envs, "num_points": num_points, "threads": threads, **figures, **ratios}
+        json_path.write_text(json.dumps(report, indent=2) + "\n")
+
+
+class RecordingController(VelocityController):
+    """The shipped controller, keeping the torques (B, 8) that it gave."""
+
+    def __init__(self, controller: VelocityController) -> None:
+        self.controller = controller
+        self.torques: list[Floats] = []
+
+    def __call__(self, qpos: Floats, qvel: Floats, command: Floats) -> Floats:
+        """Return and keep torques (B, 8)."""
+        self.torques.append(self.controller(qpos, qvel, command))
+        return self.torques[-1]
+
+
+def measure_target(num_envs: int, threads: int, rounds: int) -> dict[str, float]:
+    """Return control steps per second of our target, of bare physics, and of Gymnasium's own maze."""
+    controller = RecordingController(VelocityController.load())
+    env = AntMazeEnv(TASK.navigation, num_envs, seed=0, controller=controller, num_threads=threads)
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    starts = [env.physics.qpos, env.physics.qvel]
+
+    def target() -> int:
+        env.reset(env.toppled)
+        starts[:] = env.physics.qpos.copy(), env.physics.qvel.copy()
+        controller.torques.clear()
+        for _ in range(25):
+            env.step(2 * torch.rand(num_envs, 2, generator=generator) - 1)
+        return 25 * num_envs
+
+    model = ant_model(TASK.maze)
+    data = [mujoco.MjData(model) for _ in range(num_envs)]
+    pool = ThreadPoolExecutor(threads)
+
+    def replay(row: int) -> None:
+        one = data[row]
+        mujoco.mj_resetData(model, one)
+        one.qpos[:], one.qvel[:] = starts[0][row], starts[1][row]
+        for torques in controller.torques:
+            one.ctrl[:] = torques[row]
+            mujoco.mj_step(model, one, CONTROL_SUBSTEPS)
+
+    def physics_limit() -> int:
+        # The ants' last stretch once more, ant by ant on all cores: nothing but physics, and no waiting.
+        list(pool.map(replay, range(num_envs)))
+        return len(controller.torques) * num_envs
+
+    single = gymnasium.make(GYMNASIUM_ID)
+    single.reset(seed=0)
+
+    def gymnasium_loop() -> int:
+        for _ in range(100):
+            _, _, terminated, truncated, _ = single.step(single.action_space.sample())
+            if terminated or truncated:
+                single.reset()
+        return 100
+
+    names = ("target", "physics_limit", "gymnasium_loop")
+    return dict(zip(names, rate([target, physics_limit, gymnasium_loop], rounds), strict=True))
+
+
+def point_mass_stretch(num_points: int, steps: int) -> Stretch:
+    """Step point masses in the maze with random commands."""
+    simulator = TASK.simulator(num_points)
+    centres = torch.tensor(TASK.maze.free_centres(), dtype=torch.float32)
+    position = centres[torch.arange(num_points) % len(centres)]
+    simulator.reset_to(torch.cat([position, torch.zeros_like(position)], dim=-1))
+    command = 2 * torch.rand(num_points, 2) - 1
+
+    def stretch() -> int:
+        for _ in range(steps):
+            simulator.step(command)
+        return steps * num_points
+
+    return stretch
+
+
+def rate(stretches: list[Stretch], rounds: int) -> list[float]:
+    """Let the stretches take turns; return the steps per second of each, after one turn to warm up."""
+    done, seconds = [0] * len(stretches), [0.0] * len(stretches)
+    for turn in range(rounds + 1):
+        for index, stretch in enumerate(stretches):
+            began = time.perf_counter()
+            count = stretch()
+            if turn > 0:
+                done[index] += count
+                seconds[index] += time.perf_counter() - began
+    return [count / second for count, second in zip(done, seconds, strict=True)]
+
+
+if __name__ == "__main__":
+    typer.run(main)
