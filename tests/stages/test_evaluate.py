@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from astra_data.checkpoint import load_tensors
 from astra_data.errors import BadInputError
 from astra_data.progress import silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.tasks import TASKS
 
 CONFIG = EvaluateConfig(episodes=3)
 HORIZON = 25
@@ -81,6 +83,19 @@ def test_the_same_seed_gives_the_same_outcome(
     assert first[0]["encoder"] == "source"
     for world in ("target", "simulated"):
         assert first[0][world] == second[0][world]
+
+
+def test_an_episode_ends_with_its_success(
+    task: str, trained: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    navigation = replace(TASKS[task].navigation, success_radius_m=100.0)
+    monkeypatch.setitem(TASKS, "antmaze-near", replace(TASKS[task], navigation=navigation))
+    told, paths = make("antmaze-near", "astra", tmp_path / "out", {"policy": trained, "grounding": grounded})
+    for world in ("target", "simulated"):
+        check_outcome(told[world], paths[f"{world}.position"])
+        assert (told[world]["success"], told[world]["steps"]) == ([1.0] * 3, [1.0] * 3)
+    assert told["encoders"] == {"source": {"success": 1.0}}
+    assert min(told["target"]["return"]) > 9.0  # the bonus, and a step's progress
 
 
 def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> None:
