@@ -43,14 +43,14 @@ class FreeSpace:
             torch.tensor(maze.half_extent, dtype=torch.float32, device=device),
         )
 
-    def within(self, supported: Tensor) -> "FreeSpace":
-        """Return this space limited to the cells in which `supported` (height, width) is True."""
-        return FreeSpace(self.blocked | ~supported, self.half_extent)
-
     def is_free(self, position: Tensor) -> Tensor:
         """Tell for each `position` (..., 2) in m whether it is free."""
+        return ~self.blocked[self.cells(position)]
+
+    def cells(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the row and the column (...) of the fine grid's cell of each `position` (..., 2)."""
         column, row = self._cells(position).unbind(-1)
-        return ~self.blocked[row, column]
+        return row, column
 
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Move points from `start` to `end`, both (B, 2) in m, stopping each axis at blocked cells.

@@ -17,14 +17,14 @@ class PolicyFile:
 
     Attributes:
         policy: the networks.
-        blocked: the cells that were closed in training, (height, width) bool.
+        thinness: of the data that it was trained on, (height, width).
         scatter: factor of the noise added in training, (X, X); zeros where there was none.
         world: the switches of the training world.
         dataset, content_hash: the dataset that everything was learned from.
     """
 
     policy: ActorCritic
-    blocked: Tensor
+    thinness: Tensor
     scatter: Tensor
     world: WorldConfig
     dataset: str
@@ -33,7 +33,7 @@ class PolicyFile:
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
         tensors = {f"policy.{name}": tensor for name, tensor in self.policy.state_dict().items()}
-        tensors |= {"blocked": self.blocked, "scatter": self.scatter}
+        tensors |= {"thinness": self.thinness, "scatter": self.scatter}
         told = {
             "shape": asdict(self.policy.shape),
             "world": self.world.model_dump(mode="json"),
@@ -54,7 +54,7 @@ class PolicyFile:
         )
         return cls(
             policy.to(device).requires_grad_(False),
-            tensors["blocked"].to(torch.bool).to(device),
+            tensors["thinness"].to(device),
             tensors["scatter"].to(device),
             WorldConfig(**told["world"]),
             told["dataset"],

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional
 
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.free_space import FreeSpace
 from astra_data.mazes import FIELD_CELL_M
 from astra_data.method import Method
 from astra_data.models.grounding import GroundingModel
@@ -17,8 +18,8 @@ from astra_data.sims.randomized import RandomizedSimulator
 from astra_data.tasks import Task
 from astra_data.world import DataStarts, NavigationWorld, RewardSource, Simulator
 
-_SUPPORT_CELL = 2
-"""Side of a cell of the support map, in cells of the maze's fine grid."""
+_KERNEL_M = 0.25
+"""Standard deviation of the kernel that smooths the density of the data."""
 
 
 class WorldConfig(Config):
@@ -33,12 +34,10 @@ class WorldConfig(Config):
     """Draw topples from the topple head: they end the episode and cost what they cost in the target."""
     residual_noise: float = 0.0
     """Scatter the state after each step by so many times the scatter that the simulator does not explain."""
-    support: bool = False
-    """Close the cells that the data hardly visits."""
-    support_points: int = 3
-    """Fewer visits than this in a cell of 0.2 m are hardly any."""
-    blocked_reward: float = 0.0
-    """Added in each step that is stopped at a wall or a closed cell."""
+    support_penalty: float = 0.0
+    """Taken from the reward of a step to where there is no data; less where there is some."""
+    support_density: float = 0.3
+    """Data is thin where its density is below this share of the median density of the free space."""
     data_start_share: float = 0.0
     """Share of the episodes that start in the midst of a recorded one."""
 
@@ -48,12 +47,12 @@ class WorldParts:
     """What a training world is made of beside its switches.
 
     Attributes:
-        free: where positions may be.
+        thinness: 1 where there is no data, 0 where there is enough, on the maze's fine grid (height, width).
         scatter: factor of the state noise, (X, X).
         starts: recorded moments, if episodes may start there.
     """
 
-    free: FreeSpace
+    thinness: Tensor
     scatter: Tensor
     starts: DataStarts | None = None
 
@@ -62,13 +61,10 @@ class WorldParts:
 def world_parts(
     task: Task, config: WorldConfig, episodes: PairedEpisodes, model: GroundingModel | None
 ) -> WorldParts:
-    """Derive closed cells, scatter and starts from paired episodes, as far as `config` asks for them."""
+    """Derive thinness, scatter and starts from paired episodes, as far as `config` asks for them."""
     windows = episodes.windows
     device = str(windows.state.device)
-    free = task.simulator(1, device).free
-    if config.support:
-        visited = torch.cat([episodes.steps(windows.state), episodes.steps(windows.next_state)])[:, :2]
-        free = free.within(_supported(free, visited, 2 * config.support_points))
+    thinness = _thinness(task, episodes.steps(windows.state)[:, :2], config.support_density)
     if model is not None:
         scatter = model.residual_factor
     else:
@@ -87,18 +83,18 @@ def world_parts(
             previous_action=episodes.steps(windows.previous_action),
             hidden=hidden,
         )
-    return WorldParts(free, config.residual_noise * scatter, starts)
+    return WorldParts(thinness, config.residual_noise * scatter, starts)
 
 
-def _supported(free: FreeSpace, positions: Tensor, least: int) -> Tensor:
+def _thinness(task: Task, positions: Tensor, density: float) -> Tensor:
+    free = task.simulator(1, str(positions.device)).free
     height, width = free.blocked.shape
-    cells = ((positions + free.half_extent) / (FIELD_CELL_M * _SUPPORT_CELL)).long()
-    columns = width // _SUPPORT_CELL
-    counts = torch.bincount(
-        cells[:, 1] * columns + cells[:, 0], minlength=(height // _SUPPORT_CELL) * columns
-    )
-    coarse = counts.reshape(-1, columns) >= least
-    return coarse.repeat_interleave(_SUPPORT_CELL, 0).repeat_interleave(_SUPPORT_CELL, 1)
+    rows, columns = free.cells(positions)
+    counts = torch.bincount(rows * width + columns, minlength=height * width).reshape(height, width)
+    smooth = gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / FIELD_CELL_M)
+    # Where most of the maze was never visited, the median is nothing, and any visit at all is enough.
+    enough = max(density * float(np.median(smooth[~task.maze.fine_walls])), 1e-9)
+    return torch.from_numpy(1.0 - smooth / enough).clamp_min(0.0).float().to(positions.device)
 
 
 def training_world(
@@ -115,15 +111,15 @@ def training_world(
     inner = task.simulator(num_envs, device)
     simulator: Simulator = inner
     if model is not None:
-        simulator = GroundedSimulator(inner, model, parts.free, scatter=parts.scatter)
-    elif config.residual_noise or config.support:
-        simulator = RandomizedSimulator(inner, parts.free, parts.scatter)
+        simulator = GroundedSimulator(inner, model, inner.free, scatter=parts.scatter)
+    elif config.residual_noise:
+        simulator = RandomizedSimulator(inner, inner.free, parts.scatter)
     return NavigationWorld(
         task.navigation,
         simulator,
         reward=config.reward or method.reward,
         topple=config.topple,
-        blocked_reward=config.blocked_reward,
+        thinness=config.support_penalty * parts.thinness,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,
     )

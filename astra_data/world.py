@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.batched import Step
+from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
 from astra_data.navigation import Navigation
 from astra_data.sims.grounded import GroundedSimulator
@@ -58,7 +59,7 @@ class NavigationWorld:
         *,
         reward: RewardSource = "abstract",
         topple: bool = False,
-        blocked_reward: float = 0.0,
+        thinness: Tensor | None = None,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
     ) -> None:
@@ -69,7 +70,7 @@ class NavigationWorld:
             simulator: raw or grounded.
             reward: where the reward comes from.
             topple: end episodes by the topple head.
-            blocked_reward: added in steps in which the simulator was stopped at the edge of its space.
+            thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width).
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
         """
@@ -78,7 +79,8 @@ class NavigationWorld:
         self.grounded = simulator if isinstance(simulator, GroundedSimulator) else None
         self.reward = reward
         self.topple = topple
-        self.blocked_reward = blocked_reward
+        self.free = FreeSpace.of_maze(navigation.maze, radius_m=0.0, device=str(simulator.state.device))
+        self.thinness = thinness
         self.starts = starts
         self.data_start_share = data_start_share
         self.device = simulator.state.device
@@ -134,7 +136,9 @@ class NavigationWorld:
         after = self.simulator.step(action)
         success = self.navigation.reached(after[:, :2], self.goal)
         self.toppled = torch.zeros_like(success)
-        penalty = self.blocked_reward * self.simulator.blocked
+        penalty = torch.zeros(self.num_envs, device=self.device)
+        if self.thinness is not None:
+            penalty = -self.thinness[self.free.cells(after[:, :2])]
         if self.grounded is not None and latent is not None and (self.topple or self.reward == "blend"):
             with torch.no_grad():
                 risk = self.grounded.model.topple_logit(latent, action, after).sigmoid()

@@ -84,17 +84,6 @@ def test_a_wall_cannot_be_walked_through_from_inside() -> None:
     assert position[0, 1] > 1.8
 
 
-def test_within_closes_further_cells() -> None:
-    free = FreeSpace.of_maze(ROOM, radius_m=0.1)
-    supported = torch.ones_like(free.blocked)
-    supported[:, supported.shape[1] // 2 :] = False  # x >= 0
-    half = free.within(supported)
-    assert half.is_free(torch.tensor([[-0.05, 0.0], [0.05, 0.0]])).tolist() == [True, False]
-    rest, stopped = half.slide(torch.tensor([[-0.05, 0.0]]), torch.tensor([[0.05, 0.0]]))
-    assert bool(stopped)
-    assert rest[0].tolist() == pytest.approx([0.0, 0.0], abs=2e-4)
-
-
 def test_goal_distance_is_bilinear() -> None:
     # A field that is itself linear is reproduced exactly, between cell centres too.
     height, width = ROOM.fine_walls.shape

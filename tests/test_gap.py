@@ -31,7 +31,7 @@ def episodes(speed: float) -> PairedEpisodes:
         goal=torch.zeros(3, STEPS, 2),
         simulated_next=simulated,
         next_state=state[:, 1:],
-        reward=torch.zeros(3, STEPS),
+        reward=torch.zeros(3, STEPS, 2),
         toppled=torch.zeros(3, STEPS),
         mask=mask,
     )

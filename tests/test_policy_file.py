@@ -9,13 +9,13 @@ from astra_data.training_world import WorldConfig
 
 def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
-    blocked, scatter = torch.rand(6, 5) > 0.5, torch.randn(4, 4)
+    thinness, scatter = torch.rand(6, 5), torch.randn(4, 4)
     world = WorldConfig(reward="blend", topple=True, residual_noise=0.5)
-    saved = PolicyFile(policy, blocked, scatter, world, "toy@data-1.0.0", "abc")
+    saved = PolicyFile(policy, thinness, scatter, world, "toy@data-1.0.0", "abc")
     saved.save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
     assert (loaded.world, loaded.dataset, loaded.content_hash) == (world, "toy@data-1.0.0", "abc")
-    assert torch.equal(loaded.blocked, blocked)
+    assert torch.equal(loaded.thinness, thinness)
     assert torch.equal(loaded.scatter, scatter)
     assert loaded.policy.shape == policy.shape
     assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())

@@ -32,7 +32,7 @@ def episodes() -> PairedEpisodes:
         goal=torch.randn(2, 400, 2),
         simulated_next=state[:, 1:] + scale * torch.randn(2, 400, 4),
         next_state=state[:, 1:],
-        reward=torch.zeros(2, 400),
+        reward=torch.zeros(2, 400, 2),
         toppled=torch.zeros(2, 400),
         mask=mask,
     )
@@ -49,7 +49,6 @@ def test_without_switches_it_is_the_plain_simulator(episodes: PairedEpisodes, mo
     config = WorldConfig()
     for name, kind, grounding in (("direct_transfer", PointMass, None), ("astra", GroundedSimulator, model)):
         parts = world_parts(TASK, config, episodes, grounding)
-        assert torch.equal(parts.free.blocked, TASK.simulator(1).free.blocked)
         assert not parts.scatter.any()
         assert parts.starts is None
         world = training_world(TASK, METHODS[name], config, parts, grounding, num_envs=4, device="cpu")
@@ -71,13 +70,21 @@ def test_scatter_is_what_the_simulator_does_not_explain(
     assert torch.equal(world_parts(TASK, config, episodes, model).scatter, 2 * torch.eye(4))
 
 
-def test_support_closes_what_the_data_did_not_visit(episodes: PairedEpisodes) -> None:
-    free = world_parts(TASK, WorldConfig(support=True), episodes, None).free
-    visited = HERE + torch.tensor([[0.3, 0.3], [0.1, 0.45]])
-    elsewhere = HERE + torch.tensor([[-0.3, 0.0], [0.9, 0.0], [2.0, 0.0]])
-    assert free.is_free(visited).all()
-    assert not free.is_free(elsewhere).any()
-    assert TASK.simulator(1).free.is_free(elsewhere).all()
+def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
+    thinness = world_parts(TASK, WorldConfig(), episodes, None).thinness
+    cells = TASK.simulator(1).free.cells
+    far = HERE + torch.tensor([[1.5, 0.0], [0.0, -1.5]])
+    assert (thinness[cells(far)] == 1.0).all()
+    visited = episodes.steps(episodes.windows.state)[:, :2]
+    assert float(thinness[cells(visited)].mean()) < 0.1
+
+
+def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> None:
+    config = WorldConfig(support_penalty=0.3)
+    parts = world_parts(TASK, config, episodes, None)
+    world = training_world(TASK, METHODS["nas"], config, parts, None, num_envs=1, device="cpu")
+    assert world.thinness is not None
+    torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
 
 
 def test_recorded_starts_come_with_the_history_before_them(

@@ -44,12 +44,14 @@ def test_resumes_where_it_was() -> None:
     assert observation.shape == (4, 8)
 
 
-def test_walls_cost_what_they_are_said_to() -> None:
-    free, costly = world(2), world(2, blocked_reward=-0.25)
-    state = torch.tensor([[-4.0, 5.9 - 1e-3, 0.0, 0.0], [-4.0, 4.0, 0.0, 0.0]])
+def test_thin_data_costs_what_it_is_said_to() -> None:
+    thinness = torch.zeros(U_MAZE.fine_walls.shape)
+    thinness[:, : thinness.shape[1] // 2] = 0.25  # x < 0
+    plain, costly = world(2), world(2, thinness=thinness)
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [4.0, 4.0, 0.0, 0.0]])
     goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
     steps = []
-    for one in (free, costly):
+    for one in (plain, costly):
         one.load_state_dict({"state": state, "goal": goal})
         steps.append(one.step(torch.tensor([[0.0, 1.0]]).expand(2, 2)))
     assert (steps[1].reward - steps[0].reward).tolist() == pytest.approx([-0.25, 0.0])

@@ -64,6 +64,7 @@ class PairedEpisodes:
             return pad_sequence(pieces, batch_first=True).to(device)
 
         action = padded(columns[ACTION])
+        ended = columns[TERMINATED]
         return cls(
             target_state=padded(columns[STATE]),
             windows=Windows(
@@ -73,7 +74,7 @@ class PairedEpisodes:
                 goal=padded(columns[GOAL]),
                 simulated_next=padded(columns[ABSTRACT_SIMULATED_NEXT_STATE]),
                 next_state=padded(columns[ABSTRACT_NEXT_STATE]),
-                reward=padded(columns[REWARD]),
+                reward=padded(np.stack([columns[REWARD] * ~ended, columns[REWARD] * ended], axis=-1)),
                 toppled=padded(columns[TERMINATED] & ~columns[SUCCESS]),
                 mask=padded(np.ones(len(columns[ACTION]))),
             ),

@@ -52,7 +52,8 @@ class Windows:
     Attributes:
         state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
-        next_state: φ(s_{i+1}), (B, T, X). reward: r_i, (B, T). toppled: (B, T), the target ended badly.
+        next_state: φ(s_{i+1}), (B, T, X). toppled: (B, T), the target ended badly.
+        reward: r_i in two parts, (B, T, 2): of steps that go on, and of steps that end the task.
         mask: (B, T), 1 on real steps.
     """
 
@@ -87,7 +88,7 @@ class GroundingModel(nn.Module):
         )
         heads = shape.head_sizes
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
-        self.reward_head = mlp((latent + actions, *heads, 1))
+        self.reward_head = mlp((latent + actions, *heads, 2))
         self.correction = mlp((latent + actions + features, *heads, states))
         self.topple_head = mlp((latent + actions + features, *heads, 1))
         # An untrained correction is the identity: the raw simulator.
@@ -98,7 +99,7 @@ class GroundingModel(nn.Module):
             "state": states,
             "goal": shape.goal_size,
             "correction": states,
-            "reward": 1,
+            "reward": 2,
         }.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -137,10 +138,14 @@ class GroundingModel(nn.Module):
         low, high = self.shape.log_variance_bounds
         return mean, low + (high - low) * torch.sigmoid(raw)
 
+    def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Return both parts of the target's reward (..., 2); their scales differ a hundredfold."""
+        normal: Tensor = self.reward_head(torch.cat([latent, action], dim=-1))
+        return normal * self.reward_std + self.reward_mean
+
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
         """R_pred: return the target's reward (...)."""
-        normal: Tensor = self.reward_head(torch.cat([latent, action], dim=-1)).squeeze(-1)
-        return normal * self.reward_std + self.reward_mean
+        return self.predict_reward_parts(latent, action).sum(-1)
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
@@ -174,8 +179,8 @@ class GroundingModel(nn.Module):
             parts["latent"] = (nll * both).sum() / both.sum()
             total = total + weights.latent * parts["latent"]
         if weights.reward > 0:
-            error = (self.predict_reward(latent, action) - windows.reward) / self.reward_std
-            parts["reward"] = _masked_mean(error.square(), mask)
+            error = (self.predict_reward_parts(latent, action) - windows.reward) / self.reward_std
+            parts["reward"] = _masked_mean(error.square().mean(-1), mask)
             total = total + weights.reward * parts["reward"]
         corrected = self.correct(latent, action, windows.simulated_next)
         error = (corrected - windows.next_state) / self.correction_std

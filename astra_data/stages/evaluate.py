@@ -13,7 +13,6 @@ from torch import Tensor
 from astra_data.checkpoint import finished_folder, save_tensors
 from astra_data.deployment import DeployedPolicy, EncoderKind
 from astra_data.errors import BadInputError
-from astra_data.free_space import FreeSpace
 from astra_data.grounding_file import load_grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import CarefulFollower
@@ -182,12 +181,11 @@ def _in_simulation(
 ) -> Outcome:
     """Run the policy in its training world, from the task's starts, with the world's own latents."""
     model = load_grounding(grounding / "grounding.safetensors") if grounding else None
-    free = FreeSpace(trained.blocked, task.simulator(1).free.half_extent)
     world = training_world(
         task,
         method_named(method),
         trained.world,
-        WorldParts(free, trained.scatter),
+        WorldParts(trained.thinness, trained.scatter),
         model,
         num_envs=config.episodes,
         device="cpu",

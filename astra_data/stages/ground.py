@@ -87,7 +87,7 @@ def ground(
             "state": training.steps(windows.state),
             "goal": training.steps(windows.goal),
             "correction": training.steps(windows.next_state - windows.simulated_next),
-            "reward": training.steps(windows.reward).unsqueeze(-1),
+            "reward": training.steps(windows.reward),
         }
     )
     with finished_folder(out) as folder:
@@ -180,8 +180,9 @@ def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeig
     raw = ((windows.simulated_next - windows.next_state) / model.correction_std)[mask].square().mean()
     figures = {"r2_state": float(1.0 - wrong / raw)}
     if weights.reward > 0:
-        predicted = model.predict_reward(latent, windows.action)[mask]
-        figures["r2_reward"] = _r2(predicted, windows.reward[mask])
+        predicted = model.predict_reward_parts(latent, windows.action)[mask]
+        for part, name in enumerate(("r2_reward", "r2_final_reward")):
+            figures[name] = _r2(predicted[:, part], windows.reward[mask][:, part])
     if weights.latent > 0:
         mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
         both = mask[:, :-1] & mask[:, 1:]

@@ -74,7 +74,7 @@ def train(
         curve = _optimise(ppo, folder, device, progress)
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
         PolicyFile(
-            policy, parts.free.blocked, parts.scatter, switches, episodes.reference, episodes.content_hash
+            policy, parts.thinness, parts.scatter, switches, episodes.reference, episodes.content_hash
         ).save(folder / "policy.safetensors")
         (folder / "curve.json").write_text(json.dumps(curve, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))

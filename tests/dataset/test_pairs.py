@@ -69,10 +69,17 @@ def test_episodes_are_padded_at_the_end(episodes: PairedEpisodes) -> None:
         for values in (episodes.target_state, windows.state, windows.next_state, windows.simulated_next):
             assert torch.equal(values[episode, :length, 0], expected)
             assert (values[episode, length:] == 0).all()
-        assert torch.equal(windows.reward[episode, :length], -expected)
+        assert torch.equal(windows.reward[episode, :length].sum(-1), -expected)
         assert windows.mask[episode].tolist() == [1.0] * length + [0.0] * (30 - length)
-    assert torch.equal(episodes.steps(windows.reward), -episodes.steps(windows.state)[:, 0])
+    assert torch.equal(episodes.steps(windows.reward).sum(-1), -episodes.steps(windows.state)[:, 0])
     assert len(episodes.steps(windows.goal)) == sum(LENGTHS)
+
+
+def test_rewards_of_steps_that_end_the_task_stand_apart(episodes: PairedEpisodes) -> None:
+    final = episodes.windows.reward[..., 1].nonzero()
+    assert len(final) > 0
+    assert (episodes.windows.reward[..., 0][tuple(final.T)] == 0).all()
+    assert (final[:, 1] == episodes.lengths[final[:, 0]] - 1).all()
 
 
 def test_only_a_bad_end_is_a_topple(episodes: PairedEpisodes) -> None:

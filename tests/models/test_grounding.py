@@ -30,7 +30,7 @@ def lagging_world(episodes: int, steps: int, seed: int) -> Windows:
         goal=torch.zeros(episodes, steps, 2),
         simulated_next=simulated,
         next_state=state[:, 1:],
-        reward=state[:, 1:].norm(dim=-1),
+        reward=torch.stack([state[:, 1:].norm(dim=-1), torch.zeros(episodes, steps)], dim=-1),
         toppled=torch.zeros(episodes, steps),
         mask=torch.ones(episodes, steps),
     )
@@ -48,7 +48,7 @@ def untrained(target: TargetKind = "ema") -> GroundingModel:
             "state": TRAINING.state.flatten(0, 1),
             "goal": TRAINING.goal.flatten(0, 1),
             "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
-            "reward": TRAINING.reward.reshape(-1, 1),
+            "reward": TRAINING.reward.flatten(0, 1),
         }
     )
     return model
@@ -116,7 +116,7 @@ def test_all_heads_learn_together() -> None:
     assert error_left(model) < 0.1
     with torch.no_grad():
         predicted = model.predict_reward(latents(model), HELD_OUT.action)
-    unexplained = (predicted - HELD_OUT.reward).square().mean() / HELD_OUT.reward.var()
+    unexplained = (predicted - HELD_OUT.reward[..., 0]).square().mean() / HELD_OUT.reward[..., 0].var()
     assert float(unexplained) < 0.2
 
 
@@ -153,7 +153,7 @@ def test_masked_steps_do_not_count() -> None:
     mask = TRAINING.mask.clone()
     mask[:, 20:] = 0.0
     cut = Windows(**{name: values[:, :20] for name, values in vars(TRAINING).items()})
-    spoiled = replace(TRAINING, mask=mask, reward=TRAINING.reward + 1e3 * (1 - mask))
+    spoiled = replace(TRAINING, mask=mask, reward=TRAINING.reward + 1e3 * (1 - mask).unsqueeze(-1))
     _, parts = model.losses(spoiled, LossWeights())
     _, expected = model.losses(cut, LossWeights())
     assert parts.keys() == expected.keys() == {"latent", "reward", "state", "topple"}

@@ -36,7 +36,16 @@ def test_the_artefact_is_complete(grounded: Path) -> None:
     metrics = json.loads((grounded / "metrics.json").read_text())
     assert metrics["parameters"] > 1000
     (epoch,) = metrics["epochs"]
-    heads = {"loss_latent", "loss_reward", "loss_state", "loss_topple", "r2_latent", "r2_reward", "r2_state"}
+    heads = {
+        "loss_latent",
+        "loss_reward",
+        "loss_state",
+        "loss_topple",
+        "r2_latent",
+        "r2_reward",
+        "r2_final_reward",
+        "r2_state",
+    }
     assert epoch.keys() == {"step", "latent_std", "latent_rank"} | heads
     assert epoch["step"] == GROUND.updates
     assert 1.0 <= epoch["latent_rank"] <= GROUND.latent_size

@@ -14,9 +14,7 @@ from astra_data.stages.train import TrainConfig, train
 SWITCHES = {
     "topple": True,
     "residual_noise": 1.0,
-    "support": True,
-    "support_points": 1,
-    "blocked_reward": -0.1,
+    "support_penalty": 0.1,
     "data_start_share": 0.5,
 }
 
