@@ -46,7 +46,7 @@ def replay_commands(task: Task) -> CommandReplay:
         robots.step(velocity.expand(_ROBOTS, 2))
         target.append(task.abstraction(robots.state))
     return CommandReplay(
-        time_s=(np.arange(len(command)) + 1.0) * task.timestep_s,
+        time_s=np.arange(1, len(command) + 1, dtype=np.float64) * task.timestep_s,
         command=command,
         simulated=torch.stack(simulated).double().numpy(),
         target=torch.stack(target, dim=1).double().numpy(),

@@ -9,7 +9,7 @@ from astra_data.world import DataStarts, NavigationWorld, policy_observation
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def world(num_envs: int = 4, **options: float) -> NavigationWorld:
+def world(num_envs: int = 4, **options: float | torch.Tensor) -> NavigationWorld:
     simulator = PointMass(U_MAZE, num_envs, timestep_s=0.05)
     return NavigationWorld(TASK, simulator, **options)  # type: ignore[arg-type]
 
@@ -17,9 +17,9 @@ def world(num_envs: int = 4, **options: float) -> NavigationWorld:
 def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
     state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
     seen = policy_observation(U_MAZE, state, goal, None)
-    assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -9.0, 14.0])
-    with_latent = policy_observation(U_MAZE, state, goal, torch.tensor([[7.0]]))
-    assert with_latent.tolist() == [[7.0, *seen[0].tolist()]]
+    assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
+    with_latent = policy_observation(U_MAZE, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
+    assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
 
 
 def test_the_same_torch_seed_gives_the_same_starts() -> None:

@@ -14,7 +14,7 @@ FOLLOWER = Method(name="follower", title="Careful follower", trains=False)
 
 @dataclass(frozen=True)
 class CarefulFollower:
-    """Steer down the distance to the goal along paths that keep away from the walls, a little below full speed.
+    """Steer down the distance to the goal, along paths away from the walls, a little below full speed.
 
     Attributes:
         maze: where. margin_m: distance from the walls that paths keep where they can.
