@@ -145,7 +145,7 @@ class NavigationWorld:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
         if self.grounded is not None and latent is not None and (self.topple or self.reward == "blend"):
             with torch.no_grad():
-                risk = self.grounded.model.topple_logit(latent, action, after).sigmoid()
+                risk = self.grounded.model.topple_risk(latent, action, after)
             if self.topple:
                 self.toppled = (torch.rand_like(risk) < risk) & ~success
             else:

@@ -32,7 +32,7 @@ def episodes(speed: float) -> PairedEpisodes:
         simulated_next=simulated,
         next_state=state[:, 1:],
         reward=torch.zeros(3, STEPS, 2),
-        toppled=torch.zeros(3, STEPS),
+        topples_soon=torch.zeros(3, STEPS),
         mask=mask,
     )
     return PairedEpisodes(torch.zeros(3, STEPS, 29), windows, "toy@data-1.0.0", "0")

@@ -33,7 +33,7 @@ def episodes() -> PairedEpisodes:
         simulated_next=state[:, 1:] + scale * torch.randn(2, 400, 4),
         next_state=state[:, 1:],
         reward=torch.zeros(2, 400, 2),
-        toppled=torch.zeros(2, 400),
+        topples_soon=torch.zeros(2, 400),
         mask=mask,
     )
     return PairedEpisodes(torch.zeros(2, 400, 29), windows, "toy@data-1.0.0", "0")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -22,7 +23,7 @@ from astra_data.columns import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.errors import BadInputError
-from astra_data.models.grounding import Windows
+from astra_data.models.grounding import RISK_STEPS, Windows
 from astra_data.seeding import generator
 
 _COLUMNS = (
@@ -75,7 +76,7 @@ class PairedEpisodes:
                 simulated_next=padded(columns[ABSTRACT_SIMULATED_NEXT_STATE]),
                 next_state=padded(columns[ABSTRACT_NEXT_STATE]),
                 reward=padded(np.stack([columns[REWARD] * ~ended, columns[REWARD] * ended], axis=-1)),
-                toppled=padded(columns[TERMINATED] & ~columns[SUCCESS]),
+                topples_soon=padded(_soon(ended & ~columns[SUCCESS], dataset.lengths)),
                 mask=padded(np.ones(len(columns[ACTION]))),
             ),
             reference=dataset.reference,
@@ -127,6 +128,13 @@ class PairedEpisodes:
         windows = _gather(self.windows, rows)
         is_drawn = (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
         return replace(windows, mask=windows.mask * is_drawn), self.target_state[rows]
+
+
+def _soon(toppled: NDArray[np.bool_], lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mark the last `RISK_STEPS` steps (N,) of each episode that ends in a topple."""
+    ends = np.cumsum(lengths)
+    steps_left = np.repeat(ends, lengths) - np.arange(len(toppled))
+    return np.repeat(toppled[ends - 1], lengths) & (steps_left <= RISK_STEPS)
 
 
 def _gather(windows: Windows, rows: Tensor | tuple[Tensor, Tensor]) -> Windows:

@@ -16,6 +16,10 @@ from astra_data.models.history import HistoryEncoder, PositionFeatures, mlp
 
 TargetKind = Literal["ema", "detach", "online"]
 
+RISK_STEPS = 20
+"""The topple head learns from so many steps before each topple: the last step alone is too rare, and by then
+the robot moves as it never does in a simulator that has no topples."""
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -52,7 +56,8 @@ class Windows:
     Attributes:
         state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
-        next_state: φ(s_{i+1}), (B, T, X). toppled: (B, T), the target ended badly.
+        next_state: φ(s_{i+1}), (B, T, X). topples_soon: (B, T), the target ends
+            badly within `RISK_STEPS`.
         reward: r_i in two parts, (B, T, 2): of steps that go on, and of steps that end the task.
         mask: (B, T), 1 on real steps.
     """
@@ -64,7 +69,7 @@ class Windows:
     simulated_next: Tensor
     next_state: Tensor
     reward: Tensor
-    toppled: Tensor
+    topples_soon: Tensor
     mask: Tensor
 
 
@@ -154,9 +159,14 @@ class GroundingModel(nn.Module):
         return simulated_next + correction * self.correction_std
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Return the log-odds (...) that the target topples on the way to `next_state`."""
+        """Return the log-odds (...) that the target topples within `RISK_STEPS`, on its way to `next_state`."""
         inputs = torch.cat([latent, action, self.state_features(next_state)], dim=-1)
-        return torch.as_tensor(self.topple_head(inputs).squeeze(-1))
+        logit: Tensor = self.topple_head(inputs)
+        return logit.squeeze(-1)
+
+    def topple_risk(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """Return the probability (...) that the target topples in this step."""
+        return self.topple_logit(latent, action, next_state).sigmoid() / RISK_STEPS
 
     def update_target(self, rate: float) -> None:
         """Move the EMA target encoder by `rate` toward the encoder."""
@@ -187,7 +197,7 @@ class GroundingModel(nn.Module):
         parts["state"] = _masked_mean(error.square().mean(-1), mask)
         total = total + weights.state * parts["state"]
         logit = self.topple_logit(latent.detach(), action, windows.next_state)
-        entropy = functional.binary_cross_entropy_with_logits(logit, windows.toppled, reduction="none")
+        entropy = functional.binary_cross_entropy_with_logits(logit, windows.topples_soon, reduction="none")
         parts["topple"] = _masked_mean(entropy, mask)
         return total + parts["topple"], parts
 

@@ -31,7 +31,7 @@ def lagging_world(episodes: int, steps: int, seed: int) -> Windows:
         simulated_next=simulated,
         next_state=state[:, 1:],
         reward=torch.stack([state[:, 1:].norm(dim=-1), torch.zeros(episodes, steps)], dim=-1),
-        toppled=torch.zeros(episodes, steps),
+        topples_soon=torch.zeros(episodes, steps),
         mask=torch.ones(episodes, steps),
     )
 
