@@ -10,7 +10,7 @@ from astra_data.models.actor_critic import ActorCritic
 from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
 from astra_data.tasks import Task
-from astra_data.world import policy_observation
+from astra_data.world import limit_command, policy_observation
 
 EncoderKind = Literal["target", "source"]
 
@@ -22,16 +22,19 @@ class DeployedPolicy:
     Attributes:
         task: what to do. policy: the networks. model: the grounding, whose encoder is ψ^s.
         target_encoder: ψ^t; where it is None, ψ^s is used.
+        command_limit_m_s: of the world that the policy was trained in.
     """
 
     task: Task
     policy: ActorCritic
     model: GroundingModel | None = None
     target_encoder: TargetEncoder | None = None
+    command_limit_m_s: float = 2.0
 
     def start(self, count: int) -> None:
         """Forget everything; B = `count`."""
-        self._previous_action = torch.zeros(count, self.policy.shape.action_size)
+        self._previous_output = torch.zeros(count, self.policy.shape.action_size)
+        self._previous_action = torch.zeros_like(self._previous_output)
         self._hidden = self.policy.initial_hidden(count)
         latent_size = self.model.shape.latent_size if self.model is not None else 0
         self._encoder_hidden = torch.zeros(count, latent_size)
@@ -48,7 +51,8 @@ class DeployedPolicy:
             self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
             latent = encoder.encoder.latent(self._encoder_hidden)
         observation = policy_observation(self.task.maze, abstract, goal, latent)
-        features, self._hidden = self.policy.remember(observation, self._previous_action, self._hidden)
+        features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
         mean, _ = self.policy.policy(features)
-        self._previous_action = mean
-        return mean
+        self._previous_output = mean
+        self._previous_action = limit_command(mean, self.command_limit_m_s)
+        return self._previous_action

@@ -32,12 +32,18 @@ class WorldConfig(Config):
     """Where the reward comes from: "abstract", "predicted" or "blend"; by default as the method says."""
     topple: bool = False
     """Draw topples from the topple head: they end the episode and cost what they cost in the target."""
+    risk_weight: float = 1.0
+    """How many topples a predicted one counts for in "blend": it costs the rest of the episode as well."""
     residual_noise: float = 0.0
     """Scatter the state after each step by so many times the scatter that the simulator does not explain."""
     support_penalty: float = 0.0
     """Taken from the reward of a step to where there is no data; less where there is some."""
     support_density: float = 0.3
     """Data is thin where its density is below this share of the median density of the free space."""
+    command_limit_m_s: float = 2.0
+    """Shorten longer commands to this, in training and in the target; by default longer than any command."""
+    ramp: float = 0.0
+    """Share of the training over which the penalties grow from nothing; at once, they teach standing still."""
     data_start_share: float = 0.0
     """Share of the episodes that start in the midst of a recorded one."""
 
@@ -119,6 +125,8 @@ def training_world(
         simulator,
         reward=config.reward or method.reward,
         topple=config.topple,
+        risk_weight=config.risk_weight,
+        command_limit_m_s=config.command_limit_m_s,
         thinness=config.support_penalty * parts.thinness,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,

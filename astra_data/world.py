@@ -46,12 +46,21 @@ def policy_observation(maze: Maze, state: Tensor, goal: Tensor, latent: Tensor |
     return torch.cat(parts if latent is None else [latent / latent.shape[-1] ** 0.5, *parts], dim=-1)
 
 
+def limit_command(action: Tensor, limit: float) -> Tensor:
+    """Shorten velocity commands (..., 2), ±1 m/s per axis, to at most `limit` m/s."""
+    action = action.clamp(-1.0, 1.0)
+    return action * (limit / action.norm(dim=-1, keepdim=True).clamp_min(1e-6)).clamp_max(1.0)
+
+
 class NavigationWorld:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2); "blend", the
     task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the topple head
     and ends the episode. All randomness comes from torch's global generator.
+
+    Attributes:
+        caution: factor on the penalties for thin data and for risk; 1 unless the training ramps it up.
     """
 
     action_size = 2
@@ -63,6 +72,8 @@ class NavigationWorld:
         *,
         reward: RewardSource = "abstract",
         topple: bool = False,
+        risk_weight: float = 1.0,
+        command_limit_m_s: float = 2.0,
         thinness: Tensor | None = None,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
@@ -74,6 +85,8 @@ class NavigationWorld:
             simulator: raw or grounded.
             reward: where the reward comes from.
             topple: end episodes by the topple head.
+            risk_weight: how many topples a predicted one counts for in the reward "blend".
+            command_limit_m_s: longer commands are shortened to this.
             thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width).
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
@@ -83,6 +96,9 @@ class NavigationWorld:
         self.grounded = simulator if isinstance(simulator, GroundedSimulator) else None
         self.reward = reward
         self.topple = topple
+        self.caution = 1.0
+        self.risk_weight = risk_weight
+        self.command_limit_m_s = command_limit_m_s
         self.free = FreeSpace.of_maze(navigation.maze, radius_m=0.0, device=str(simulator.state.device))
         self.thinness = thinness
         self.starts = starts
@@ -133,8 +149,8 @@ class NavigationWorld:
         return torch.from_numpy(values).float().to(self.device)
 
     def step(self, action: Tensor) -> Step:
-        """Apply `action` (B, 2), clipped to ±1."""
-        action = action.clamp(-1.0, 1.0)
+        """Apply `action` (B, 2), clipped to ±1 and to the command limit."""
+        action = limit_command(action, self.command_limit_m_s)
         before = self.simulator.state
         latent = None if self.grounded is None else self.grounded.latent
         after = self.simulator.step(action)
@@ -149,7 +165,7 @@ class NavigationWorld:
             if self.topple:
                 self.toppled = (torch.rand_like(risk) < risk) & ~success
             else:
-                penalty = penalty + self.navigation.topple_reward * risk
+                penalty = penalty + self.risk_weight * self.navigation.topple_reward * risk
         if self.reward == "predicted" and self.grounded is not None and latent is not None:
             with torch.no_grad():
                 reward = self.grounded.model.predict_reward(latent, action)
@@ -157,7 +173,7 @@ class NavigationWorld:
             reward = self.navigation.reward(before[:, :2], after[:, :2], self.goal, self.toppled)
         return Step(
             observation=self._observe(),
-            reward=reward + penalty,
+            reward=reward + self.caution * penalty,
             terminated=success | self.toppled,
             success=success,
         )

@@ -2,7 +2,9 @@ import pytest
 import torch
 
 from astra_data.mazes import U_MAZE
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.navigation import Navigation
+from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.world import DataStarts, NavigationWorld, policy_observation
 
@@ -81,3 +83,22 @@ def test_reaching_the_goal_is_success() -> None:
     assert bool(step.success)
     assert bool(step.terminated)
     assert float(step.reward) == pytest.approx(10.05, abs=0.01)
+
+
+def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4).clone()
+    goal = torch.tensor([[-4.0, -4.0]]).expand(3, 2)
+    action = torch.tensor([[1.0, 0.0]]).expand(3, 2)
+    rewards = []
+    for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
+        inner = PointMass(U_MAZE, 3, timestep_s=0.05)
+        one = NavigationWorld(TASK, GroundedSimulator(inner, model, inner.free), **options)  # type: ignore[arg-type]
+        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+        latent = one.simulator.latent  # type: ignore[union-attr]
+        rewards.append(one.step(action).reward)
+    risk = model.topple_risk(latent, action, one.simulator.state).detach()
+    assert (risk > 0).all()
+    torch.testing.assert_close(rewards[1] - rewards[0], -10.0 * risk)
+    torch.testing.assert_close(rewards[2] - rewards[0], -30.0 * risk)

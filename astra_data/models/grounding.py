@@ -159,7 +159,7 @@ class GroundingModel(nn.Module):
         return simulated_next + correction * self.correction_std
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Return the log-odds (...) that the target topples within `RISK_STEPS`, on its way to `next_state`."""
+        """Return the log-odds (...) of a topple within `RISK_STEPS`, on the way to `next_state`."""
         inputs = torch.cat([latent, action, self.state_features(next_state)], dim=-1)
         logit: Tensor = self.topple_head(inputs)
         return logit.squeeze(-1)

@@ -22,7 +22,7 @@ from astra_data.target_encoder_file import save_target_encoder
 class AlignConfig(Config):
     """How the target encoder is fitted. The paper prints none of these."""
 
-    updates: int = 1000
+    updates: int = 400
     """Gradient updates in all."""
     batch_windows: int = 32
     """Windows per update."""

@@ -104,10 +104,13 @@ def evaluate(
     else:
         trained = PolicyFile.load(policy / "policy.safetensors")
         model = load_grounding(grounding / "grounding.safetensors") if grounding else None
-        encoders: dict[EncoderKind, DeployedPolicy] = {"source": DeployedPolicy(world, trained.policy, model)}
+        limit = trained.world.command_limit_m_s
+        encoders: dict[EncoderKind, DeployedPolicy] = {
+            "source": DeployedPolicy(world, trained.policy, model, None, limit)
+        }
         if target_encoder is not None:
             aligned = load_target_encoder(target_encoder / "target_encoder.safetensors")
-            encoders["target"] = DeployedPolicy(world, trained.policy, model, aligned)
+            encoders["target"] = DeployedPolicy(world, trained.policy, model, aligned, limit)
         headline = config.encoder if config.encoder in encoders else "source"
         outcomes = {}
         for kind, deployed in encoders.items():

@@ -19,6 +19,7 @@ from astra_data.progress import Progress
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 from astra_data.training_world import WorldConfig, training_world, world_parts
+from astra_data.world import NavigationWorld
 
 _CHECKPOINT_EVERY = 20
 
@@ -71,7 +72,7 @@ def train(
     ).to(device)
     ppo = Ppo(env, policy, config, horizon=world.navigation.horizon, seed=seed)
     with finished_folder(out) as folder:
-        curve = _optimise(ppo, folder, device, progress)
+        curve = _optimise(ppo, env, config.ramp, folder, device, progress)
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
         PolicyFile(
             policy, parts.thinness, parts.scatter, switches, episodes.reference, episodes.content_hash
@@ -81,7 +82,9 @@ def train(
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
 
 
-def _optimise(ppo: Ppo, folder: Path, device: str, progress: Progress) -> dict[str, Any]:
+def _optimise(
+    ppo: Ppo, env: NavigationWorld, ramp: float, folder: Path, device: str, progress: Progress
+) -> dict[str, Any]:
     points: list[dict[str, float]] = []
     seconds = 0.0
     checkpoint = folder / "checkpoint.safetensors"
@@ -93,6 +96,7 @@ def _optimise(ppo: Ppo, folder: Path, device: str, progress: Progress) -> dict[s
         points, seconds = told["points"], told["seconds"]
     began, first = time.perf_counter() - seconds, ppo.steps
     while not ppo.done:
+        env.caution = min(1.0, ppo.steps / (ppo.config.total_steps * ramp)) if ramp else 1.0
         metrics = ppo.iterate()
         points.append({"steps": ppo.steps, **metrics})
         seconds = time.perf_counter() - began

@@ -26,7 +26,9 @@ SUCCESS = {
 }
 """Row → seed → episode."""
 
-REPLAY = CommandReplay(np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4)))
+REPLAY = CommandReplay(
+    np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4))
+)
 
 CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
 
