@@ -43,7 +43,7 @@ class WorldConfig(Config):
     command_limit_m_s: float = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: float = 0.0
-    """Share of the training over which the penalties grow from nothing; at once, they teach standing still."""
+    """Share of the training over which the penalties grow from nothing: at once, they teach to stand."""
     data_start_share: float = 0.0
     """Share of the episodes that start in the midst of a recorded one."""
 

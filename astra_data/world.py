@@ -48,8 +48,10 @@ def policy_observation(maze: Maze, state: Tensor, goal: Tensor, latent: Tensor |
 
 def limit_command(action: Tensor, limit: float) -> Tensor:
     """Shorten velocity commands (..., 2), ±1 m/s per axis, to at most `limit` m/s."""
-    action = action.clamp(-1.0, 1.0)
-    return action * (limit / action.norm(dim=-1, keepdim=True).clamp_min(1e-6)).clamp_max(1.0)
+    command = action.clamp(-1.0, 1.0)
+    speed = command.norm(dim=-1, keepdim=True)
+    shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
+    return command * shorten
 
 
 class NavigationWorld:

@@ -6,7 +6,7 @@ from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.navigation import Navigation
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
-from astra_data.world import DataStarts, NavigationWorld, policy_observation
+from astra_data.world import DataStarts, NavigationWorld, limit_command, policy_observation
 
 TASK = Navigation(U_MAZE, horizon=700)
 
@@ -94,7 +94,7 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
     rewards = []
     for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
         inner = PointMass(U_MAZE, 3, timestep_s=0.05)
-        one = NavigationWorld(TASK, GroundedSimulator(inner, model, inner.free), **options)  # type: ignore[arg-type]
+        one = NavigationWorld(TASK, GroundedSimulator(inner, model, inner.free), **options)
         one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
         latent = one.simulator.latent  # type: ignore[union-attr]
         rewards.append(one.step(action).reward)
@@ -102,3 +102,23 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
     assert (risk > 0).all()
     torch.testing.assert_close(rewards[1] - rewards[0], -10.0 * risk)
     torch.testing.assert_close(rewards[2] - rewards[0], -30.0 * risk)
+
+
+def test_commands_are_clipped_and_shortened() -> None:
+    commands = torch.tensor([[3.0, 0.0], [0.6, 0.8], [1.0, 1.0], [0.1, -0.2], [0.0, 0.0]])
+    limited = limit_command(commands, 0.5)
+    expected = torch.tensor([[0.5, 0.0], [0.3, 0.4], [0.5 / 2**0.5] * 2, [0.1, -0.2], [0.0, 0.0]])
+    torch.testing.assert_close(limited, expected)
+    torch.testing.assert_close(limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
+
+
+def test_caution_scales_the_penalties() -> None:
+    one = world(1, thinness=torch.ones(U_MAZE.fine_walls.shape), command_limit_m_s=0.5)
+    state = {"state": torch.tensor([[-4.0, 4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
+    rewards = []
+    for caution in (0.0, 0.25, 1.0):
+        one.load_state_dict(state)
+        one.caution = caution
+        rewards.append(float(one.step(torch.tensor([[1.0, 0.0]])).reward))
+    assert one.simulator.state[0].tolist() == pytest.approx([-3.975, 4.0, 0.5, 0.0], abs=1e-5)
+    assert [rewards[0] - reward for reward in rewards] == pytest.approx([0.0, 0.25, 1.0], abs=1e-5)
