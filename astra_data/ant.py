@@ -103,6 +103,15 @@ def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
     return (walls[0], walls[-1]) if walls else None
 
 
+def standing_pose(count: int) -> Floats:
+    """Return `count` upright poses (count, 15) at the origin, legs within their joint limits."""
+    qpos = np.zeros((count, POSITIONS))
+    qpos[:, 2] = TORSO_HEIGHT_M
+    qpos[:, 3] = 1.0
+    qpos[:, 7:] = np.array([0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
+    return qpos
+
+
 def up_cosine(quaternion: Floats) -> Floats:
     """Return the cosine (B,) between the torso's up axis and the vertical, from `quaternion` (B, 4) wxyz."""
     _, x, y, _ = quaternion.T

@@ -149,11 +149,10 @@ def evaluate(
     method: Method = None,
     seed: Seed = None,
     jobs: Jobs = None,
-    device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
     """Run the policies in the target environment."""
-    _run_stage(recipe, "evaluate", method=method, seed=seed, jobs=jobs, device=device, root=root)
+    _run_stage(recipe, "evaluate", method=method, seed=seed, jobs=jobs, root=root)
 
 
 @app.command()

@@ -87,6 +87,8 @@ class Recipe(Config):
         for row in rows:
             if base_method(row) not in METHODS:
                 raise ValueError(f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}")
+            if row.endswith(PLUS) and not METHODS[base_method(row)].trains:
+                raise ValueError(f"'{row}' has nothing to train with the [plus] settings: leave out {PLUS}")
         return rows
 
     @model_validator(mode="after")
@@ -133,7 +135,7 @@ def plan(
         trained = [row for row in recipe.methods if METHODS[base_method(row)].trains]
         items += (_train(recipe, folder, row, seed, device) for row in trained)
         items += (_align(recipe, folder, base, seed, device) for base in bases if METHODS[base].aligns)
-        items += (_evaluate(recipe, folder, row, seed, device) for row in recipe.methods)
+        items += (_evaluate(recipe, folder, row, seed) for row in recipe.methods)
     items.append(_report(recipe, path, folder, publish))
     # Stage by stage, so that work on every seed begins before any seed is finished.
     return tuple(sorted(items, key=lambda item: list(STAGES).index(stage_of(item))))
@@ -217,7 +219,7 @@ def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> I
     return Item(key, (dataset, grounding), call)
 
 
-def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> Item:
+def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
     key, base = f"evaluate/{row}/seed_{seed}", base_method(row)
     policy = f"train/{row}/seed_{seed}" if METHODS[base].trains else None
     grounding = _grounding(row, seed)
@@ -232,7 +234,6 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int, device: str) ->
         target_encoder=folder / target_encoder if target_encoder else None,
         seed=seed,
         out=folder / key,
-        device=device,
     )
     return Item(key, _existing(policy, grounding, target_encoder), call)
 

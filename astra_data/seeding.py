@@ -7,7 +7,6 @@ and the same seed gives the same numbers in every process and on every machine.
 import hashlib
 
 import numpy as np
-import torch
 
 
 def derive(seed: int, purpose: str) -> int:
@@ -19,8 +18,3 @@ def derive(seed: int, purpose: str) -> int:
 def generator(seed: int, purpose: str) -> np.random.Generator:
     """Return a numpy generator for `purpose`."""
     return np.random.default_rng(derive(seed, purpose))
-
-
-def torch_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return a torch generator for `purpose` on `device`."""
-    return torch.Generator(device).manual_seed(derive(seed, purpose))

@@ -12,7 +12,7 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.mazes import FIELD_CELL_M
 from astra_data.method import Method
 from astra_data.models.grounding import GroundingModel
-from astra_data.recipe import Config
+from astra_data.recipe import Config, NotNegative, Positive, Share
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.randomized import RandomizedSimulator
 from astra_data.tasks import Task
@@ -23,28 +23,29 @@ _KERNEL_M = 0.25
 
 
 class WorldConfig(Config):
-    """Switches of the training world. All off is the method as it is published; each may be given to any.
+    """Switches of the training world; all off is the method as it is published.
 
-    `topple` and the reward "blend" need a grounded simulator and are without effect in the raw one.
+    Each may be given to any method, but the raw simulator has no model to predict from: there `topple` is
+    without effect and the rewards "predicted" and "blend" are the abstract one.
     """
 
     reward: RewardSource | None = None
     """Where the reward comes from: "abstract", "predicted" or "blend"; by default as the method says."""
     topple: bool = False
-    """Draw topples from the topple head: they end the episode and cost what they cost in the target."""
-    risk_weight: float = 1.0
+    """Draw topples from the topple head: they end the episode, and with the task's own reward they cost."""
+    risk_weight: NotNegative = 1.0
     """How many topples a predicted one counts for in "blend": it costs the rest of the episode as well."""
-    residual_noise: float = 0.0
+    residual_noise: NotNegative = 0.0
     """Scatter the state after each step by so many times the scatter that the simulator does not explain."""
-    support_penalty: float = 0.0
+    support_penalty: NotNegative = 0.0
     """Taken from the reward of a step to where there is no data; less where there is some."""
-    support_density: float = 0.3
+    support_density: Positive = 0.3
     """Data is thin where its density is below this share of the median density of the free space."""
-    command_limit_m_s: float = 2.0
+    command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
-    ramp: float = 0.0
+    ramp: Share = 0.0
     """Share of the training over which the penalties grow from nothing: at once, they teach to stand."""
-    data_start_share: float = 0.0
+    data_start_share: Share = 0.0
     """Share of the episodes that start in the midst of a recorded one."""
 
 
@@ -75,7 +76,9 @@ def world_parts(
         scatter = model.residual_factor
     else:
         residual = episodes.steps(windows.next_state - windows.simulated_next)
-        scatter = torch.linalg.cholesky(torch.cov(residual.T) + 1e-9 * torch.eye(4, device=device))
+        scatter = torch.linalg.cholesky(
+            torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=device)
+        )
     starts = None
     if config.data_start_share > 0:
         hidden = None

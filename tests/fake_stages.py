@@ -115,7 +115,6 @@ def evaluate(
     target_encoder: Path | None,
     seed: int,
     out: Path,
-    device: str,
     progress: Progress,
 ) -> None:
     asked = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}

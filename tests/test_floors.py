@@ -10,7 +10,7 @@ HOUSE = Path(__file__).parents[1] / "astra_data"
 FLOORS = (
     ("errors", "columns", "seeding", "recipe", "batched", "progress", "simulator", "statistics"),
     ("mazes", "free_space", "navigation", "physics", "ant", "abstraction", "checkpoint", "models"),
-    ("dataset", "importers", "figures", "grounding_file", "target_encoder_file"),
+    ("dataset", "figures", "grounding_file", "target_encoder_file"),
     ("envs", "sims", "results"),
     (
         "tasks",

@@ -103,6 +103,10 @@ class PairedEpisodes:
         order = torch.from_numpy(generator(seed, "held-out episodes").permutation(len(self)))
         order = order.to(self.target_state.device)
         count = max(1, round(held_out_share * len(self)))
+        if count >= len(self):
+            raise BadInputError(
+                f"{self.reference} has {len(self)} episodes: expected more, to hold {count} of them out"
+            )
         return self.select(order[count:]), self.select(order[:count])
 
     def steps(self, values: Tensor) -> Tensor:

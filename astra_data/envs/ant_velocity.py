@@ -10,11 +10,11 @@ from astra_data.ant import (
     CONTROL_SUBSTEPS,
     TIMESTEP_S,
     TOPPLE_COSINE,
-    TORSO_HEIGHT_M,
     Floats,
     ant_model,
     canonical_view,
     rotation_matrix,
+    standing_pose,
     torques_to_body,
     up_cosine,
 )
@@ -70,12 +70,9 @@ class AntVelocityEnv:
         """Stand the ants in `mask` (B,) up at random headings, by default all; return (B, 28)."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         count = len(rows)
-        qpos = np.tile(self.physics.model.qpos0, (count, 1))
-        # Ankles start inside their 30 to 70 degree range.
-        qpos[:, 7:] = np.array([0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
+        qpos = standing_pose(count)
         qpos[:, 7:] += self._rng.uniform(-0.1, 0.1, (count, 8))
         yaw = self._rng.uniform(-np.pi, np.pi, count)
-        qpos[:, 2] = TORSO_HEIGHT_M
         qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
         self.physics.set_state(rows, qpos, self._rng.normal(0.0, 0.1, (count, 14)))
         self._draw_commands(rows)

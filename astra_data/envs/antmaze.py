@@ -10,9 +10,9 @@ from astra_data.ant import (
     POSITIONS,
     STATE_SIZE,
     TOPPLE_COSINE,
-    TORSO_HEIGHT_M,
     VelocityController,
     ant_model,
+    standing_pose,
     up_cosine,
     wall_geoms,
 )
@@ -129,12 +129,3 @@ class AntMazeEnv:
 
     def _observe(self) -> Tensor:
         return torch.cat([self.state, self.goal], dim=-1)
-
-
-def standing_pose(count: int) -> Floats:
-    """Return `count` upright poses (count, 15) at the origin, legs within their joint limits."""
-    qpos = np.zeros((count, POSITIONS))
-    qpos[:, 2] = TORSO_HEIGHT_M
-    qpos[:, 3] = 1.0
-    qpos[:, 7:] = np.array([0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
-    return qpos

@@ -19,36 +19,36 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from astra_data.batched import ResumableEnv
 from astra_data.models.actor_critic import ActorCritic
-from astra_data.recipe import Config
+from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.seeding import derive
 
 
 class PpoConfig(Config):
     """Settings of proximal policy optimisation."""
 
-    total_steps: int = 4_000_000
+    total_steps: Count = 4_000_000
     """Environment steps in all."""
-    rollout_steps: int = 64
+    rollout_steps: Count = 64
     """Steps of every environment per iteration."""
-    epochs: int = 5
+    epochs: Count = 5
     """Passes over the collected steps per iteration."""
-    minibatches: int = 4
+    minibatches: Count = 4
     """Updates per pass; each takes whole stretches of a share of the environments."""
-    learning_rate: float = 5e-4
+    learning_rate: Positive = 5e-4
     """At the start; falls linearly to zero."""
-    discount: float = 0.99
+    discount: Share = 0.99
     """Of the reward, per step."""
-    gae_lambda: float = 0.95
+    gae_lambda: Share = 0.95
     """Decay of the advantage's n-step mixture, per step."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Largest change of an action's probability ratio that still earns."""
-    entropy_weight: float = 0.003
+    entropy_weight: NotNegative = 0.003
     """Of the policy's entropy in the loss."""
-    value_weight: float = 0.5
+    value_weight: NotNegative = 0.5
     """Of the critic's squared error in the loss."""
-    gradient_norm: float = 0.5
+    gradient_norm: Positive = 0.5
     """Gradients are clipped to this norm."""
-    reward_scale: float = 0.1
+    reward_scale: Positive = 0.1
     """Factor on the reward that the critic learns from."""
 
 

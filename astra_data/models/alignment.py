@@ -3,18 +3,32 @@
 import torch
 from torch import Tensor, nn
 
-from astra_data.models.history import HistoryEncoder
+from astra_data.models.history import HistoryEncoder, PositionFeatures
 
 
 class TargetEncoder(nn.Module):
-    """ψ^t: encode histories of full target states into the source encoder's latent space."""
+    """ψ^t: encode histories of full target states into the source encoder's latent space.
+
+    The first two entries of a target state are its planar position in m; they are seen as the source
+    encoder sees them, with `PositionFeatures`. Without these, ψ^t cannot follow what ψ^s makes of walls.
+    """
 
     def __init__(
-        self, state_size: int, goal_size: int, action_size: int, *, embedding_size: int, latent_size: int
+        self,
+        state_size: int,
+        goal_size: int,
+        action_size: int,
+        *,
+        embedding_size: int,
+        latent_size: int,
+        position_octaves: int = 4,
     ) -> None:
         super().__init__()
+        self.position_features = PositionFeatures(position_octaves)
         self.encoder = HistoryEncoder(
-            state_size + goal_size + action_size, embedding_size=embedding_size, latent_size=latent_size
+            state_size + self.position_features.size + goal_size + action_size,
+            embedding_size=embedding_size,
+            latent_size=latent_size,
         )
         for name, size in {"state": state_size, "goal": goal_size}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -31,9 +45,12 @@ class TargetEncoder(nn.Module):
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
-        """Assemble [s_i, goal, a_{i-1}] (..., I), states clipped to ±5 standard deviations."""
+        """Assemble [s_i, its position's features, goal, a_{i-1}] (..., I), states within ±5 deviations."""
         normal_state = ((state - self.state_mean) / self.state_std).clamp(-5.0, 5.0)
-        return torch.cat([normal_state, (goal - self.goal_mean) / self.goal_std, previous_action], dim=-1)
+        waves = self.position_features(state[..., :2])
+        return torch.cat(
+            [normal_state, waves, (goal - self.goal_mean) / self.goal_std, previous_action], dim=-1
+        )
 
 
 def gaussian_mmd(

@@ -26,8 +26,8 @@ HOW_TO_READ = {
     ),
     "learning": (
         "Success in the simulator while the policy learns: mean over seeds, band from the worst seed to "
-        "the best. High here and low in the table means that the policy learned what the target does not "
-        "do."
+        "the best. Episodes that start in the midst of a recorded one count as well. High here and low in "
+        "the table means that the policy learned what the target does not do."
     ),
     "gap": (
         "The simulator is given the target's actions from a target state on; the error is its distance "

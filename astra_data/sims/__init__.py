@@ -1,1 +1,1 @@
-"""Abstract simulators: batched, `reset_to(state)`, and the wrapper that grounds them."""
+"""Abstract simulators: batched, `reset_to(state)`; and the wrappers that scatter and that ground them."""

@@ -15,7 +15,7 @@ class GroundedSimulator:
 
     Attributes:
         state: corrected abstract states, (B, X). latent: z, (B, Z).
-        blocked: (B,) bool, the last correction was stopped at a wall or at the edge of the support.
+        blocked: (B,) bool, the last correction was stopped at a wall.
     """
 
     def __init__(

@@ -3,9 +3,10 @@
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from astra_data.checkpoint import finished_folder
@@ -14,7 +15,7 @@ from astra_data.grounding_file import load_grounding
 from astra_data.models.alignment import TargetEncoder, gaussian_mmd
 from astra_data.models.grounding import GroundingModel, Windows
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, Count, NotNegative, Positive
 from astra_data.seeding import derive
 from astra_data.target_encoder_file import save_target_encoder
 
@@ -22,21 +23,21 @@ from astra_data.target_encoder_file import save_target_encoder
 class AlignConfig(Config):
     """How the target encoder is fitted. The paper prints none of these."""
 
-    updates: int = 400
+    updates: Count = 600
     """Gradient updates in all."""
-    batch_windows: int = 32
+    batch_windows: Count = 32
     """Windows per update."""
-    window: int = 100
+    window: Count = 100
     """Steps per window, in backpropagation through time."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """At the start; falls to zero along a half cosine."""
-    gradient_norm: float = 1.0
+    gradient_norm: Positive = 1.0
     """Gradients are clipped to this norm."""
     bandwidths: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
     """Of the MMD's kernels, in units of the square root of the latent's size."""
-    paired_weight: float = 0.0
+    paired_weight: NotNegative = 0.0
     """Weight of the direct distance between paired latents; 0 is the paper's loss."""
-    held_out_share: float = 0.1
+    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes that only measure the agreement; the same ones as in `ground`."""
 
 
@@ -67,6 +68,7 @@ def align(
         model.shape.action_size,
         embedding_size=model.shape.embedding_size,
         latent_size=model.shape.latent_size,
+        position_octaves=model.shape.position_octaves,
     ).to(device)
     encoder.set_scales(training.steps(training.target_state), training.steps(training.windows.goal))
     optimizer = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)

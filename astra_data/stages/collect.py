@@ -23,7 +23,7 @@ from astra_data.columns import (
 )
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, Count, NotNegative
 from astra_data.seeding import derive, generator
 from astra_data.tasks import Task, task_named
 
@@ -33,11 +33,11 @@ class CollectConfig(Config):
 
     behavior: Literal["random"] = "random"
     """"random": commands drawn from U[-1, 1]² m/s, each held for a while."""
-    episodes: int = 200
+    episodes: Count = 200
     """Recorded side by side."""
-    max_steps: int = 500
+    max_steps: Count = 500
     """Longest episode, in control steps; longer ones are truncated."""
-    hold_s: tuple[float, float] = (0.5, 3.0)
+    hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
 
 
@@ -91,7 +91,7 @@ def _record(
     env = task.target(count, seed=derive(seed, "collect"), start_anywhere=True)
     rng = generator(seed, "behavior")
     env.reset()
-    low, high = (round(seconds / task.timestep_s) for seconds in config.hold_s)
+    low, high = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
     command = np.zeros((count, 2))
     hold = np.zeros(count, dtype=int)
     lengths = np.zeros(count, dtype=int)

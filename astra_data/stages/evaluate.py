@@ -18,7 +18,7 @@ from astra_data.methods import method_named
 from astra_data.methods.follower import CarefulFollower
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, Count, Positive
 from astra_data.seeding import derive
 from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
@@ -30,11 +30,11 @@ Act = Callable[[Tensor, Tensor], Tensor]
 class EvaluateConfig(Config):
     """How policies are tested; 100 episodes are the paper's."""
 
-    episodes: int = 100
+    episodes: Count = 100
     """Run side by side, in the target and in simulation each."""
     encoder: EncoderKind = "target"
     """Whose latents an aligned policy is deployed with for the headline figures; both are reported."""
-    leg_scale: float = 1.0
+    leg_scale: Positive = 1.0
     """Of the ant in the target environment; 1.25 is the paper's morphology test."""
 
 
@@ -79,7 +79,6 @@ def evaluate(
     target_encoder: Path | None,
     seed: int,
     out: Path,
-    device: str,
     progress: Progress,
 ) -> None:
     """Test a row and write its figures and paths to `out`.

@@ -3,9 +3,10 @@
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from astra_data.checkpoint import finished_folder, flatten, load_tensors, save_tensors, unflatten
@@ -16,7 +17,7 @@ from astra_data.grounding_file import save_grounding
 from astra_data.methods import method_named
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, Count, Positive, Share
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 
@@ -26,25 +27,25 @@ _CHECKPOINT_EVERY = 250
 class GroundConfig(Config):
     """How the grounding model is fitted. The paper prints none of these."""
 
-    updates: int = 1500
+    updates: Count = 1500
     """Gradient updates in all."""
-    batch_windows: int = 48
+    batch_windows: Count = 48
     """Windows per update."""
-    window: int = 100
+    window: Count = 100
     """Steps per window, in backpropagation through time."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """At the start; falls to zero along a half cosine."""
-    gradient_norm: float = 1.0
+    gradient_norm: Positive = 1.0
     """Gradients are clipped to this norm."""
     target: TargetKind = "ema"
     """Where the next latent of the latent loss comes from; "online" is the printed loss, unbounded below."""
-    ema_rate: float = 0.01
+    ema_rate: Share = 0.01
     """Share by which the slow encoder of "ema" follows, per update."""
-    latent_size: int = 64
+    latent_size: Count = 64
     """Z, also the size of the encoder's memory."""
     position_octaves: int = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position."""
-    held_out_share: float = 0.1
+    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes on which nothing is fitted but the residual's scatter."""
 
 

@@ -21,14 +21,14 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, NotNegative
 from astra_data.tasks import Task, task_named
 
 
 class PairConfig(Config):
     """How strictly a reset of the simulator is checked."""
 
-    reset_tolerance: float = 1e-6
+    reset_tolerance: NotNegative = 1e-6
     """Largest difference between φ(s) and what the simulator shows after being reset to it."""
 
 
@@ -67,7 +67,7 @@ def pair(task: str, config: PairConfig, *, dataset: Path, out: Path, progress: P
         fps=source.info["fps"],
         task=world.instruction,
         description=description,
-        subset_seed=source.description["seeds"]["subset"],
+        subset_seed=source.description["seeds"].get("subset", 0),
     ) as writer:
         for index, episode in enumerate(source.episodes()):
             paired = pair_steps(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from astra_data.checkpoint import finished_folder
+from astra_data.errors import BadInputError
 from astra_data.figures import (
     Curve,
     OpenLoop,
@@ -151,6 +152,9 @@ def _success(results: Results) -> Figure:
 
 def _trajectories(results: Results, root: Path, maze: Maze, config: ReportConfig) -> Figure:
     panels = []
+    unknown = [method for method in config.trajectory_methods if method not in results.methods]
+    if unknown:
+        raise BadInputError(f"report.trajectory_methods: expected rows of the recipe, got '{unknown[0]}'")
     for method in config.trajectory_methods or results.methods:
         folder = root / "evaluate" / method / f"seed_{results.seeds[0]}"
         evaluation = read_json(Evaluation, folder / EVALUATION)

@@ -16,6 +16,7 @@ from astra_data.methods import method_named
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
+from astra_data.recipe import Count
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 from astra_data.training_world import WorldConfig, training_world, world_parts
@@ -27,7 +28,7 @@ _CHECKPOINT_EVERY = 20
 class TrainConfig(WorldConfig, PpoConfig):
     """How policies are trained: PPO's settings, the world's switches, and the sizes below."""
 
-    num_envs: int = 256
+    num_envs: Count = 256
     """Worlds stepped side by side."""
     hidden_sizes: tuple[int, ...] = (64, 64)
     """Of actor and critic."""
@@ -57,6 +58,9 @@ def train(
         raise BadInputError(f"method '{method}' has no policy to train")
     if base.grounds and grounding is None:
         raise BadInputError(f"method '{method}' trains in a grounded simulator: run the stage `ground` first")
+    weights = base.loss_weights
+    if (config.reward or base.reward) == "predicted" and weights is not None and weights.reward == 0:
+        raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     model = load_grounding(grounding / "grounding.safetensors", device) if grounding else None
     episodes = PairedEpisodes.load(dataset, device)
     parts = world_parts(world, config, episodes, model)

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.ant import ant_model, wall_geoms
-from astra_data.envs.antmaze import AntMazeEnv, standing_pose
+from astra_data.ant import ant_model, standing_pose, wall_geoms
+from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.mazes import U_MAZE
 from astra_data.navigation import Navigation
 

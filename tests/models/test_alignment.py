@@ -3,6 +3,7 @@ import torch
 from torch import Tensor
 
 from astra_data.models.alignment import TargetEncoder, gaussian_mmd
+from astra_data.models.history import PositionFeatures
 from astra_data.stages.align import AlignConfig
 
 
@@ -56,11 +57,12 @@ def test_the_gradient_is_alive_at_latent_size_64() -> None:
 
 
 def test_target_encoder_clips_normalised_states() -> None:
-    encoder = TargetEncoder(3, 2, 1, embedding_size=4, latent_size=4)
+    encoder = TargetEncoder(3, 2, 1, embedding_size=4, latent_size=4, position_octaves=2)
     state, goal = 2.0 + 3.0 * torch.randn(5000, 3), torch.randn(5000, 2)
     encoder.set_scales(state, goal)
     inputs = encoder.encoder_input(state, goal, torch.zeros(5000, 1))
-    assert inputs.shape == (5000, 6)
+    assert inputs.shape == (5000, 6 + 8)
+    torch.testing.assert_close(inputs[:, 3:11], PositionFeatures(2)(state[:, :2]))
     torch.testing.assert_close(inputs[:, :3].std(0), torch.ones(3), atol=0.01, rtol=0)
     far = encoder.encoder_input(torch.full((1, 3), 1e6), goal[:1], torch.zeros(1, 1))
     assert far[0, :3].tolist() == pytest.approx([5.0] * 3)

@@ -23,7 +23,7 @@ def make(
     task: str, method: str, out: Path, inputs: dict[str, Path] | None = None, config: EvaluateConfig = CONFIG
 ) -> Result:
     paths = {"policy": None, "grounding": None, "target_encoder": None} | (inputs or {})
-    evaluate(task, method, config, **paths, seed=0, out=out, device="cpu", progress=silent)
+    evaluate(task, method, config, **paths, seed=0, out=out, progress=silent)
     tensors, _ = load_tensors(out / "trajectories.safetensors")
     return json.loads((out / "evaluation.json").read_text()), tensors
 
