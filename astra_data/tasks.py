@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 from astra_data.abstraction import ant_to_point_mass
 from astra_data.ant import TIMESTEP_S
@@ -10,7 +10,7 @@ from astra_data.columns import ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
-from astra_data.navigation import Navigation
+from astra_data.navigation import Navigation, RewardKind
 from astra_data.recipe import did_you_mean
 from astra_data.sims.point_mass import PointMass
 
@@ -84,11 +84,11 @@ _ANT_COLUMNS = (
 )
 
 
-def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
+def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
     return Task(
-        name=name,
+        name=name if reward == "geodesic" else f"{name}-{reward}",
         instruction="walk through the maze to the goal",
-        navigation=Navigation(maze, horizon),
+        navigation=Navigation(maze, horizon, reward),
         abstraction=ant_to_point_mass,
         state_columns=_ANT_COLUMNS,
         abstract_names=("x", "y", "vx", "vy"),
@@ -96,10 +96,17 @@ def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
     )
 
 
+_MAZES: tuple[tuple[str, Maze, int], ...] = (
+    ("antmaze-umaze", U_MAZE, 700),
+    ("antmaze-long", LONG_MAZE, 1000),
+)
+
 TASKS: dict[str, Task] = {
     task.name: task
-    for task in (_antmaze("antmaze-umaze", U_MAZE, 700), _antmaze("antmaze-long", LONG_MAZE, 1000))
+    for task in (_antmaze(*maze, reward) for maze in _MAZES for reward in get_args(RewardKind))
 }
+"""By name. A maze's plain name has the reward of progress along its corridors; `-euclidean` and `-sparse`
+follow the name of the same task with another reward."""
 
 
 def task_named(name: str) -> Task:

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 from astra_data.errors import BadInputError
 from astra_data.tasks import TASKS, Task, task_named
@@ -34,3 +35,15 @@ def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
 def test_an_unknown_task_answers_with_the_known_ones() -> None:
     with pytest.raises(BadInputError, match=r"unknown task 'antmaze-umase'.*antmaze-umaze"):
         task_named("antmaze-umase")
+
+
+@pytest.mark.parametrize(("name", "metres"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])
+def test_names_tell_rewards_apart(name: str, metres: float) -> None:
+    task = TASKS[f"antmaze-umaze{name}"]
+    start = torch.tensor([task.maze.cell_centre(*task.maze.start)])
+    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)])
+    # Half a metre straight at the goal, which is behind a wall: the path round the wall's corner, 6 m to the
+    # right of the start and 2 m down, is sqrt(6² + 2²) - sqrt(6² + 1.5²) metres shorter.
+    after = start + torch.tensor([[0.0, -0.5]])
+    reward = task.navigation.reward(start, after, goal, torch.zeros(1))
+    assert float(reward) == pytest.approx(metres, abs=0.04)
