@@ -11,8 +11,9 @@ from rich.console import Console
 
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
-from astra_data.plan import STAGES, Recipe, base_method, plan, select, stage_of
+from astra_data.plan import STAGES, Recipe, plan, select, stage_of
 from astra_data.recipe import did_you_mean, load_recipe
+from astra_data.rows import base_method
 from astra_data.schedule import Item, execute
 
 RUNS = Path("runs")
