@@ -11,6 +11,7 @@ from rich.console import Console
 
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.lock import held
 from astra_data.plan import STAGES, Recipe, plan, select, stage_of
 from astra_data.recipe import did_you_mean, load_recipe
 from astra_data.rows import base_method
@@ -40,13 +41,13 @@ def run(
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     _check_stage(until or "report")
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
     items = [item for item in plan(recipe, recipe_path, folder, device=device) if stage_of(item) in wanted]
-    items = [item for item in items if not _finished(item, folder)]
     _make(recipe, folder, items, jobs, device)
     return folder
 
@@ -67,14 +68,15 @@ def run_stage(
     Raises:
         MissingStageError: an artefact that the stage reads is not finished.
         RecipeError: the recipe has faults, or differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     _check_stage(stage)
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     planned = plan(recipe, recipe_path, folder, device=device, publish=publish)
     items = _selected(recipe, planned, stage, method, seed)
-    items = [item for item in items if not _finished(item, folder)]
-    missing = next((key for item in items for key in item.inputs if not (folder / key).is_dir()), None)
+    reads = [key for item in items if not _finished(item, folder) for key in item.inputs]
+    missing = next((key for key in reads if not (folder / key).is_dir()), None)
     if missing:
         option = "" if root == RUNS else f" --root {root}"
         command = f"astra-data {missing.partition('/')[0]} {recipe_path}{option}"
@@ -92,16 +94,20 @@ def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
 
 def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | None, device: str) -> None:
     _check_device(device)
-    _check_unchanged(recipe, folder)
     folder.mkdir(parents=True, exist_ok=True)
-    partial_file = folder / ".recipe.json.partial"
-    partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
-    os.replace(partial_file, folder / "recipe.json")
-    jobs = jobs or os.cpu_count() or 1
-    # One thread each: faster for networks this small, and idle threads of one item slow down the others.
-    prepare = partial(torch.set_num_threads, 1)
-    with display(len(items), Console()) as watch:
-        execute(items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        _check_unchanged(recipe, folder)
+        partial_file = folder / ".recipe.json.partial"
+        partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
+        os.replace(partial_file, folder / "recipe.json")
+        items = [item for item in items if not _finished(item, folder)]
+        jobs = jobs or os.cpu_count() or 1
+        # One thread each: faster for networks this small, and idle threads of one item slow down the others.
+        prepare = partial(torch.set_num_threads, 1)
+        with display(len(items), Console()) as watch:
+            execute(items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
 
 
 def _finished(item: Item, folder: Path) -> bool:

@@ -8,7 +8,18 @@ from pathlib import Path
 HOUSE = Path(__file__).parents[1] / "astra_data"
 
 FLOORS = (
-    ("errors", "columns", "seeding", "recipe", "batched", "progress", "simulator", "statistics", "rows"),
+    (
+        "errors",
+        "columns",
+        "seeding",
+        "recipe",
+        "batched",
+        "progress",
+        "simulator",
+        "statistics",
+        "rows",
+        "lock",
+    ),
     ("mazes", "free_space", "navigation", "physics", "ant", "abstraction", "checkpoint", "models"),
     ("dataset", "figures", "grounding_file", "target_encoder_file"),
     ("envs", "sims", "results"),

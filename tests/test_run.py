@@ -62,6 +62,26 @@ def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> 
     assert not (tmp_path / "r/ground").exists()
 
 
+def test_a_folder_in_use_is_left_alone(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "r"
+
+    def files() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+    def run_again(*_: object, **__: object) -> None:
+        before = files()
+        with pytest.raises(BadInputError) as caught:
+            run_stage(recipe, "collect", root=tmp_path)
+        assert str(caught.value) == f"{folder} is in use by another run: wait until it ends, or stop it"
+        assert files() == before
+
+    with monkeypatch.context() as patched:
+        patched.setattr("astra_data.run.execute", run_again)
+        run(recipe, root=tmp_path)
+    run_stage(recipe, "collect", root=tmp_path, jobs=1)
+    assert (folder / "collect/seed_0").is_dir()
+
+
 def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> None:
     with pytest.raises(MissingStageError) as caught:
         run_stage(recipe, "train", method="astra", root=tmp_path)
