@@ -2,13 +2,16 @@
 
 import json
 import os
+from collections import Counter
 from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import torch
 from rich.console import Console
 
+from astra_data.cores import cores
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.lock import held
@@ -20,6 +23,10 @@ from astra_data.schedule import Item, execute
 RUNS = Path("runs")
 ALWAYS_NEW = {"report"}
 """Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+PHYSICS = {"collect", "evaluate"}
+"""Stages that step the target's physics, on any number of threads."""
+CUDA_JOBS = 2
+"""Items at a time on a CUDA device: each process holds a context of its own there."""
 
 
 def run(
@@ -35,7 +42,7 @@ def run(
     Args:
         recipe_path: the recipe.
         root: where the recipe's folder is.
-        jobs: number of items at a time; by default one per core.
+        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
         device: torch device of the networks.
         until: the last stage to run; by default all.
 
@@ -103,11 +110,27 @@ def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | Non
         partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
         os.replace(partial_file, folder / "recipe.json")
         items = [item for item in items if not _finished(item, folder)]
-        jobs = jobs or os.cpu_count() or 1
-        # One thread each: faster for networks this small, and idle threads of one item slow down the others.
+        jobs = jobs or _default_jobs(device)
+        # The networks get one thread: faster as small as they are, and idle threads slow down other items.
         prepare = partial(torch.set_num_threads, 1)
         with display(len(items), Console()) as watch:
-            execute(items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+            execute(_share_cores(items, jobs), jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+
+
+def _default_jobs(device: str) -> int:
+    return CUDA_JOBS if torch.device(device).type == "cuda" else cores()
+
+
+def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
+    """Tell the items that step the target's physics their share of the cores."""
+    counts = Counter(map(stage_of, items))
+    shared = []
+    for item in items:
+        if stage_of(item) in PHYSICS:
+            num_threads = max(1, cores() // min(jobs, counts[stage_of(item)]))
+            item = replace(item, call=partial(item.call, num_threads=num_threads))
+        shared.append(item)
+    return shared
 
 
 def _finished(item: Item, folder: Path) -> bool:

@@ -19,6 +19,7 @@ FLOORS = (
         "statistics",
         "rows",
         "lock",
+        "cores",
     ),
     ("mazes", "free_space", "navigation", "physics", "ant", "abstraction", "checkpoint", "models"),
     ("dataset", "figures", "grounding_file", "target_encoder_file"),

@@ -48,6 +48,30 @@ def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.Captur
     assert (folder / "train/astra/seed_0/attempts").read_text() == "."
 
 
+@pytest.mark.parametrize(("jobs", "each_of_two"), [(None, 1), (1, 3)])
+def test_items_side_by_side_share_the_cores(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int | None, each_of_two: int
+) -> None:
+    monkeypatch.setattr("astra_data.run.cores", lambda: 3)
+    folder = run(recipe, root=tmp_path, jobs=jobs)
+    assert asked(folder / "collect/seed_0")["num_threads"] == 3
+    for row in ("astra", "astra_plus"):
+        assert asked(folder / "evaluate" / row / "seed_0")["num_threads"] == each_of_two
+
+
+@pytest.mark.parametrize(("device", "jobs"), [("cpu", 5), ("cuda:0", 2)])
+def test_few_items_at_a_time_hold_a_context_of_a_gpu(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, jobs: int
+) -> None:
+    told: list[int] = []
+    monkeypatch.setattr("astra_data.run.cores", lambda: 5)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("astra_data.run.execute", lambda *_, jobs, **__: told.append(jobs))
+    run(recipe, root=tmp_path, device=device)
+    run(recipe, root=tmp_path, device=device, jobs=3)
+    assert told == [jobs, 3]
+
+
 def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
     text = recipe.read_text()
     recipe.write_text(text + "[pair]\nfails = true\n")
