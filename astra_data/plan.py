@@ -201,8 +201,6 @@ def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> I
     key, dataset, grounding = f"align/{base}/seed_{seed}", f"pair/seed_{seed}", f"ground/{base}/seed_{seed}"
     call = partial(
         align,
-        recipe.task,
-        base,
         recipe.align,
         dataset=folder / dataset,
         grounding=folder / grounding,

@@ -93,8 +93,6 @@ def train(
 
 
 def align(
-    task: str,
-    method: str,
     config: FakeConfig,
     *,
     dataset: Path,
@@ -104,7 +102,7 @@ def align(
     device: str,
     progress: Progress,
 ) -> None:
-    _write(config, out, progress, task=task, method=method, dataset=dataset, grounding=grounding, seed=seed)
+    _write(config, out, progress, dataset=dataset, grounding=grounding, seed=seed)
 
 
 def evaluate(
