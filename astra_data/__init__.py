@@ -2,12 +2,13 @@
 
 The house, from the ground up; a file uses only what is below it or beside it, never what is above:
 
-words       errors  columns  seeding  recipe  batched  simulator  progress  statistics
+words       errors  columns  seeding  recipe  rows  batched  simulator  progress  statistics  lock  cores
 knowledge   mazes  free_space  navigation  ant  physics  abstraction  checkpoint  models/
-data        dataset/  figures/
-worlds      envs/ (targets)  sims/ (abstract simulators, raw, randomized, grounded)
-learning    tasks  world  training_world  learners/  gap  deployment
-methods     methods/, one file each: what is different about it
-stages      stages/, one file per step: collect pair ground train align evaluate report
-roof        plan  schedule  run  cli
+data        dataset/  grounding_file  target_encoder_file  figures/  results/
+worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
+learning    tasks  world  training_world  method  policy_file  deployment  gap  mismatch  gymnasium_faces
+            learners/
+methods     methods/ (one file each: what is different about it)
+stages      stages/ (one file per step: collect pair ground train align evaluate report)
+roof        plan  schedule  display  run  cli
 """

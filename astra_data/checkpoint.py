@@ -72,7 +72,8 @@ def finished_folder(out: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds.
 
     After a failure the working folder, `.<name>.partial` beside `out`, stays: the next call yields it again
-    with all that it holds, so that a training can go on from its last checkpoint.
+    with all that it holds, so that a training can go on from its last checkpoint. What replaces an older
+    `out` begins empty instead; the older one waits as `.<name>.old` until the new one is in its place.
 
     Args:
         out: the finished folder.
@@ -81,14 +82,25 @@ def finished_folder(out: Path, *, replace: bool = False) -> Iterator[Path]:
     Raises:
         BadInputError: `out` is already there and is not to be replaced.
     """
+    partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
+    if old.exists() and not out.exists():  # a kill came between the two renames below
+        os.replace(old, out)
     if out.exists() and not replace:
         raise BadInputError(f"{out} is finished already: remove it to make it anew")
-    partial = out.with_name(f".{out.name}.partial")
+    if replace:
+        _remove(partial, old)
     partial.mkdir(parents=True, exist_ok=True)
     yield partial
     if out.exists():
-        shutil.rmtree(out)
+        os.replace(out, old)
     os.replace(partial, out)
+    _remove(old)
+
+
+def _remove(*folders: Path) -> None:
+    for folder in folders:
+        if folder.exists():
+            shutil.rmtree(folder)
 
 
 def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:

@@ -31,7 +31,11 @@ Seed = Annotated[int | None, typer.Option(help="Only this seed of the recipe.", 
 Device = Annotated[str, typer.Option(help="Torch device of the networks: cpu, cuda, cuda:1, …")]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="Items at a time, each in its own process.", show_default="one per core"),
+    typer.Option(
+        min=1,
+        help="Items at a time, each in its own process; on a CUDA device, each with its own CUDA context.",
+        show_default="one per core; 2 with --device cuda",
+    ),
 ]
 Root = Annotated[Path, typer.Option(help="Folder of all runs.")]
 Until = Annotated[str | None, typer.Option(help="The last stage to run.", show_default="all")]

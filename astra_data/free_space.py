@@ -43,10 +43,6 @@ class FreeSpace:
             torch.tensor(maze.half_extent, dtype=torch.float32, device=device),
         )
 
-    def is_free(self, position: Tensor) -> Tensor:
-        """Tell for each `position` (..., 2) in m whether it is free."""
-        return ~self.blocked[self.cells(position)]
-
     def cells(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the row and the column (...) of the fine grid's cell of each `position` (..., 2)."""
         column, row = self._cells(position).unbind(-1)

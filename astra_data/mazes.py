@@ -63,15 +63,6 @@ class Maze:
         """Return the centres (N, 2) of the free cells in m."""
         return np.array([self.cell_centre(row, column) for row, column in self.free_cells()])
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell for each of `points` (..., 2) whether it lies in a free cell."""
-        half_width, half_height = self.half_extent
-        columns = np.floor((points[..., 0] + half_width) / self.scale).astype(int)
-        rows = np.floor((half_height - points[..., 1]) / self.scale).astype(int)
-        height, width = self.walls.shape
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        return np.asarray(inside & ~self.walls[rows.clip(0, height - 1), columns.clip(0, width - 1)])
-
     @cached_property
     def fine_walls(self) -> NDArray[np.bool_]:
         """The walls on a grid of `FIELD_CELL_M`, indexed [y, x] from the lower left corner."""

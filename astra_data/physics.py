@@ -5,12 +5,13 @@ Gymnasium environment (`mujoco.rollout` starts every call cold), and contacts st
 `mj_step` releases the interpreter lock, so plain threads use all cores.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from astra_data.cores import cores
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -39,7 +40,7 @@ class BatchedPhysics:
         self.qvel: Floats = np.zeros((num_envs, model.nv))
         self._data = [mujoco.MjData(model) for _ in range(num_envs)]
         self._views = [(data, data.ctrl, data.qpos, data.qvel) for data in self._data]
-        self.num_threads = min(num_threads or os.cpu_count() or 1, num_envs)
+        self.num_threads = min(num_threads or cores(), num_envs)
         self._pool = ThreadPoolExecutor(self.num_threads)
 
     def set_state(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats) -> None:

@@ -18,6 +18,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from astra_data.methods import METHODS
 from astra_data.recipe import Config, did_you_mean
+from astra_data.rows import PLUS, base_method, is_plus
 from astra_data.schedule import Item
 from astra_data.stages.align import AlignConfig, align
 from astra_data.stages.collect import CollectConfig, collect
@@ -38,8 +39,6 @@ STAGES: dict[str, tuple[str, ...]] = {
     "report": ("evaluate",),
 }
 """Each stage, in order, and the stages whose artefacts it reads."""
-
-PLUS = "_plus"
 
 
 class Recipe(Config):
@@ -87,7 +86,7 @@ class Recipe(Config):
         for row in rows:
             if base_method(row) not in METHODS:
                 raise ValueError(f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}")
-            if row.endswith(PLUS) and not METHODS[base_method(row)].trains:
+            if is_plus(row) and not METHODS[base_method(row)].trains:
                 raise ValueError(f"'{row}' has nothing to train with the [plus] settings: leave out {PLUS}")
         return rows
 
@@ -97,11 +96,6 @@ class Recipe(Config):
             if len(set(values)) < len(values):
                 raise ValueError(f"expected each of {name} once, got {list(values)}")
         return self
-
-
-def base_method(row: str) -> str:
-    """Return the method of a row: its name without `_plus`."""
-    return row.removesuffix(PLUS)
 
 
 @dataclass(frozen=True)
@@ -193,7 +187,7 @@ def _train(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> It
         train,
         recipe.task,
         row,
-        recipe.plus if row.endswith(PLUS) else recipe.train,
+        recipe.plus if is_plus(row) else recipe.train,
         dataset=folder / dataset,
         grounding=folder / grounding if grounding else None,
         seed=seed,
@@ -207,8 +201,6 @@ def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> I
     key, dataset, grounding = f"align/{base}/seed_{seed}", f"pair/seed_{seed}", f"ground/{base}/seed_{seed}"
     call = partial(
         align,
-        recipe.task,
-        base,
         recipe.align,
         dataset=folder / dataset,
         grounding=folder / grounding,

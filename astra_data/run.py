@@ -2,22 +2,31 @@
 
 import json
 import os
+from collections import Counter
 from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import torch
 from rich.console import Console
 
+from astra_data.cores import cores
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
-from astra_data.plan import STAGES, Recipe, base_method, plan, select, stage_of
+from astra_data.lock import held
+from astra_data.plan import STAGES, Recipe, plan, select, stage_of
 from astra_data.recipe import did_you_mean, load_recipe
+from astra_data.rows import base_method
 from astra_data.schedule import Item, execute
 
 RUNS = Path("runs")
 ALWAYS_NEW = {"report"}
 """Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+PHYSICS = {"collect", "evaluate"}
+"""Stages that step the target's physics, on any number of threads."""
+CUDA_JOBS = 2
+"""Items at a time on a CUDA device: each process holds a context of its own there."""
 
 
 def run(
@@ -33,19 +42,19 @@ def run(
     Args:
         recipe_path: the recipe.
         root: where the recipe's folder is.
-        jobs: number of items at a time; by default one per core.
+        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
         device: torch device of the networks.
         until: the last stage to run; by default all.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     _check_stage(until or "report")
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
     items = [item for item in plan(recipe, recipe_path, folder, device=device) if stage_of(item) in wanted]
-    items = [item for item in items if not _finished(item, folder)]
     _make(recipe, folder, items, jobs, device)
     return folder
 
@@ -66,14 +75,15 @@ def run_stage(
     Raises:
         MissingStageError: an artefact that the stage reads is not finished.
         RecipeError: the recipe has faults, or differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     _check_stage(stage)
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     planned = plan(recipe, recipe_path, folder, device=device, publish=publish)
     items = _selected(recipe, planned, stage, method, seed)
-    items = [item for item in items if not _finished(item, folder)]
-    missing = next((key for item in items for key in item.inputs if not (folder / key).is_dir()), None)
+    reads = [key for item in items if not _finished(item, folder) for key in item.inputs]
+    missing = next((key for key in reads if not (folder / key).is_dir()), None)
     if missing:
         option = "" if root == RUNS else f" --root {root}"
         command = f"astra-data {missing.partition('/')[0]} {recipe_path}{option}"
@@ -91,16 +101,36 @@ def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
 
 def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | None, device: str) -> None:
     _check_device(device)
-    _check_unchanged(recipe, folder)
     folder.mkdir(parents=True, exist_ok=True)
-    partial_file = folder / ".recipe.json.partial"
-    partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
-    os.replace(partial_file, folder / "recipe.json")
-    jobs = jobs or os.cpu_count() or 1
-    # One thread each: faster for networks this small, and idle threads of one item slow down the others.
-    prepare = partial(torch.set_num_threads, 1)
-    with display(len(items), Console()) as watch:
-        execute(items, jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        _check_unchanged(recipe, folder)
+        partial_file = folder / ".recipe.json.partial"
+        partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
+        os.replace(partial_file, folder / "recipe.json")
+        items = [item for item in items if not _finished(item, folder)]
+        jobs = jobs or _default_jobs(device)
+        # The networks get one thread: faster as small as they are, and idle threads slow down other items.
+        prepare = partial(torch.set_num_threads, 1)
+        with display(len(items), Console()) as watch:
+            execute(_share_cores(items, jobs), jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+
+
+def _default_jobs(device: str) -> int:
+    return CUDA_JOBS if torch.device(device).type == "cuda" else cores()
+
+
+def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
+    """Tell the items that step the target's physics their share of the cores."""
+    counts = Counter(map(stage_of, items))
+    shared = []
+    for item in items:
+        if stage_of(item) in PHYSICS:
+            num_threads = max(1, cores() // min(jobs, counts[stage_of(item)]))
+            item = replace(item, call=partial(item.call, num_threads=num_threads))
+        shared.append(item)
+    return shared
 
 
 def _finished(item: Item, folder: Path) -> bool:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from threading import Thread
 from typing import Protocol
 
 from astra_data.errors import AstraDataError
@@ -56,7 +57,8 @@ def execute(
     """Run `items`, at most `jobs` at a time, in freshly spawned processes.
 
     Inputs that are not among `items` count as finished. What an item prints goes to `<logs>/<key>.txt`; the
-    file of an item that printed nothing is removed. When an item fails, or at Ctrl-C, the others are stopped.
+    file of an item that printed nothing is removed. When an item fails, at Ctrl-C, or when this process is
+    killed, the others are stopped.
 
     Args:
         items: in order of preference.
@@ -162,6 +164,7 @@ class _Worker:
 
 
 def _serve(connection: Connection, prepare: Callable[[], object] | None) -> None:
+    Thread(target=_leave_with_parent, daemon=True).start()
     if prepare:
         prepare()
     while True:
@@ -181,6 +184,14 @@ def _serve(connection: Connection, prepare: Callable[[], object] | None) -> None
             if not log.stat().st_size:
                 log.unlink()
             connection.send(None)
+
+
+def _leave_with_parent() -> None:
+    """Stop this process when its parent dies, so that nobody works in a folder that is no longer locked."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 class _Reporter:

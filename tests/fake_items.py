@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from astra_data.errors import MissingStageError
+from astra_data.lock import held
 from astra_data.progress import Progress
 
 
@@ -38,5 +39,7 @@ def kill_itself(*, progress: Progress) -> None:
 
 
 def hang(path: Path, *, progress: Progress) -> None:
-    path.write_text(str(os.getpid()))
-    time.sleep(600)
+    """Hold the lock of the folder of `path` while hanging."""
+    with held(path.parent):
+        path.write_text(str(os.getpid()))
+        time.sleep(600)

@@ -53,8 +53,10 @@ def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -
     os.replace(folder, out)
 
 
-def collect(task: str, config: FakeConfig, *, seed: int, out: Path, progress: Progress) -> None:
-    _write(config, out, progress, task=task, seed=seed)
+def collect(
+    task: str, config: FakeConfig, *, seed: int, out: Path, progress: Progress, num_threads: int
+) -> None:
+    _write(config, out, progress, task=task, seed=seed, num_threads=num_threads)
 
 
 def pair(task: str, config: FakeConfig, *, dataset: Path, out: Path, progress: Progress) -> None:
@@ -91,8 +93,6 @@ def train(
 
 
 def align(
-    task: str,
-    method: str,
     config: FakeConfig,
     *,
     dataset: Path,
@@ -102,7 +102,7 @@ def align(
     device: str,
     progress: Progress,
 ) -> None:
-    _write(config, out, progress, task=task, method=method, dataset=dataset, grounding=grounding, seed=seed)
+    _write(config, out, progress, dataset=dataset, grounding=grounding, seed=seed)
 
 
 def evaluate(
@@ -116,9 +116,10 @@ def evaluate(
     seed: int,
     out: Path,
     progress: Progress,
+    num_threads: int,
 ) -> None:
     asked = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
-    _write(config, out, progress, task=task, method=method, seed=seed, **asked)
+    _write(config, out, progress, task=task, method=method, seed=seed, num_threads=num_threads, **asked)
 
 
 def report(

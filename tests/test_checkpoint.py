@@ -149,7 +149,54 @@ def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
         pass
     with finished_folder(tmp_path / "out", replace=True) as folder:
         (folder / "new").touch()
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["new"]
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
+        "out",
+        "out/new",
+    ]
+
+
+def test_a_failed_replacement_leaves_the_old_folder_and_is_not_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "old").touch()
+    with pytest.raises(KeyboardInterrupt), finished_folder(tmp_path / "out", replace=True) as folder:
+        (folder / "half").touch()
+        raise KeyboardInterrupt
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["old"]
+    with finished_folder(tmp_path / "out", replace=True) as folder:
+        assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("renames", [0, 1, 2])
+def test_a_kill_while_replacing_loses_nothing(
+    tmp_path: Path, renames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, left = tmp_path / "out", [renames]
+
+    def replace_until_killed(source: Path, target: Path) -> None:
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        source.rename(target)
+
+    def killed(_: Path) -> None:
+        raise KeyboardInterrupt
+
+    out.mkdir()
+    (out / "old").touch()
+    with monkeypatch.context() as patched:
+        patched.setattr("os.replace", replace_until_killed)
+        patched.setattr("shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt), finished_folder(out, replace=True) as folder:
+            (folder / "new").touch()
+    with pytest.raises(BadInputError, match="finished already"), finished_folder(out):
+        pass
+    assert [path.name for path in out.iterdir()] == ["new" if renames == 2 else "old"]
+    with finished_folder(out, replace=True) as folder:
+        (folder / "newer").touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
+        "out",
+        "out/newer",
+    ]
 
 
 def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:

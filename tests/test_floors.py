@@ -1,37 +1,27 @@
-"""The house's plan, enforced: imports go down, rooms have no inner doors, files stay short."""
+"""The map in `astra_data`'s docstring, enforced; and: rooms have no inner doors, files stay short."""
 
 import ast
+import re
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import astra_data
+
 HOUSE = Path(__file__).parents[1] / "astra_data"
 
-FLOORS = (
-    ("errors", "columns", "seeding", "recipe", "batched", "progress", "simulator", "statistics"),
-    ("mazes", "free_space", "navigation", "physics", "ant", "abstraction", "checkpoint", "models"),
-    ("dataset", "figures", "grounding_file", "target_encoder_file"),
-    ("envs", "sims", "results"),
-    (
-        "tasks",
-        "world",
-        "gymnasium_faces",
-        "method",
-        "gap",
-        "training_world",
-        "policy_file",
-        "deployment",
-        "mismatch",
-        "learners",
-    ),
-    ("methods",),
-    ("stages",),
-    ("schedule", "display", "plan", "run", "sweep", "cli"),
-)
-"""Files and rooms from the ground up; on one floor, files may use each other, without circles."""
-
-NO_NEIGHBOURS = {"envs", "sims", "methods", "stages", "importers"}
+NO_NEIGHBOURS = {"envs", "sims", "methods", "stages"}
 """Rooms whose files do not import each other; their `__init__` may import them all."""
+
+
+def floors() -> list[list[str]]:
+    """Read the map in the package's docstring: files and rooms (`room/`) from the ground up.
+
+    On one floor, files may use each other, without circles.
+    """
+    plan = (astra_data.__doc__ or "").split("\n\n")[2]
+    lines = re.sub(r"\(.*?\)|\n +", " ", plan).splitlines()
+    return [names for _floor, *names in map(str.split, lines)]
 
 
 def modules() -> dict[str, Path]:
@@ -56,14 +46,15 @@ def imports(path: Path, known: dict[str, Path]) -> Iterator[str]:
                 yield name if name in known else name.rpartition(".")[0]
 
 
-def test_every_file_has_a_floor() -> None:
-    placed = {name for floor in FLOORS for name in floor}
-    strangers = {name.partition(".")[0] for name in modules()} - placed - {""}
-    assert not strangers, f"give these a floor in FLOORS: {sorted(strangers)}"
+def test_the_map_names_every_file_and_room_once_and_no_others() -> None:
+    drawn = [name for floor in floors() for name in floor]
+    rooms = {f"{path.parent.name}/" for path in HOUSE.glob("*/*.py")}
+    files = {path.stem for path in HOUSE.glob("*.py")} - {"__init__"}
+    assert sorted(drawn) == sorted(files | rooms)
 
 
 def test_imports_only_go_down() -> None:
-    level = {name: number for number, floor in enumerate(FLOORS) for name in floor}
+    level = {name.rstrip("/"): number for number, floor in enumerate(floors()) for name in floor}
     known, faults = modules(), []
     for name, path in known.items():
         room = name.partition(".")[0]

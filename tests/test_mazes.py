@@ -19,16 +19,18 @@ def test_the_long_maze_is_the_u_maze_twice() -> None:
 def test_cells_and_points_agree() -> None:
     centres = U_MAZE.free_centres()
     assert len(centres) == len(U_MAZE.free_cells()) == 7
-    assert U_MAZE.contains(centres).all()
+    assert (U_MAZE.clearance(centres) > 1.9).all()
     walls = np.array([U_MAZE.cell_centre(*cell) for cell in U_MAZE.wall_cells()])
     assert len(walls) == 25 - 7
-    assert not U_MAZE.contains(walls).any()
-    assert not U_MAZE.contains(np.array([[100.0, 0.0], [0.0, -100.0]])).any()
+    assert not U_MAZE.clearance(walls).any()
+    assert not U_MAZE.clearance(np.array([[100.0, 0.0], [0.0, -100.0]])).any()
 
 
 def test_the_fine_grid_repeats_the_walls() -> None:
     points = np.random.default_rng(0).uniform(-9.9, 9.9, (500, 2))
-    assert (U_MAZE.contains(points) == ~U_MAZE.fine_walls[U_MAZE.fine_index(points)]).all()
+    centres = np.array([U_MAZE.cell_centre(row, column) for row in range(5) for column in range(5)])
+    nearest = np.abs(points[:, None] - centres).max(axis=-1).argmin(axis=1)
+    assert (U_MAZE.fine_walls[U_MAZE.fine_index(points)] == U_MAZE.walls.ravel()[nearest]).all()
 
 
 def test_clearance_in_the_middle_and_beside_a_wall() -> None:

@@ -49,7 +49,6 @@ def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
 
 def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -> None:
     points = TASK.draw_anywhere(np.random.default_rng(0), 7000)
-    assert U_MAZE.contains(points).all()
     assert U_MAZE.clearance(points).min() > 0.8
     # The two arms are mirror images.
     assert (points[:, 1] > 0).mean() == pytest.approx(0.5, abs=0.02)

@@ -48,6 +48,30 @@ def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.Captur
     assert (folder / "train/astra/seed_0/attempts").read_text() == "."
 
 
+@pytest.mark.parametrize(("jobs", "each_of_two"), [(None, 1), (1, 3)])
+def test_items_side_by_side_share_the_cores(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int | None, each_of_two: int
+) -> None:
+    monkeypatch.setattr("astra_data.run.cores", lambda: 3)
+    folder = run(recipe, root=tmp_path, jobs=jobs)
+    assert asked(folder / "collect/seed_0")["num_threads"] == 3
+    for row in ("astra", "astra_plus"):
+        assert asked(folder / "evaluate" / row / "seed_0")["num_threads"] == each_of_two
+
+
+@pytest.mark.parametrize(("device", "jobs"), [("cpu", 5), ("cuda:0", 2)])
+def test_few_items_at_a_time_hold_a_context_of_a_gpu(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, jobs: int
+) -> None:
+    told: list[int] = []
+    monkeypatch.setattr("astra_data.run.cores", lambda: 5)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("astra_data.run.execute", lambda *_, jobs, **__: told.append(jobs))
+    run(recipe, root=tmp_path, device=device)
+    run(recipe, root=tmp_path, device=device, jobs=3)
+    assert told == [jobs, 3]
+
+
 def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
     text = recipe.read_text()
     recipe.write_text(text + "[pair]\nfails = true\n")
@@ -60,6 +84,26 @@ def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> 
     run(recipe, root=tmp_path, jobs=1, until="pair")
     assert (tmp_path / "r/pair/seed_0/attempts").read_text() == ".."
     assert not (tmp_path / "r/ground").exists()
+
+
+def test_a_folder_in_use_is_left_alone(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "r"
+
+    def files() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+    def run_again(*_: object, **__: object) -> None:
+        before = files()
+        with pytest.raises(BadInputError) as caught:
+            run_stage(recipe, "collect", root=tmp_path)
+        assert str(caught.value) == f"{folder} is in use by another run: wait until it ends, or stop it"
+        assert files() == before
+
+    with monkeypatch.context() as patched:
+        patched.setattr("astra_data.run.execute", run_again)
+        run(recipe, root=tmp_path)
+    run_stage(recipe, "collect", root=tmp_path, jobs=1)
+    assert (folder / "collect/seed_0").is_dir()
 
 
 def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> None:

@@ -10,7 +10,11 @@ import pytest
 from fake_items import crash, fail, hang, kill_itself, rendezvous, touch
 
 from astra_data.errors import AstraDataError, MissingStageError
+from astra_data.lock import held
 from astra_data.schedule import Item, execute
+
+PATIENCE_S = 120
+"""Enough for a process to start on a machine that is busy with other work."""
 
 
 class Record:
@@ -85,26 +89,47 @@ def test_items_that_wait_for_each_other_are_a_bug() -> None:
 
 
 def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
-    pid_file, script = tmp_path / "pid", tmp_path / "script.py"
+    parent = _hanging_run(tmp_path)
+    # As in a terminal, Ctrl-C reaches the whole process group.
+    os.killpg(parent.pid, signal.SIGINT)
+    _, errors = parent.communicate(timeout=PATIENCE_S)
+    assert errors.count(b"KeyboardInterrupt") == 1
+    assert _is_gone(int((tmp_path / "pid").read_text()))
+
+
+def test_no_process_outlives_a_killed_run(tmp_path: Path) -> None:
+    parent = _hanging_run(tmp_path)
+    parent.kill()
+    parent.communicate(timeout=PATIENCE_S)
+    until = time.monotonic() + PATIENCE_S
+    ours = False
+    while not ours:
+        assert time.monotonic() < until, "the item still holds its lock"
+        time.sleep(0.02)
+        with held(tmp_path) as ours:
+            pass
+
+
+def _hanging_run(folder: Path) -> subprocess.Popen[bytes]:
+    """Start a process whose one item hangs, holding the lock of `folder`."""
+    pid_file, script = folder / "pid", folder / "script.py"
     script.write_text(
         "import sys\nfrom functools import partial\nfrom pathlib import Path\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from fake_items import hang\nfrom test_schedule import Record\n"
         "from astra_data.schedule import Item, execute\n"
         "if __name__ == '__main__':\n"
-        f"    here = Path({str(tmp_path)!r})\n"
+        f"    here = Path({str(folder)!r})\n"
         "    execute([Item('a', (), partial(hang, here / 'pid'))], jobs=1, logs=here, watch=Record())\n"
     )
-    # As in a terminal, Ctrl-C reaches the whole process group.
     parent = subprocess.Popen([sys.executable, script], stderr=subprocess.PIPE, start_new_session=True)
-    until = time.monotonic() + 30
+    until = time.monotonic() + PATIENCE_S
     while not (pid_file.exists() and pid_file.read_text()):
-        assert time.monotonic() < until
+        if time.monotonic() > until:
+            parent.kill()
+            pytest.fail("the item did not start")
         time.sleep(0.02)
-    os.killpg(parent.pid, signal.SIGINT)
-    _, errors = parent.communicate(timeout=30)
-    assert errors.count(b"KeyboardInterrupt") == 1
-    assert _is_gone(int(pid_file.read_text()))
+    return parent
 
 
 def _is_gone(pid: int) -> bool:

@@ -8,7 +8,6 @@ ratios hold even on a machine that does other work too.
 """
 
 import json
-import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from astra_data.ant import CONTROL_SUBSTEPS, VelocityController, ant_model
+from astra_data.cores import cores
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.physics import Floats
 from astra_data.tasks import TASKS
@@ -45,7 +45,7 @@ def main(
 ) -> None:
     """Print control steps per second of the target and of the abstract simulator, and the ratios."""
     torch.set_num_threads(1)
-    threads = os.cpu_count() or 1
+    threads = cores()
     figures = measure_target(num_envs, threads, rounds)
     figures["point_mass"] = rate([point_mass_stretch(num_points, steps=100)], rounds)[0]
     ratios = {

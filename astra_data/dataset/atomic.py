@@ -1,6 +1,5 @@
 """Folders that appear finished or not at all."""
 
-import fcntl
 import os
 import shutil
 from collections.abc import Iterator
@@ -8,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from astra_data.errors import BadInputError
+from astra_data.lock import held
 
 
 @contextmanager
@@ -28,7 +28,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         folder.mkdir()
     except FileExistsError:
         raise BadInputError(f"{target} is being written right now; wait or choose another folder.") from None
-    with _held(folder):
+    with held(folder):
         try:
             yield folder
             for path in folder.rglob("*"):
@@ -48,23 +48,9 @@ def _refuse(target: Path) -> None:
 def _sweep(target: Path) -> None:
     for folder in target.parent.iterdir():
         if folder.name.startswith(f".{target.name}.tmp-") and folder.is_dir():
-            with _held(folder) as held:
-                if held:
+            with held(folder) as ours:
+                if ours:
                     shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _held(folder: Path) -> Iterator[bool]:
-    """Hold the lock of `folder`; yield False if another process does."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        yield False
-    else:
-        yield True
-    finally:
-        os.close(handle)
 
 
 def _sync(path: Path) -> None:

@@ -9,10 +9,9 @@ open_loop     open_loop_error: how fast a simulator drifts from the target
 from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.figures.scores import Curve, learning_curves, success_bars
-from astra_data.figures.style import PLUS, ROLES, method_colour, method_title, png
+from astra_data.figures.style import ROLES, method_colour, method_title, png
 
 __all__ = [
-    "PLUS",
     "ROLES",
     "Curve",
     "OpenLoop",

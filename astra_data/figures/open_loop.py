@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator
 from numpy.typing import NDArray
 
-from astra_data.figures.style import INK, is_plus, method_colour, method_title, style
+from astra_data.figures.style import INK, method_colour, method_title, style
+from astra_data.rows import is_plus
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from astra_data.figures.style import FAINT, INK, ROLES, is_plus, method_colour, method_title, style
+from astra_data.figures.style import FAINT, INK, ROLES, method_colour, method_title, style
+from astra_data.rows import is_plus
 
 Floats = NDArray[np.float64]
 

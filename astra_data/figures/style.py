@@ -9,8 +9,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-PLUS = "_plus"
-"""Ending of a row that is a variant of the row before it."""
+from astra_data.rows import base_method, is_plus
 
 TITLES = {
     "direct_transfer": "Direct transfer",
@@ -92,21 +91,16 @@ def style() -> Iterator[None]:
         yield
 
 
-def is_plus(method: str) -> bool:
-    """Tell whether a row is the variant of another row."""
-    return method.endswith(PLUS)
-
-
 def method_title(method: str) -> str:
     """Return the title of a row: "astra_plus" is "ASTRA+"."""
-    base = method.removesuffix(PLUS)
+    base = base_method(method)
     title = TITLES.get(base, base.replace("_", " ").capitalize())
     return f"{title}+" if is_plus(method) else title
 
 
 def method_colour(method: str) -> str:
     """Return the colour of a row as "#rrggbb": a variant's is its base row's, darker."""
-    base = method.removesuffix(PLUS)
+    base = base_method(method)
     spare = SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
     colour = COLOURS.get(base, spare)
     if is_plus(method):

@@ -6,6 +6,7 @@ from astra_data.methods.astra import ASTRA
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
+from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {method.name: method for method in (DIRECT_TRANSFER, NAS, ASTRA, FOLLOWER)}
 
@@ -16,7 +17,7 @@ def method_named(row: str) -> Method:
     Raises:
         BadInputError: there is no such method.
     """
-    name = row.removesuffix("_plus")
+    name = base_method(row)
     if name not in METHODS:
-        raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with _plus")
+        raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with {PLUS}")
     return METHODS[name]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from astra_data.cores import cores
 from astra_data.errors import BadInputError
 from astra_data.figures import ROLES, method_title
 from astra_data.results.artefacts import (
@@ -28,7 +29,7 @@ from astra_data.results.model import (
     MethodResults,
     Results,
 )
-from astra_data.results.provenance import commit, cores, cpu_name, memory_gib, package_versions
+from astra_data.results.provenance import commit, cpu_name, memory_gib, package_versions
 from astra_data.results.runs import Runs
 from astra_data.statistics import probability_of_improvement, summarise
 

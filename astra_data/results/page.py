@@ -4,8 +4,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from astra_data.figures import PLUS, method_title
+from astra_data.figures import method_title
 from astra_data.results.model import BandMeans, Results
+from astra_data.rows import is_plus
 from astra_data.statistics import Summary
 
 HOW_TO_READ = {
@@ -109,7 +110,7 @@ def _table(results: Results) -> str:
         "95 % stratified bootstrap interval. Topple: share of episodes in which the robot fell. Wall "
         "contact: share of steps. Floor and ceiling bound the other rows; the best of those is bold."
     )
-    if any(method.endswith(PLUS) for method in rows):
+    if any(map(is_plus, rows)):
         note += " A plus marks the same method trained with the recipe's `[plus]` settings."
     return "## Results\n\n" + "\n".join(lines) + f"\n\n{note}"
 

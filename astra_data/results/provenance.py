@@ -34,11 +34,6 @@ def cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def cores() -> int:
-    """Return the number of processor cores."""
-    return os.cpu_count() or 1
-
-
 def memory_gib() -> float:
     """Return the machine's memory in GiB, to one decimal."""
     return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)

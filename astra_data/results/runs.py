@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from astra_data.errors import BadInputError, MissingStageError
-from astra_data.figures import PLUS
 from astra_data.results.artefacts import Artefact, DatasetFile, read_json
+from astra_data.rows import base_method
 
 SHARED = ("ground", "align")
 """Stages whose artefacts a "_plus" row takes from its base row."""
@@ -38,7 +38,7 @@ class Runs:
     def owner(self, stage: str, method: str) -> str:
         """Return the name of a row's folder: a "_plus" row shares the grounding and alignment of its base."""
         if stage in SHARED and not (self.root / stage / method).is_dir():
-            return method.removesuffix(PLUS)
+            return base_method(method)
         return method
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:

@@ -42,8 +42,6 @@ class AlignConfig(Config):
 
 
 def align(
-    task: str,
-    method: str,
     config: AlignConfig,
     *,
     dataset: Path,

@@ -80,10 +80,12 @@ def evaluate(
     seed: int,
     out: Path,
     progress: Progress,
+    num_threads: int | None = None,
 ) -> None:
     """Test a row and write its figures and paths to `out`.
 
     Starts, goals and headings depend on the seed alone, so they are the same for every method.
+    The physics runs on `num_threads`, by default one per core; the outcome is the same with any number.
 
     Raises:
         BadInputError: an input is not there or not what was expected.
@@ -97,7 +99,7 @@ def evaluate(
     told: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
     tensors: dict[str, Tensor] = {}
     if policy is None:
-        outcome, rate = _in_target(world, None, config, seed, progress)
+        outcome, rate = _in_target(world, None, config, seed, num_threads, progress)
         tensors |= {"target.position": outcome.position}
         told |= {"target": outcome.to_json(), "target_steps_per_second": rate}
     else:
@@ -113,7 +115,7 @@ def evaluate(
         headline = config.encoder if config.encoder in encoders else "source"
         outcomes = {}
         for kind, deployed in encoders.items():
-            outcomes[kind], rate = _in_target(world, deployed, config, seed, progress)
+            outcomes[kind], rate = _in_target(world, deployed, config, seed, num_threads, progress)
         simulated = _in_simulation(world, method, trained, grounding, config, seed)
         told |= {
             "encoder": headline,
@@ -142,10 +144,20 @@ def evaluate(
 
 
 def _in_target(
-    task: Task, deployed: DeployedPolicy | None, config: EvaluateConfig, seed: int, progress: Progress
+    task: Task,
+    deployed: DeployedPolicy | None,
+    config: EvaluateConfig,
+    seed: int,
+    num_threads: int | None,
+    progress: Progress,
 ) -> tuple[Outcome, float]:
     """Return what happened in the target, and target steps/s."""
-    env = task.target(config.episodes, seed=derive(seed, "evaluation"), leg_scale=config.leg_scale)
+    env = task.target(
+        config.episodes,
+        seed=derive(seed, "evaluation"),
+        leg_scale=config.leg_scale,
+        num_threads=num_threads,
+    )
     env.reset()
     act: Act
     if deployed is None:

@@ -57,6 +57,5 @@ def trained(grounded: Path, paired: Path) -> Path:
 def aligned(grounded: Path, paired: Path) -> Path:
     out = paired.with_name("align")
     inputs = {"dataset": paired, "grounding": grounded}
-    with short_task():
-        align(TASK, "astra", ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
+    align(ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
     return out

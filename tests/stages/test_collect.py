@@ -48,11 +48,11 @@ def test_commands_are_held_for_a_while(collected: Path) -> None:
         assert (held <= most).all()
 
 
-def test_the_seed_decides_everything(task: str, tmp_path: Path) -> None:
+def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path: Path) -> None:
     hashes = []
-    for number, seed in enumerate((1, 1, 2)):
+    for number, (seed, threads) in enumerate([(1, 1), (1, 2), (2, 2)]):
         out = tmp_path / str(number)
-        collect(task, TINY, seed=seed, out=out, progress=silent)
+        collect(task, TINY, seed=seed, out=out, progress=silent, num_threads=threads)
         hashes.append(Dataset.open(out).content_hash)
     assert hashes[0] == hashes[1] != hashes[2]
 

@@ -20,10 +20,15 @@ Result = tuple[dict[str, Any], dict[str, Tensor]]
 
 
 def make(
-    task: str, method: str, out: Path, inputs: dict[str, Path] | None = None, config: EvaluateConfig = CONFIG
+    task: str,
+    method: str,
+    out: Path,
+    inputs: dict[str, Path] | None = None,
+    config: EvaluateConfig = CONFIG,
+    num_threads: int | None = None,
 ) -> Result:
     paths = {"policy": None, "grounding": None, "target_encoder": None} | (inputs or {})
-    evaluate(task, method, config, **paths, seed=0, out=out, progress=silent)
+    evaluate(task, method, config, **paths, seed=0, out=out, progress=silent, num_threads=num_threads)
     tensors, _ = load_tensors(out / "trajectories.safetensors")
     return json.loads((out / "evaluation.json").read_text()), tensors
 
@@ -73,12 +78,12 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert torch.equal(paths["start"], paths["target.position"][:, 0])
 
 
-def test_the_same_seed_gives_the_same_outcome(
+def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
     task: str, trained: Path, grounded: Path, tmp_path: Path
 ) -> None:
+    inputs = {"policy": trained, "grounding": grounded}
     first, second = (
-        make(task, "astra", tmp_path / name, {"policy": trained, "grounding": grounded})
-        for name in ("a", "b")
+        make(task, "astra", tmp_path / str(threads), inputs, num_threads=threads) for threads in (1, 2)
     )
     assert first[0]["encoder"] == "source"
     for world in ("target", "simulated"):
