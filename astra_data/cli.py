@@ -5,7 +5,7 @@ Only here do imports stand inside functions, so that `astra-data --help` answers
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,10 @@ RecipePath = Annotated[
 ]
 RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE...", help="Recipes, TOML files.")]
 Method = Annotated[str | None, typer.Option(help="Only this row of the recipe.", show_default=False)]
-Seed = Annotated[int | None, typer.Option(help="Only this seed of the recipe.", show_default=False)]
+Seeds = Annotated[
+    list[int] | None,
+    typer.Option("--seed", help="Only this seed of the recipe; may be repeated.", show_default=False),
+]
 Device = Annotated[str, typer.Option(help="Torch device of the networks: cpu, cuda, cuda:1, …")]
 Jobs = Annotated[
     int | None,
@@ -65,6 +68,7 @@ def _options(
 @app.command()
 def run(
     recipe: RecipePath,
+    seeds: Seeds = None,
     jobs: Jobs = None,
     device: Device = "cpu",
     until: Until = None,
@@ -74,7 +78,8 @@ def run(
     from astra_data.run import run as run_recipe
 
     with _resumable():
-        typer.echo(f"finished: {run_recipe(recipe, root=root, jobs=jobs, device=device, until=until)}")
+        folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
+        typer.echo(f"finished: {folder}")
 
 
 @app.command()
@@ -97,72 +102,72 @@ def check(recipes: RecipePaths, root: Root = RUNS) -> None:
 
 
 @app.command()
-def collect(recipe: RecipePath, seed: Seed = None, jobs: Jobs = None, root: Root = RUNS) -> None:
+def collect(recipe: RecipePath, seeds: Seeds = None, jobs: Jobs = None, root: Root = RUNS) -> None:
     """Collect a dataset in the target environment."""
-    _run_stage(recipe, "collect", seed=seed, jobs=jobs, root=root)
+    _run_stage(recipe, "collect", seeds=seeds or (), jobs=jobs, root=root)
 
 
 @app.command()
-def pair(recipe: RecipePath, seed: Seed = None, jobs: Jobs = None, root: Root = RUNS) -> None:
+def pair(recipe: RecipePath, seeds: Seeds = None, jobs: Jobs = None, root: Root = RUNS) -> None:
     """Add to every transition where the abstract simulator lands from the same state."""
-    _run_stage(recipe, "pair", seed=seed, jobs=jobs, root=root)
+    _run_stage(recipe, "pair", seeds=seeds or (), jobs=jobs, root=root)
 
 
 @app.command()
 def ground(
     recipe: RecipePath,
     method: Method = None,
-    seed: Seed = None,
+    seeds: Seeds = None,
     jobs: Jobs = None,
     device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
     """Learn to correct the abstract simulator from the pairs."""
-    _run_stage(recipe, "ground", method=method, seed=seed, jobs=jobs, device=device, root=root)
+    _run_stage(recipe, "ground", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
 
 
 @app.command()
 def train(
     recipe: RecipePath,
     method: Method = None,
-    seed: Seed = None,
+    seeds: Seeds = None,
     jobs: Jobs = None,
     device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
     """Train policies in the abstract simulator, grounded where the method grounds it."""
-    _run_stage(recipe, "train", method=method, seed=seed, jobs=jobs, device=device, root=root)
+    _run_stage(recipe, "train", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
 
 
 @app.command()
 def align(
     recipe: RecipePath,
     method: Method = None,
-    seed: Seed = None,
+    seeds: Seeds = None,
     jobs: Jobs = None,
     device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
     """Learn the encoder of target histories that agrees with the simulator's."""
-    _run_stage(recipe, "align", method=method, seed=seed, jobs=jobs, device=device, root=root)
+    _run_stage(recipe, "align", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
 
 
 @app.command()
 def evaluate(
     recipe: RecipePath,
     method: Method = None,
-    seed: Seed = None,
+    seeds: Seeds = None,
     jobs: Jobs = None,
     root: Root = RUNS,
 ) -> None:
     """Run the policies in the target environment."""
-    _run_stage(recipe, "evaluate", method=method, seed=seed, jobs=jobs, root=root)
+    _run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
 
 
 @app.command()
-def report(recipe: RecipePath, publish: Publish = False, root: Root = RUNS) -> None:
+def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, root: Root = RUNS) -> None:
     """Write the recipe's tables and figures."""
-    _run_stage(recipe, "report", publish=publish, root=root)
+    _run_stage(recipe, "report", seeds=seeds or (), publish=publish, root=root)
 
 
 def _run_stage(
@@ -171,7 +176,7 @@ def _run_stage(
     *,
     root: Path,
     method: str | None = None,
-    seed: int | None = None,
+    seeds: Sequence[int] = (),
     jobs: int | None = None,
     device: str = "cpu",
     publish: bool = False,
@@ -180,7 +185,7 @@ def _run_stage(
 
     with _resumable():
         folder = run_stage(
-            recipe, stage, method=method, seed=seed, root=root, jobs=jobs, device=device, publish=publish
+            recipe, stage, method=method, seeds=seeds, root=root, jobs=jobs, device=device, publish=publish
         )
         typer.echo(f"finished: {folder}")
 

@@ -8,7 +8,7 @@ A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` set
 grounding and the alignment of `<method>`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from astra_data.errors import BadInputError
 from astra_data.methods import METHODS
 from astra_data.recipe import Config, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus
@@ -109,7 +110,13 @@ class Reported:
 
 
 def plan(
-    recipe: Recipe, path: Path, folder: Path, *, device: str = "cpu", publish: bool = False
+    recipe: Recipe,
+    path: Path,
+    folder: Path,
+    *,
+    seeds: Sequence[int] = (),
+    device: str = "cpu",
+    publish: bool = False,
 ) -> tuple[Item, ...]:
     """Return every artefact of `recipe`, each after those it reads.
 
@@ -117,12 +124,21 @@ def plan(
         recipe: what to make.
         path: the recipe's file.
         folder: where it is made, such as `runs/antmaze_long`; an item's artefact is at `folder / key`.
+        seeds: those of the recipe's seeds to make and to report; by default all.
         device: torch device of the networks.
         publish: whether the report copies its results into `results/` beside the recipe.
+
+    Raises:
+        BadInputError: the recipe has no such seed.
     """
+    unknown = next((seed for seed in seeds if seed not in recipe.seeds), None)
+    if unknown is not None:
+        known = ", ".join(map(str, recipe.seeds))
+        raise BadInputError(f"the recipe has no seed {unknown}; its seeds: {known}")
+    asked = tuple(dict.fromkeys(seeds)) or recipe.seeds
     bases = tuple(dict.fromkeys(base_method(row) for row in recipe.methods))
     items: list[Item] = []
-    for seed in recipe.seeds:
+    for seed in asked:
         items.append(_collect(recipe, folder, seed))
         items.append(_pair(recipe, folder, seed))
         items += (_ground(recipe, folder, base, seed, device) for base in bases if METHODS[base].grounds)
@@ -130,7 +146,7 @@ def plan(
         items += (_train(recipe, folder, row, seed, device) for row in trained)
         items += (_align(recipe, folder, base, seed, device) for base in bases if METHODS[base].aligns)
         items += (_evaluate(recipe, folder, row, seed) for row in recipe.methods)
-    items.append(_report(recipe, path, folder, publish))
+    items.append(_report(recipe, path, folder, asked, publish))
     # Stage by stage, so that work on every seed begins before any seed is finished.
     return tuple(sorted(items, key=lambda item: list(STAGES).index(stage_of(item))))
 
@@ -140,18 +156,12 @@ def stage_of(item: Item) -> str:
     return item.key.partition("/")[0]
 
 
-def select(
-    items: tuple[Item, ...], stage: str, *, method: str | None = None, seed: int | None = None
-) -> Iterator[Item]:
-    """Yield the items of `stage`, of `method` and of `seed` only where they are given."""
+def select(items: tuple[Item, ...], stage: str, *, method: str | None = None) -> Iterator[Item]:
+    """Yield the items of `stage`, of `method` only where it is given."""
     for item in items:
         parts = item.key.split("/")
-        if parts[0] == stage and method in (None, *parts[1:-1]) and seed in (None, _seed(parts[-1])):
+        if parts[0] == stage and method in (None, *parts[1:-1]):
             yield item
-
-
-def _seed(part: str) -> int | None:
-    return int(part.removeprefix("seed_")) if part.startswith("seed_") else None
 
 
 def _collect(recipe: Recipe, folder: Path, seed: int) -> Item:
@@ -230,13 +240,14 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
     return Item(key, _existing(policy, grounding, target_encoder), call)
 
 
-def _report(recipe: Recipe, path: Path, folder: Path, publish: bool) -> Item:
-    inputs = tuple(f"evaluate/{row}/seed_{seed}" for row in recipe.methods for seed in recipe.seeds)
+def _report(recipe: Recipe, path: Path, folder: Path, seeds: tuple[int, ...], publish: bool) -> Item:
+    inputs = tuple(f"evaluate/{row}/seed_{seed}" for row in recipe.methods for seed in seeds)
+    options = "" if seeds == recipe.seeds else "".join(f" --seed {seed}" for seed in seeds)
     call = partial(
         report,
-        Reported(path.stem, recipe.task, recipe.methods, recipe.seeds),
+        Reported(path.stem, recipe.task, recipe.methods, seeds),
         root=folder,
-        command=f"astra-data run {path}",
+        command=f"astra-data run {path}{options}",
         publish=path.parent / "results" if publish else None,
         config=recipe.report,
     )

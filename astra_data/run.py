@@ -3,7 +3,7 @@
 import json
 import os
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ CUDA_JOBS = 2
 def run(
     recipe_path: Path,
     *,
+    seeds: Sequence[int] = (),
     root: Path = RUNS,
     jobs: int | None = None,
     device: str = "cpu",
@@ -41,6 +42,7 @@ def run(
 
     Args:
         recipe_path: the recipe.
+        seeds: those of the recipe's seeds to make and to report; by default all.
         root: where the recipe's folder is.
         jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
         device: torch device of the networks.
@@ -54,7 +56,8 @@ def run(
     _check_stage(until or "report")
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
-    items = [item for item in plan(recipe, recipe_path, folder, device=device) if stage_of(item) in wanted]
+    planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device)
+    items = [item for item in planned if stage_of(item) in wanted]
     _make(recipe, folder, items, jobs, device)
     return folder
 
@@ -64,13 +67,13 @@ def run_stage(
     stage: str,
     *,
     method: str | None = None,
-    seed: int | None = None,
+    seeds: Sequence[int] = (),
     root: Path = RUNS,
     jobs: int | None = None,
     device: str = "cpu",
     publish: bool = False,
 ) -> Path:
-    """Make the artefacts of one stage of a recipe, of one `method` or `seed` only where given.
+    """Make the artefacts of one stage of a recipe, of one `method` and of some `seeds` only where given.
 
     Raises:
         MissingStageError: an artefact that the stage reads is not finished.
@@ -80,8 +83,8 @@ def run_stage(
     """
     _check_stage(stage)
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
-    planned = plan(recipe, recipe_path, folder, device=device, publish=publish)
-    items = _selected(recipe, planned, stage, method, seed)
+    planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device, publish=publish)
+    items = _selected(recipe, planned, stage, method)
     reads = [key for item in items if not _finished(item, folder) for key in item.inputs]
     missing = next((key for key in reads if not (folder / key).is_dir()), None)
     if missing:
@@ -137,16 +140,12 @@ def _finished(item: Item, folder: Path) -> bool:
     return stage_of(item) not in ALWAYS_NEW and (folder / item.key).is_dir()
 
 
-def _selected(
-    recipe: Recipe, items: tuple[Item, ...], stage: str, method: str | None, seed: int | None
-) -> list[Item]:
+def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str | None) -> list[Item]:
     if method is not None and method not in recipe.methods:
         raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
-    if seed is not None and seed not in recipe.seeds:
-        raise BadInputError(f"the recipe has no seed {seed}; its seeds: {', '.join(map(str, recipe.seeds))}")
     if method is not None and stage in ("ground", "align"):
         method = base_method(method)
-    selected = list(select(items, stage, method=method, seed=seed))
+    selected = list(select(items, stage, method=method))
     if not selected:
         raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
     return selected

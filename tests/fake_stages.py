@@ -131,6 +131,7 @@ def report(
     progress: Progress,
     config: FakeConfig,
 ) -> None:
-    asked = {"name": recipe.name, "methods": recipe.methods, "command": command, "publish": publish}
+    asked: dict[str, object] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
+    asked |= {"command": command, "publish": publish}
     shutil.rmtree(root / "report", ignore_errors=True)
     _write(config, root / "report", progress, **asked)

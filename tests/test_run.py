@@ -2,6 +2,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -142,14 +143,26 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     [
         ({"stage": "trian"}, "unknown stage 'trian': did you mean 'train'?"),
         ({"stage": "train", "method": "astr"}, "the recipe has no method 'astr': did you mean 'astra'?"),
-        ({"stage": "train", "seed": 3}, "the recipe has no seed 3; its seeds: 0"),
+        ({"stage": "train", "seeds": [0, 3]}, "the recipe has no seed 3; its seeds: 0"),
         ({"stage": "collect", "device": "gpu"}, "expected a device such as cpu, cuda or cuda:1, got 'gpu'"),
     ],
 )
-def test_bad_arguments(recipe: Path, tmp_path: Path, arguments: dict[str, str], message: str) -> None:
+def test_bad_arguments(recipe: Path, tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        run_stage(recipe, root=tmp_path, **arguments)  # type: ignore[arg-type]
+        run_stage(recipe, root=tmp_path, **arguments)
     assert str(caught.value) == message
+
+
+def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text().replace("seeds = [0]", "seeds = [0, 1, 2]"))
+    folder = run(recipe, seeds=[2, 0], root=tmp_path, jobs=2)
+    assert sorted(path.name for path in (folder / "evaluate/astra").iterdir()) == ["seed_0", "seed_2"]
+    told = asked(folder / "report")
+    assert told["seeds"] == [2, 0]
+    assert told["command"] == f"astra-data run {recipe} --seed 2 --seed 0"
+    run_stage(recipe, "pair", seeds=[0], root=tmp_path)
+    with pytest.raises(MissingStageError, match="collect/seed_1 is missing"):
+        run_stage(recipe, "pair", root=tmp_path)
 
 
 def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) -> None:
