@@ -22,11 +22,24 @@ class Part(BaseModel):
 
 
 class Machine(Part):
-    """The machine that wrote the report."""
+    """A machine that something was made on."""
 
     cpu: str
     cores: int
     memory_gib: float
+    gpu: str | None = None
+    """Where the networks ran on one."""
+
+
+class Origin(Part):
+    """What some stages' artefacts say of their making; None or empty where they do not say."""
+
+    commit: str | None
+    """Of the code, ending in "-dirty" where it was changed since."""
+    machine: Machine | None
+    packages: dict[str, str | None]
+    stages: list[str]
+    """"report" for what is drawn and simulated by the report itself."""
 
 
 class Dataset(Part):
@@ -117,13 +130,10 @@ class Results(Part):
     task: str
     command: str
     """The command that produced these results."""
-    commit: str | None
-    dirty: bool | None
-    """Whether the checkout differed from `commit`."""
-    machine: Machine
+    origins: list[Origin]
+    """Normally one; more if code or machine changed on the way."""
     wall_seconds: dict[str, float]
     """By stage over all rows and seeds, and "total"; stages that record no time are left out."""
-    packages: dict[str, str]
     datasets: list[Dataset]
     evaluated_with: list[DatasetUse]
     seeds: list[int]
@@ -132,7 +142,7 @@ class Results(Part):
     methods: dict[str, MethodResults]
     probability_of_improvement: Improvement | None
     throughput: dict[str, dict[str, dict[str, list[float]]]]
-    """stage → figure → row, or grounding that rows share → one value per seed."""
+    """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
 
     def gaps(self) -> dict[str, GapMeans]:
         """Return each grounding's gap once, though rows share it."""

@@ -1,11 +1,11 @@
 """Results → Markdown: tables, figures and how to read them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
 from astra_data.figures import PLUS, method_title
-from astra_data.results.model import BandMeans, Results
+from astra_data.results.model import BandMeans, Origin, Results
 from astra_data.statistics import Summary
 
 HOW_TO_READ = {
@@ -72,14 +72,15 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 
 
 def _head(results: Results) -> str:
-    machine, total = results.machine, results.wall_seconds["total"]
+    stages = [origin for origin in results.origins if origin.machine and origin.stages != ["report"]]
+    machines = " and ".join(dict.fromkeys(_machine(origin) for origin in stages))
     seeds = ", ".join(str(seed) for seed in results.seeds)
     return (
         f"# {results.recipe}\n\n"
         f"Task `{results.task}`, seeds {seeds}, {results.episodes} episodes per row and seed. Produced by\n\n"
         f"```\n{results.command}\n```\n\n"
-        f"on {machine.cpu}, {machine.cores} cores, {machine.memory_gib:g} GiB of memory. "
-        f"Wall time of the stages, summed: {_duration(total)}."
+        f"on {machines or 'a machine that was not recorded'}. "
+        f"Wall time of the stages, summed: {_duration(results.wall_seconds['total'])}."
     )
 
 
@@ -177,7 +178,11 @@ def _cost(results: Results) -> str:
             time = "-" if seconds is None else _duration(seconds)
             lines.append(_line([stage, time, "; ".join(shown)]))
     lines.append(_line(["total", _duration(results.wall_seconds["total"]), ""]))
-    note = "Summed over rows and seeds; a dash where a stage recorded no time."
+    note = (
+        "Wall time: summed over rows and seeds, which run side by side; a dash where a stage recorded none. "
+        "Speed: of one item beside the others, averaged over seeds. Simulator steps/s: the world alone; PPO "
+        "steps/s: world and learning."
+    )
     return "## Cost\n\n" + "\n".join(lines) + f"\n\n{note}"
 
 
@@ -190,9 +195,11 @@ def _rates(rows: Mapping[str, list[float]]) -> str:
 
 
 def _origin(results: Results) -> str:
-    commit = "no commit" if results.commit is None else f"commit `{results.commit}`"
-    state = ", with uncommitted changes" if results.dirty else ""
-    lines = [f"- Code: {commit}{state}."]
+    lines = [
+        f"- Code: {_by_stage(results.origins, _commit)}.",
+        f"- Machine: {_by_stage(results.origins, _machine)}.",
+        f"- Versions: {_by_stage(results.origins, _versions)}.",
+    ]
     hashes_of: dict[tuple[str, str, str], list[str]] = {}
     for dataset in results.datasets:
         key = (dataset.stage, dataset.name, dataset.version)
@@ -205,8 +212,37 @@ def _origin(results: Results) -> str:
         hashes = ", ".join(dict.fromkeys(f"`{digest}`" for digest in use.hashes if digest is not None))
         named = f"{versions or 'no dataset'}{f' ({hashes})' if hashes else ''}"
         lines.append(f"- Dataset named by the evaluations of {rows}: {named}.")
-    packages = ", ".join(f"{name} {version}" for name, version in results.packages.items())
-    return "## Where this comes from\n\n" + "\n".join(lines) + f"\n- Versions: {packages}."
+    return "## Where this comes from\n\n" + "\n".join(lines)
+
+
+def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:
+    """Return what all origins say, or each text with the stages that it holds for."""
+    stages: dict[str, list[str]] = {}
+    for origin in origins:
+        stages.setdefault(text(origin), []).extend(origin.stages)
+    if len(stages) == 1:
+        return next(iter(stages))
+    return "; ".join(f"{said} ({', '.join(dict.fromkeys(of))})" for said, of in stages.items())
+
+
+def _commit(origin: Origin) -> str:
+    if origin.commit is None:
+        return "not recorded"
+    commit = origin.commit.removesuffix("-dirty")
+    return f"commit `{commit}`{' with uncommitted changes' if commit != origin.commit else ''}"
+
+
+def _machine(origin: Origin) -> str:
+    machine = origin.machine
+    if machine is None:
+        return "not recorded"
+    gpu = f", {machine.gpu}" if machine.gpu else ""
+    return f"{machine.cpu}, {machine.cores} cores, {machine.memory_gib:g} GiB of memory{gpu}"
+
+
+def _versions(origin: Origin) -> str:
+    known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
+    return ", ".join(known) or "not recorded"
 
 
 def _figure(name: str, figures: Mapping[str, str]) -> str:
@@ -238,7 +274,9 @@ def _ends(low: float | None, high: float | None) -> str:
 
 
 def _unit(figure: str) -> str:
-    return figure.removesuffix("_per_second").replace("_", " ") + "/s"
+    """Return "target steps/s" for "target_steps_per_second"; bare steps are PPO's."""
+    steps = figure.removesuffix("_per_second").replace("_", " ")
+    return f"{'PPO ' if steps == 'steps' else ''}{steps}/s"
 
 
 def _short(rate: float) -> str:

@@ -24,6 +24,7 @@ from astra_data.columns import (
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative
+from astra_data.results.provenance import machine
 from astra_data.seeding import derive, generator
 from astra_data.tasks import Task, task_named
 
@@ -49,8 +50,6 @@ def collect(task: str, config: CollectConfig, *, seed: int, out: Path, progress:
     """
     world = task_named(task)
     began = time.perf_counter()
-    columns, lengths = _record(world, config, seed, progress)
-    seconds = time.perf_counter() - began
     description = {
         "name": f"{task}-{config.behavior}",
         "stage": "collect",
@@ -66,6 +65,8 @@ def collect(task: str, config: CollectConfig, *, seed: int, out: Path, progress:
         description=description,
         subset_seed=derive(seed, "subset"),
     ) as writer:
+        columns, lengths = _record(world, config, seed, progress)
+        rate = float(lengths.sum() / (time.perf_counter() - began))
         for index, length in enumerate(lengths):
             values = {name: stacked[:length, index] for name, stacked in columns.items()}
             writer.add(
@@ -80,7 +81,9 @@ def collect(task: str, config: CollectConfig, *, seed: int, out: Path, progress:
                     },
                 )
             )
-    progress(1.0, f"{len(lengths)} episodes, {lengths.sum() / seconds:,.0f} target steps/s")
+        seconds = time.perf_counter() - began
+        writer.made = {"wall_seconds": seconds, "target_steps_per_second": rate, "machine": machine()}
+    progress(1.0, f"{len(lengths)} episodes, {rate:,.0f} target steps/s")
 
 
 def _record(

@@ -18,6 +18,7 @@ from astra_data.methods import method_named
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive, Share
+from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 
@@ -68,7 +69,7 @@ def ground(
     weights = method_named(method).loss_weights
     if weights is None:
         raise BadInputError(f"method '{method}' does not ground its simulator")
-    world = task_named(task)
+    world, made = task_named(task), origin(device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "grounding"))
@@ -97,7 +98,7 @@ def ground(
         progress(1.0, "gap report")
         gap = gap_report(world, model, held_out, seed=seed)
         save_grounding(folder / "grounding.safetensors", model, episodes)
-        (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
+        (folder / "metrics.json").write_text(json.dumps(made | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)

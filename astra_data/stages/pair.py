@@ -22,6 +22,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError
 from astra_data.progress import Progress
 from astra_data.recipe import Config, NotNegative
+from astra_data.results.provenance import machine
 from astra_data.tasks import Task, task_named
 
 
@@ -81,6 +82,8 @@ def pair(task: str, config: PairConfig, *, dataset: Path, out: Path, progress: P
             steps += len(episode)
             rate = steps / (time.perf_counter() - began)
             progress((index + 1) / len(source), f"{rate:,.0f} pairs/s")
+        seconds = time.perf_counter() - began
+        writer.made = {"wall_seconds": seconds, "pairs_per_second": steps / seconds, "machine": machine()}
 
 
 def pair_steps(

@@ -17,6 +17,7 @@ from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Count
+from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 from astra_data.training_world import WorldConfig, training_world, world_parts
@@ -53,7 +54,7 @@ def train(
     Raises:
         BadInputError: the method has no policy to train, or needs a grounding and got none.
     """
-    base, world = method_named(method), task_named(task)
+    base, world, made = method_named(method), task_named(task), origin(device)
     if not base.trains:
         raise BadInputError(f"method '{method}' has no policy to train")
     if base.grounds and grounding is None:
@@ -81,7 +82,7 @@ def train(
         PolicyFile(
             policy, parts.thinness, parts.scatter, switches, episodes.reference, episodes.content_hash
         ).save(folder / "policy.safetensors")
-        (folder / "curve.json").write_text(json.dumps(curve, indent=1))
+        (folder / "curve.json").write_text(json.dumps(made | curve, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
 

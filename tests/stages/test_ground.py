@@ -35,6 +35,7 @@ def test_the_artefact_is_complete(grounded: Path) -> None:
     assert {file.name for file in grounded.iterdir()} == files
     metrics = json.loads((grounded / "metrics.json").read_text())
     assert metrics["parameters"] > 1000
+    assert {"git_commit", "packages", "machine"} <= metrics.keys()
     (epoch,) = metrics["epochs"]
     heads = {
         "loss_latent",

@@ -41,6 +41,9 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
     before, after = Dataset.open(collected), Dataset.open(paired)
     assert after.description["parents"] == [before.identity]
     assert after.description["simulator"] == {"id": "point_mass", "timestep_s": 0.05, "radius_m": 0.1}
+    steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
+    assert steps == pytest.approx(after.lengths.sum())
+    assert after.description["machine"] == before.description["machine"]
     assert after.order == before.order
     assert after.metadata == before.metadata
     for one, other in zip(before.episodes(), after.episodes(), strict=True):

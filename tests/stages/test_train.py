@@ -45,6 +45,7 @@ def stop(fraction: float, note: str) -> None:
 def test_the_artefact_is_complete(trained: Path) -> None:
     assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
     curve = json.loads((trained / "curve.json").read_text())
+    assert {"git_commit", "packages", "machine"} <= curve.keys()
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     assert {"success", "return"} <= curve["points"][0].keys()
     policy = PolicyFile.load(trained / "policy.safetensors")
