@@ -24,7 +24,7 @@ class Curve:
 
     Attributes:
         steps: simulator steps so far, (K,), increasing.
-        success: success rate, (K,); NaN where no episode had ended.
+        success: share of the training episodes that ended in success, (K,); NaN where none had ended.
     """
 
     steps: Floats
@@ -70,7 +70,7 @@ def success_bars(
 
 
 def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
-    """Draw success in the training simulator over steps: mean over seeds, band from the worst to the best.
+    """Draw success of the training episodes over steps: mean over seeds, band from the worst to the best.
 
     Args:
         curves: each row's seeds, at least one.
@@ -88,7 +88,7 @@ def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
         axes.set_xlabel("simulator steps")
-        axes.set_ylabel("success rate in the simulator")
+        axes.set_ylabel("success of training episodes, from all starts")
         axes.xaxis.set_major_formatter(_steps_label)
         figure.legend(loc="outside right center", handlelength=2.4)
         return figure

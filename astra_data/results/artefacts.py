@@ -88,8 +88,7 @@ class Point(BaseModel):
 
     steps: float
     success: float | None
-    """None where no episode had ended."""
-    returns: float | None = Field(alias="return")
+    """Of the training episodes that ended; None where none had."""
 
 
 class CurveFile(Artefact):

@@ -166,7 +166,6 @@ def _row(
             Learning(
                 steps=[point.steps for point in curve.points],
                 success=[float("nan") if point.success is None else point.success for point in curve.points],
-                returns=[float("nan") if point.returns is None else point.returns for point in curve.points],
             )
             for curve in curves
         ],

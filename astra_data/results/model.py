@@ -65,9 +65,7 @@ class Learning(Part):
 
     steps: list[float]
     success: list[Number]
-    returns: list[Number] = Field(
-        validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
-    )
+    """Of the training episodes that ended, wherever in the task they began."""
 
 
 class BandMeans(Part):

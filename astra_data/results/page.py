@@ -16,18 +16,20 @@ HOW_TO_READ = {
     ),
     "trajectories": (
         "Orange, dashed: the policy in the simulator that it was trained in. Blue: the same policy in the "
-        "target. An episode that fails ends with a cross; the star is the goal. The closer blue follows "
-        "orange, the better the simulator was grounded. The number is the success rate over all episodes "
-        "and seeds."
+        "target. An episode that fails ends with a cross, one that succeeds at the star, its goal. Starts "
+        "and goals are drawn apart in the two worlds, so the lines are no pairs: compare the ways that they "
+        "take and where they end. The number is the success rate in the target over all episodes and seeds."
     ),
     "mismatch": (
         "The same commands in the ungrounded simulator (blue) and, repeatedly, in the target (orange: "
         "mean; bands: 25 to 75 % and 5 to 95 %). Where they part, the simulator lacks something."
     ),
     "learning": (
-        "Success in the simulator while the policy learns: mean over seeds, band from the worst seed to "
-        "the best. Episodes that start in the midst of a recorded one count as well. High here and low in "
-        "the table means that the policy learned what the target does not do."
+        "Share of the training episodes that reach the goal, in the simulator that the policy is trained in: "
+        "mean over seeds, band from the worst seed to the best. With `data_start_share` in the recipe that "
+        "share of the episodes starts in the midst of a recorded trajectory, often nearer to the goal, so "
+        "these figures are no success rates of the task; those are in the table. High here and low there "
+        "means that the policy learned what the target does not do."
     ),
     "gap": (
         "The simulator is given the target's actions from a target state on; the error is its distance "

@@ -1,8 +1,10 @@
 """Train: optimise a policy by PPO in the raw or grounded simulator (Algorithm 2)."""
 
 import json
+import math
 import time
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -90,7 +92,7 @@ def train(
 def _optimise(
     ppo: Ppo, env: NavigationWorld, ramp: float, folder: Path, device: str, progress: Progress
 ) -> dict[str, Any]:
-    points: list[dict[str, float]] = []
+    points: list[dict[str, float | None]] = []
     seconds = 0.0
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
@@ -103,11 +105,14 @@ def _optimise(
     while not ppo.done:
         env.caution = min(1.0, ppo.steps / (ppo.config.total_steps * ramp)) if ramp else 1.0
         metrics = ppo.iterate()
-        points.append({"steps": ppo.steps, **metrics})
+        # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
+        known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
+        points.append({"steps": ppo.steps, **known})
         seconds = time.perf_counter() - began
         rate = ppo.steps / seconds
-        recent = [point["success"] for point in points[-10:]]
-        note = f"{rate:,.0f} steps/s  success in simulation {sum(recent) / len(recent):.2f}"
+        recent = [point["success"] for point in points[-10:] if point["success"] is not None]
+        success = f"{fmean(recent):.2f}" if recent else "unknown yet"
+        note = f"{rate:,.0f} steps/s  success of training episodes {success}"
         progress(ppo.steps / ppo.config.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0:
             state = {"ppo": ppo.state_dict(), "world": ppo.env.state_dict()}

@@ -152,9 +152,9 @@ def write_runs(parent: Path) -> Path:
             write_evaluation(root, method, seed)
             if method != "follower":
                 points = [
-                    {"steps": 0, "success": None, "return": 0.0, "entropy": 1.0},
-                    {"steps": 1000, "success": 0.5, "return": 1.0, "entropy": 0.5},
-                    {"steps": 2000, "success": 0.75, "return": 2.0, "entropy": 0.2},
+                    {"steps": 0, "success": None, "entropy": 1.0},
+                    {"steps": 1000, "success": 0.5, "entropy": 0.5},
+                    {"steps": 2000, "success": 0.75, "entropy": 0.2},
                 ]
                 write_json(
                     root / f"train/{method}/seed_{seed}/curve.json",
@@ -216,7 +216,7 @@ def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN
         "simulated_success",
     }
     assert set(row["summary"]["success"]) == {"mean", "std", "iqm", "low", "high"}
-    learning = {"steps": [0.0, 1000.0, 2000.0], "success": [None, 0.5, 0.75], "return": [0.0, 1.0, 2.0]}
+    learning = {"steps": [0.0, 1000.0, 2000.0], "success": [None, 0.5, 0.75]}
     assert row["learning"] == [learning] * 3
 
 
