@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from astra_data.errors import BadInputError
-from astra_data.figures import ROLES, method_title
+from astra_data.figures import PLUS, ROLES, method_title
 from astra_data.results.artefacts import (
     EVALUATION,
     TRAJECTORIES,
@@ -22,7 +22,6 @@ from astra_data.results.model import (
     Dataset,
     DatasetUse,
     GapMeans,
-    Improvement,
     Learning,
     MethodResults,
     Origin,
@@ -30,7 +29,7 @@ from astra_data.results.model import (
 )
 from astra_data.results.provenance import origin
 from astra_data.results.runs import Runs
-from astra_data.statistics import probability_of_improvement, summarise
+from astra_data.statistics import Comparison, probability_of_improvement, summarise
 
 THROUGHPUT = {
     "collect": ("target_steps_per_second",),
@@ -240,18 +239,15 @@ def _evaluated_with(evaluations: dict[str, list[Evaluation]]) -> list[DatasetUse
     ]
 
 
-def _improvement(rows: dict[str, MethodResults], replicates: int) -> Improvement | None:
-    ours = [method for method in rows if method.startswith("astra")]
-    if not ours:
-        return None
-    success = {method: rows[method].summary["success"] for method in ours}
-    best = max(ours, key=lambda method: (success[method].iqm, success[method].mean))
-    scores = np.array(rows[best].success)
-    return Improvement(
-        best=best,
-        over={
-            method: probability_of_improvement(scores, np.array(row.success), replicates=replicates)
-            for method, row in rows.items()
-            if method != best
-        },
-    )
+def _improvement(rows: dict[str, MethodResults], replicates: int) -> dict[str, dict[str, Comparison]]:
+    """Compare ASTRA with every other row that is trained as it is, with the [plus] settings or without."""
+    success = {method: np.array(row.success) for method, row in rows.items() if row.role != "ceiling"}
+    return {
+        ours: {
+            other: probability_of_improvement(success[ours], scores, replicates=replicates)
+            for other, scores in success.items()
+            if other != ours and other.endswith(PLUS) == ours.endswith(PLUS)
+        }
+        for ours in ("astra", f"astra{PLUS}")
+        if ours in success
+    }

@@ -113,13 +113,6 @@ class MethodResults(Part):
     """Empty for a row that is not trained."""
 
 
-class Improvement(Part):
-    """How likely a seed of the best ASTRA row beats a seed of another row."""
-
-    best: str
-    over: dict[str, Comparison]
-
-
 class Results(Part):
     """All that the page and the figures show."""
 
@@ -138,7 +131,8 @@ class Results(Part):
     episodes: int
     """Per row and seed."""
     methods: dict[str, MethodResults]
-    probability_of_improvement: Improvement | None
+    probability_of_improvement: dict[str, dict[str, Comparison]]
+    """ASTRA's row → another that is trained alike → how likely a seed of the one beats one of the other."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
     """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
 

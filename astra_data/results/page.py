@@ -118,16 +118,20 @@ def _table(results: Results) -> str:
 
 
 def _comparison(results: Results) -> str:
-    improvement = results.probability_of_improvement
-    if improvement is None or not improvement.over:
+    rows = results.methods
+    lines = [
+        _line([rows[ours].title, rows[other].title, f"{found.probability:.2f}{_ends(found.low, found.high)}"])
+        for ours, over in results.probability_of_improvement.items()
+        for other, found in over.items()
+    ]
+    if not lines:
         return ""
-    title = results.methods[improvement.best].title
-    lines = [_line([f"{title} beats", "probability [95 %]"]), _line(["---", "---:"])]
-    for method, comparison in improvement.over.items():
-        ends = _ends(comparison.low, comparison.high)
-        lines.append(_line([results.methods[method].title, f"{comparison.probability:.2f}{ends}"]))
-    note = "How likely a seed of the one has a higher success rate than a seed of the other; ties count half."
-    return "## Probability of improvement\n\n" + "\n".join(lines) + f"\n\n{note}"
+    head = [_line(["row", "beats", "probability [95 %]"]), _line(["---", "---", "---:"])]
+    note = (
+        "How likely a seed of the one has a higher success rate than a seed of the other; ties count half. "
+        "Only rows that are trained alike are compared: all with the `[plus]` settings, or all without."
+    )
+    return "## Probability of improvement\n\n" + "\n".join(head + lines) + f"\n\n{note}"
 
 
 def _encoders(results: Results) -> str:
