@@ -21,15 +21,15 @@ HOW_TO_READ = {
         "take and where they end. The number is the success rate in the target over all episodes and seeds."
     ),
     "mismatch": (
-        "The same commands in the ungrounded simulator (blue) and, repeatedly, in the target (orange: "
+        "The same commands in the ungrounded simulator (orange) and, repeatedly, in the target (blue: "
         "mean; bands: 25 to 75 % and 5 to 95 %). Where they part, the simulator lacks something."
     ),
     "learning": (
         "Share of the training episodes that reach the goal, in the simulator that the policy is trained in: "
-        "mean over seeds, band from the worst seed to the best. With `data_start_share` in the recipe that "
-        "share of the episodes starts in the midst of a recorded trajectory, often nearer to the goal, so "
-        "these figures are no success rates of the task; those are in the table. High here and low there "
-        "means that the policy learned what the target does not do."
+        "mean over seeds, band from the worst seed to the best; plus rows have a panel of their own. With "
+        "`data_start_share` in the recipe that share of the episodes starts in the midst of a recorded "
+        "trajectory, often nearer to the goal, so these figures are no success rates of the task; those are "
+        "in the table. High here and low there means that the policy learned what the target does not do."
     ),
     "gap": (
         "The simulator is given the target's actions from a target state on; the error is its distance "
