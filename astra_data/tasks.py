@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 from astra_data.abstraction import ant_to_point_mass
 from astra_data.ant import TIMESTEP_S
-from astra_data.columns import ACTION, GOAL, NEXT_STATE, STATE, Column
+from astra_data.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
@@ -24,7 +24,7 @@ class Task:
         navigation: maze, horizon, reward and success.
         abstraction: φ, target states (..., S) to abstract states (..., X).
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
-        abstract_names: of the abstract state's entries.
+        abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
     """
 
@@ -33,7 +33,7 @@ class Task:
     navigation: Navigation
     abstraction: Callable[[Any], Any]
     state_columns: tuple[Column, ...]
-    abstract_names: tuple[str, ...]
+    abstract_state: Column
     timestep_s: float
 
     @property
@@ -84,6 +84,19 @@ _ANT_COLUMNS = (
 )
 
 
+_POINT_MASS = Column(
+    ABSTRACT_STATE,
+    size=4,
+    meaning="abstract state of the target before the action",
+    **_roles(
+        ("x", "y", "vx", "vy"),
+        ["m"] * 2 + ["m/s"] * 2,
+        ["world"] * 4,
+        ["position"] * 2 + ["vector"] * 2,
+    ),
+)
+
+
 def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
     return Task(
         name=name if reward == "geodesic" else f"{name}-{reward}",
@@ -91,7 +104,7 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         navigation=Navigation(maze, horizon, reward),
         abstraction=ant_to_point_mass,
         state_columns=_ANT_COLUMNS,
-        abstract_names=("x", "y", "vx", "vy"),
+        abstract_state=_POINT_MASS,
         timestep_s=TIMESTEP_S,
     )
 

@@ -120,7 +120,8 @@ def training_world(
     inner = task.simulator(num_envs, device)
     simulator: Simulator = inner
     if model is not None:
-        simulator = GroundedSimulator(inner, model, inner.free, scatter=parts.scatter)
+        scatter = parts.scatter if config.residual_noise else None
+        simulator = GroundedSimulator(inner, model, inner.free, scatter=scatter)
     elif config.residual_noise:
         simulator = RandomizedSimulator(inner, inner.free, parts.scatter)
     return NavigationWorld(

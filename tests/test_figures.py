@@ -81,6 +81,7 @@ def test_success_bars_show_bars_seeds_and_intervals() -> None:
     dots = [line for line in axes.lines if line.get_marker() == "o"]
     assert [sorted(np.asarray(line.get_ydata())) for line in dots] == [[0.2, 0.3, 0.4], [0.8], [1.0]]
     assert sum(line.get_marker() == "D" for line in axes.lines) == 2
+    assert not any(line.get_clip_on() for line in axes.lines if line.get_marker() in ("o", "D"))
     assert sum(line.get_marker() == "None" for line in axes.lines) == 1  # one interval
     labels = [label.get_text() for label in axes.get_xticklabels()]
     assert labels == ["NAS", "ASTRA+", "Careful\nfollower\n(ceiling)"]
@@ -97,10 +98,10 @@ def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
         "astra_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
     }
     figure = learning_curves(curves)
-    axes = figure.axes[0]
+    plain, plus = figure.axes
     assert legend(figure) == ["NAS", "ASTRA+"]
-    assert len(axes.collections) == 1  # a band needs two seeds
-    nas, astra = axes.lines
+    assert (len(plain.collections), len(plus.collections)) == (1, 0)  # a band needs two seeds
+    (nas,), (astra,) = plain.lines, plus.lines
     assert (nas.get_linestyle(), astra.get_linestyle()) == ("-", "--")
     steps, success = np.asarray(nas.get_xdata()), np.asarray(nas.get_ydata())
     assert (steps[0], steps[-1]) == (50.0, 100.0)
@@ -131,13 +132,15 @@ def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:
     figure = dynamics_mismatch(time_s, np.zeros((5, 2)), simulated, target)
     x, y, speed, command = figure.axes
     labels = [axes.get_ylabel() for axes in (x, y, speed, command)]
-    assert labels == ["x (m)", "y (m)", "speed (m/s)", "command"]
+    assert labels == ["x (m)", "y (m)", "speed (m/s)", "command (m/s)"]
     for axes in (x, y, speed):
         assert len(axes.collections) == 2
         assert len(axes.lines) == 2
+    # A command holds during the step that ends at its time.
+    assert [line.get_drawstyle() for line in command.lines] == ["steps-pre"] * 2
     mean, one = x.lines
     assert np.asarray(mean.get_ydata()).tolist() == [1.5, 1.5, 1.5, 1.5, 1.0]
-    assert to_hex(str(one.get_color())) == DEPLOYED.lower()
+    assert [to_hex(str(line.get_color())) for line in (mean, one)] == [DEPLOYED.lower(), SIMULATED.lower()]
     assert np.asarray(speed.lines[1].get_ydata()).tolist() == [5.0] * 5
 
 

@@ -18,7 +18,7 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     assert sizes[2] == env.action_size
     abstract = task.abstraction(env.state)
     simulator = task.simulator(2)
-    assert abstract.shape == simulator.state.shape == (2, len(task.abstract_names))
+    assert abstract.shape == simulator.state.shape == (2, task.abstract_state.size)
     assert simulator.timestep_s == task.timestep_s
     assert not simulator.free.blocked[simulator.free.cells(abstract[:, :2])].any()
 

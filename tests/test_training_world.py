@@ -55,6 +55,9 @@ def test_without_switches_it_is_the_plain_simulator(episodes: PairedEpisodes, mo
         assert type(world.simulator) is kind
         assert world.reward == METHODS[name].reward
         assert world.num_envs == 4
+        drawn = torch.get_rng_state()
+        world.step(torch.zeros(4, 2))
+        assert torch.equal(torch.get_rng_state(), drawn)
 
 
 def test_scatter_is_what_the_simulator_does_not_explain(

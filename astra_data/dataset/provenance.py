@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+import platform
 import re
 import subprocess
 from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,16 @@ from typing import Any
 from astra_data.columns import Array
 from astra_data.errors import BadInputError
 
-PACKAGES = ("astra-data", "gymnasium-robotics", "lerobot", "mujoco")
+ROOT = Path(__file__).parents[2]
+CODE = ("astra_data", "pyproject.toml", "uv.lock")
+"""What makes a checkout differ from its commit; notes and recipes do not."""
+
+PACKAGES = (
+    *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
+    *("numpy", "rliable", "scipy", "torch", "torchrl"),
+)
+"""Packages whose versions can move a result."""
+
 _DEFAULTS: dict[str, Any] = {
     "name": None,
     "version": "1.0.0",
@@ -52,27 +63,38 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
         faults.append(f"expected plain JSON ({error})")
     if faults:
         raise BadInputError(f"Dataset description: {'; '.join(faults)}.")
-    return full | {"packages": {name: _version(name) for name in PACKAGES}, "git_commit": _git_commit()}
+    return full | {"packages": package_versions(), "git_commit": git_commit()}
 
 
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of `PACKAGES`, where installed."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+@cache
+def git_commit() -> str | None:
+    """Return the commit of the checkout that this process runs from, with "-dirty" if its code was changed.
+
+    Asked once: what is committed later is not what this process loaded.
+    """
+    if not (ROOT / ".git").exists():
         return None
-
-
-def _git_commit() -> str | None:
-    """Return the commit of the checkout that this code runs from, with "-dirty" if it was changed since."""
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():
-        return None
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        head = _git("rev-parse", "--verify", "HEAD")
+        return f"{head}-dirty" if _git("status", "--porcelain", "--", *CODE) else head
     except (OSError, subprocess.CalledProcessError):
         return None
-    return done.stdout.strip()
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(ROOT), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 class ContentHash:

@@ -32,6 +32,10 @@ class DatasetWriter:
             writer.add(episode)
 
     Leaving the block validates and commits; an exception or a kill at any moment leaves `root` absent.
+
+    Attributes:
+        made: how the dataset was made, such as how long it took, for meta/astra/dataset.json beside the
+            description; to be filled in before leaving the block.
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class DatasetWriter:
         self._fps = fps
         self._task = task
         self._description = complete_description(description)
+        self.made: dict[str, Any] = {}
         self._subset_seed = subset_seed
         self._hash = ContentHash()
         self._frames = 0
@@ -154,7 +159,8 @@ class DatasetWriter:
         self._write_json(layout.INFO_PATH, info)
         self._write_json(layout.STATS_PATH, global_statistics(self._stored, self._frames, self._blocks))
         self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
-        self._write_json(layout.DATASET_PATH, self._description | {"content_hash": self._hash.hexdigest()})
+        contents = {"content_hash": self._hash.hexdigest()}
+        self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
         metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}
         for key, kind_ in sorted(self._metadata_types.items()):

@@ -82,8 +82,8 @@ def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target
     """Draw what the same commands do in the simulator and in the target, over time.
 
     Args:
-        time_s: (T,).
-        command: the commands given, (T, 2).
+        time_s: at the end of each step, (T,).
+        command: the velocities commanded in m/s, (T, 2).
         simulated: x, y, vx, vy in m and m/s, (T, 4).
         target: the same for each repetition in the target, (N, T, 4); NaN after an episode's end.
     """
@@ -98,24 +98,24 @@ def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target
         ):
             for low, high, alpha in ((5, 95, 0.18), (25, 75, 0.32)):
                 band = np.nanpercentile(many[:, alive], [low, high], axis=0)
-                axes.fill_between(time_s[alive], *band, color=SIMULATED, alpha=alpha, lw=0)
-            axes.plot(time_s[alive], np.nanmean(many[:, alive], axis=0), color=SIMULATED)
-            axes.plot(time_s, one, color=DEPLOYED)
+                axes.fill_between(time_s[alive], *band, color=DEPLOYED, alpha=alpha, lw=0)
+            axes.plot(time_s[alive], np.nanmean(many[:, alive], axis=0), color=DEPLOYED)
+            axes.plot(time_s, one, color=SIMULATED)
             axes.set_ylabel(label)
         for part, dashes in ((0, "-"), (1, ":")):
-            grid[1, 1].step(time_s, command[:, part], dashes, where="post", color=INK, lw=1.2)
-        grid[1, 1].set_ylabel("command")
+            grid[1, 1].step(time_s, command[:, part], dashes, where="pre", color=INK, lw=1.2)
+        grid[1, 1].set_ylabel("command (m/s)")
         figure.align_ylabels(grid)
         for axes in grid[1]:
             axes.set_xlabel("time (s)")
-            axes.set_xlim(time_s[0], time_s[-1])
+            axes.set_xlim(0, time_s[-1])
         handles = [
-            Line2D([], [], color=DEPLOYED, label="simulator"),
-            Line2D([], [], color=SIMULATED, label="target, mean"),
-            Patch(fc=SIMULATED, alpha=0.5, label="25 to 75 %"),
-            Patch(fc=SIMULATED, alpha=0.18, label="5 to 95 %"),
-            Line2D([], [], color=INK, lw=1.2, label="command 1"),
-            Line2D([], [], color=INK, lw=1.2, ls=":", label="command 2"),
+            Line2D([], [], color=SIMULATED, label="simulator"),
+            Line2D([], [], color=DEPLOYED, label="target, mean"),
+            Patch(fc=DEPLOYED, alpha=0.44, label="25 to 75 %"),
+            Patch(fc=DEPLOYED, alpha=0.18, label="5 to 95 %"),
+            Line2D([], [], color=INK, lw=1.2, label="command, x"),
+            Line2D([], [], color=INK, lw=1.2, ls=":", label="command, y"),
         ]
         figure.legend(
             handles=handles, loc="outside upper center", ncols=6, columnspacing=1.2, handlelength=1.6

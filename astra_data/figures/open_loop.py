@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from astra_data.figures.style import INK, method_colour, method_title, style
@@ -58,8 +58,10 @@ def open_loop_error(gaps: Mapping[str, OpenLoop]) -> Figure:
             horizons = np.unique(np.concatenate([gap.horizons for gap in gaps.values()]))
             axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=_label(quantity))
             axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
-            axes.xaxis.set_minor_locator(NullLocator())
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_minor_locator(NullLocator())
         handles, labels = grid[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside right center", handlelength=2.4)
         return figure

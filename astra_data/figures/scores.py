@@ -25,7 +25,7 @@ class Curve:
 
     Attributes:
         steps: simulator steps so far, (K,), increasing.
-        success: success rate, (K,); NaN where no episode had ended.
+        success: share of the training episodes that ended in success, (K,); NaN where none had ended.
     """
 
     steps: Floats
@@ -50,7 +50,8 @@ def success_bars(
         for place, (method, seeds) in enumerate(scores.items()):
             _bar(axes, place, method, seeds, intervals[method])
             if method in simulated:
-                axes.plot(place, simulated[method], "D", mfc="white", mec=INK, mew=1.1, ms=5, zorder=5)
+                (diamond,) = axes.plot(place, simulated[method], "D", mfc="white", mec=INK, ms=5, zorder=5)
+                diamond.set_clip_on(False)
         axes.set_xticks(range(len(scores)), [_tick_label(method) for method in scores])
         axes.tick_params(axis="x", length=0, pad=19)
         axes.set_xlim(-0.6, len(scores) - 0.4)
@@ -71,26 +72,31 @@ def success_bars(
 
 
 def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
-    """Draw success in the training simulator over steps: mean over seeds, band from the worst to the best.
+    """Draw success of the training episodes over steps: mean over seeds, band from the worst to the best.
+
+    Rows with the [plus] settings have a panel of their own.
 
     Args:
         curves: each row's seeds, at least one.
     """
     with style():
-        figure = Figure(figsize=(6.6, 3.7), layout="constrained")
-        axes = figure.add_subplot()
+        panels = sorted({is_plus(method) for method in curves})
+        figure = Figure(figsize=(2.2 + 3.6 * len(panels), 3.7), layout="constrained")
+        grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         for method, seeds in curves.items():
+            axes = grid[panels.index(is_plus(method))]
             steps, success = _on_one_grid(seeds)
             colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
             if len(seeds) > 1:
                 low, high = success.min(axis=0), success.max(axis=0)
                 axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
             axes.plot(steps, success.mean(axis=0), dashes, color=colour, label=method_title(method))
-        axes.set_ylim(-0.02, 1.02)
-        axes.set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
-        axes.set_xlabel("simulator steps")
-        axes.set_ylabel("success rate in the simulator")
-        axes.xaxis.set_major_formatter(_steps_label)
+        for axes in grid:
+            axes.set_ylim(-0.02, 1.02)
+            axes.set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
+            axes.set_xlabel("simulator steps")
+            axes.xaxis.set_major_formatter(_steps_label)
+        grid[0].set_ylabel("success of training episodes, from all starts")
         figure.legend(loc="outside right center", handlelength=2.4)
         return figure
 
@@ -104,7 +110,9 @@ def _bar(axes: Axes, place: int, method: str, seeds: Floats, interval: tuple[flo
     if np.isfinite(low):
         axes.plot([place, place], [low, high], color=INK, lw=1.6, zorder=3)
     spread = np.linspace(-0.2, 0.2, len(seeds)) if len(seeds) > 1 else np.zeros(1)
-    axes.plot(place + spread, seeds, "o", mfc="white", mec=INK, mew=0.9, ms=4.5, zorder=4)
+    # Not clipped: the axis would cut what lies on 0 in half.
+    (dots,) = axes.plot(place + spread, seeds, "o", mfc="white", mec=INK, mew=0.9, ms=4.5, zorder=4)
+    dots.set_clip_on(False)
     # Under the axis, where neither dots nor diamonds can cover the number.
     axes.annotate(
         f"{iqm:.2f}",

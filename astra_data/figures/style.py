@@ -43,10 +43,10 @@ ROLES = {"direct_transfer": "floor", "follower": "ceiling"}
 """Rows that bound the others: no grounding at all; a controller that never was in a simulator."""
 
 SIMULATED = "#E07B00"
-"""The simulator that a policy was trained in (the paper's Fig. 3)."""
+"""A simulator, in every figure (as in the paper's Fig. 3)."""
 
 DEPLOYED = "#0060A8"
-"""The target environment (the paper's Fig. 3)."""
+"""The target environment, likewise."""
 
 INK = "#2B2B2B"
 FAINT = "#8A8A8A"

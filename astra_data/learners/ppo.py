@@ -6,6 +6,7 @@ seeds torch from (seed, iteration): a run that resumes from a checkpoint repeats
 would have done.
 """
 
+import math
 import time
 from typing import Any
 
@@ -94,7 +95,12 @@ class Ppo:
         return self.steps >= self.config.total_steps
 
     def iterate(self) -> dict[str, float]:
-        """Collect one stretch and learn from it; return the success rate and return of finished episodes."""
+        """Collect one stretch and learn from it.
+
+        Returns:
+            "success" of the "episodes" that ended, wherever in the task they began, NaN where none did; the
+            mean "reward" of a step; the mean "std" of the actions.
+        """
         torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
         share_left = 1.0 - self.steps / self.config.total_steps
         for group in self._optimizer.param_groups:
@@ -110,7 +116,7 @@ class Ppo:
     def _collect(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         env, policy = self.env, self.policy
         columns: dict[str, list[Tensor]] = {}
-        finished = succeeded = returned = 0.0
+        finished = succeeded = rewarded = 0.0
         first_hidden = self._hidden.clone()
         for _ in range(self.config.rollout_steps):
             row = {
@@ -146,7 +152,7 @@ class Ppo:
                 columns.setdefault(name, []).append(values)
             finished += float(done.sum())
             succeeded += float(step.success.sum())
-            returned += float(step.reward.sum())
+            rewarded += float(step.reward.mean())
             self._age = torch.where(done, 0, self._age)
             self._observation = env.reset(done) if bool(done.any()) else step.observation
             self._previous_action = executed * (~done).unsqueeze(-1)
@@ -166,8 +172,11 @@ class Ppo:
             ),
         )
         rollout |= {"advantage": advantage, "value_target": target, "hidden": first_hidden}
-        count = max(finished, 1.0)
-        return rollout, {"success": succeeded / count, "return": returned / count, "episodes": finished}
+        return rollout, {
+            "success": succeeded / finished if finished else math.nan,
+            "episodes": finished,
+            "reward": rewarded / self.config.rollout_steps,
+        }
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
         config, policy = self.config, self.policy

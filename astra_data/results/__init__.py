@@ -5,5 +5,5 @@ runs          find those files for all rows and seeds
 model         Results: what results.json holds
 assembly      artefacts → Results
 page          Results → Markdown
-provenance    commit, machine and package versions
+provenance    commit, machine and package versions, for every stage to record
 """

@@ -10,18 +10,23 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from astra_data.errors import BadInputError
+from astra_data.results.model import Machine
 
 EVALUATION = "evaluation.json"
 TRAJECTORIES = "trajectories.safetensors"
 
 
 class Artefact(BaseModel):
-    """A file that a stage wrote, with the seconds that the stage took where it says so."""
+    """A file that a stage wrote, with how it was made where it says so."""
 
     model_config = ConfigDict(frozen=True)
 
     wall_seconds: float | None = None
     """How long the stage ran, in s."""
+    git_commit: str | None = None
+    """Of the code, ending in "-dirty" where it was changed since."""
+    packages: dict[str, str | None] = Field(default_factory=dict)
+    machine: Machine | None = None
 
 
 class Outcomes(BaseModel):
@@ -83,14 +88,14 @@ class Point(BaseModel):
 
     steps: float
     success: float | None
-    """None where no episode had ended."""
-    returns: float | None = Field(alias="return")
+    """Of the training episodes that ended; None where none had."""
 
 
 class CurveFile(Artefact):
     """curve.json of one row and seed."""
 
     steps_per_second: float | None = None
+    simulator_steps_per_second: float | None = None
     points: list[Point] = Field(min_length=1)
 
 
@@ -135,6 +140,8 @@ class DatasetFile(Artefact):
     name: str
     version: str
     content_hash: str
+    target_steps_per_second: float | None = None
+    pairs_per_second: float | None = None
 
 
 def read_json[T: Artefact](model: type[T], path: Path) -> T:

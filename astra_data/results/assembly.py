@@ -1,11 +1,10 @@
 """Artefacts of all rows and seeds → Results."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from astra_data.cores import cores
 from astra_data.errors import BadInputError
 from astra_data.figures import ROLES, method_title
 from astra_data.results.artefacts import (
@@ -23,23 +22,25 @@ from astra_data.results.model import (
     Dataset,
     DatasetUse,
     GapMeans,
-    Improvement,
     Learning,
-    Machine,
     MethodResults,
+    Origin,
     Results,
 )
-from astra_data.results.provenance import commit, cpu_name, memory_gib, package_versions
+from astra_data.results.provenance import origin
 from astra_data.results.runs import Runs
-from astra_data.statistics import probability_of_improvement, summarise
+from astra_data.rows import PLUS, is_plus
+from astra_data.statistics import Comparison, probability_of_improvement, summarise
 
 THROUGHPUT = {
-    "ground": "windows_per_second",
-    "train": "steps_per_second",
-    "align": "windows_per_second",
-    "evaluate": "target_steps_per_second",
+    "collect": ("target_steps_per_second",),
+    "pair": ("pairs_per_second",),
+    "ground": ("windows_per_second",),
+    "train": ("simulator_steps_per_second", "steps_per_second"),
+    "align": ("windows_per_second",),
+    "evaluate": ("target_steps_per_second",),
 }
-"""The figure in which each stage gives its speed."""
+"""The figures in which each stage gives its speed."""
 
 
 def assemble(
@@ -78,42 +79,33 @@ def assemble(
         )
         for method in methods
     }
-    timed: dict[str, list[Artefact]] = {
-        "collect": [*datasets["collect"].values()],
-        "pair": [*datasets["pair"].values()],
-        "ground": [file for files in metrics.values() for file in files],
-        "train": [file for files in curves.values() for file in files],
-        "align": [file for files in alignments.values() for file in files],
-        "evaluate": [file for files in evaluations.values() for file in files],
+    files: dict[str, Mapping[str, Sequence[Artefact]]] = {
+        "collect": {"all": list(datasets["collect"].values())},
+        "pair": {"all": list(datasets["pair"].values())},
+        "ground": metrics,
+        "train": curves,
+        "align": alignments,
+        "evaluate": evaluations,
     }
-    head, dirty = commit()
     return Results(
         recipe=recipe,
         task=task,
         command=command,
-        commit=head,
-        dirty=dirty,
-        machine=Machine(cpu=cpu_name(), cores=cores(), memory_gib=memory_gib()),
-        wall_seconds=_wall_seconds(timed),
-        packages=package_versions(),
+        origins=_origins(files | {"report": {"all": [Artefact.model_validate(origin())]}}),
+        wall_seconds=_wall_seconds(files),
         datasets=[
             Dataset(
                 stage=stage, seed=seed, name=file.name, version=file.version, content_hash=file.content_hash
             )
-            for stage, files in datasets.items()
-            for seed, file in files.items()
+            for stage, of_seeds in datasets.items()
+            for seed, file in of_seeds.items()
         ],
         evaluated_with=_evaluated_with(evaluations),
         seeds=list(seeds),
         episodes=episodes,
         methods=rows,
         probability_of_improvement=_improvement(rows, replicates),
-        throughput={
-            "ground": _throughput("ground", metrics),
-            "train": _throughput("train", curves),
-            "align": _throughput("align", alignments),
-            "evaluate": _throughput("evaluate", evaluations),
-        },
+        throughput={stage: _throughput(stage, rows_files) for stage, rows_files in files.items()},
     )
 
 
@@ -174,7 +166,6 @@ def _row(
             Learning(
                 steps=[point.steps for point in curve.points],
                 success=[float("nan") if point.success is None else point.success for point in curve.points],
-                returns=[float("nan") if point.returns is None else point.returns for point in curve.points],
             )
             for curve in curves
         ],
@@ -209,19 +200,32 @@ def _gap_means(gaps: Sequence[Gap]) -> GapMeans:
     )
 
 
-def _wall_seconds(timed: dict[str, list[Artefact]]) -> dict[str, float]:
-    seconds = {
-        stage: sum(file.wall_seconds for file in files if file.wall_seconds is not None)
-        for stage, files in timed.items()
-        if any(file.wall_seconds is not None for file in files)
+def _origins(files: Mapping[str, Mapping[str, Sequence[Artefact]]]) -> list[Origin]:
+    origins: dict[str, Origin] = {}
+    for stage, rows in files.items():
+        for file in (file for row in rows.values() for file in row):
+            found = Origin(commit=file.git_commit, machine=file.machine, packages=file.packages, stages=[])
+            stages = origins.setdefault(found.model_dump_json(), found).stages
+            if stage not in stages:
+                stages.append(stage)
+    return list(origins.values())
+
+
+def _wall_seconds(files: Mapping[str, Mapping[str, Sequence[Artefact]]]) -> dict[str, float]:
+    recorded = {
+        stage: [file.wall_seconds for row in rows.values() for file in row if file.wall_seconds is not None]
+        for stage, rows in files.items()
     }
+    seconds = {stage: sum(times) for stage, times in recorded.items() if times}
     return seconds | {"total": sum(seconds.values())}
 
 
-def _throughput[T: Artefact](stage: str, files: dict[str, list[T]]) -> dict[str, dict[str, list[float]]]:
-    figure = THROUGHPUT[stage]
-    speeds = {method: [getattr(file, figure) for file in row] for method, row in files.items()}
-    return {figure: {method: row for method, row in speeds.items() if None not in row}}
+def _throughput(stage: str, files: Mapping[str, Sequence[Artefact]]) -> dict[str, dict[str, list[float]]]:
+    figures = {}
+    for figure in THROUGHPUT[stage]:
+        speeds = {method: [getattr(file, figure) for file in row] for method, row in files.items()}
+        figures[figure] = {method: row for method, row in speeds.items() if row and None not in row}
+    return figures
 
 
 def _evaluated_with(evaluations: dict[str, list[Evaluation]]) -> list[DatasetUse]:
@@ -236,18 +240,15 @@ def _evaluated_with(evaluations: dict[str, list[Evaluation]]) -> list[DatasetUse
     ]
 
 
-def _improvement(rows: dict[str, MethodResults], replicates: int) -> Improvement | None:
-    ours = [method for method in rows if method.startswith("astra")]
-    if not ours:
-        return None
-    success = {method: rows[method].summary["success"] for method in ours}
-    best = max(ours, key=lambda method: (success[method].iqm, success[method].mean))
-    scores = np.array(rows[best].success)
-    return Improvement(
-        best=best,
-        over={
-            method: probability_of_improvement(scores, np.array(row.success), replicates=replicates)
-            for method, row in rows.items()
-            if method != best
-        },
-    )
+def _improvement(rows: dict[str, MethodResults], replicates: int) -> dict[str, dict[str, Comparison]]:
+    """Compare ASTRA with every other row that is trained as it is, with the [plus] settings or without."""
+    success = {method: np.array(row.success) for method, row in rows.items() if row.role != "ceiling"}
+    return {
+        ours: {
+            other: probability_of_improvement(success[ours], scores, replicates=replicates)
+            for other, scores in success.items()
+            if other != ours and is_plus(other) == is_plus(ours)
+        }
+        for ours in ("astra", f"astra{PLUS}")
+        if ours in success
+    }

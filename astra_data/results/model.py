@@ -22,11 +22,24 @@ class Part(BaseModel):
 
 
 class Machine(Part):
-    """The machine that wrote the report."""
+    """A machine that something was made on."""
 
     cpu: str
     cores: int
     memory_gib: float
+    gpu: str | None = None
+    """Where the networks ran on one."""
+
+
+class Origin(Part):
+    """What some stages' artefacts say of their making; None or empty where they do not say."""
+
+    commit: str | None
+    """Of the code, ending in "-dirty" where it was changed since."""
+    machine: Machine | None
+    packages: dict[str, str | None]
+    stages: list[str]
+    """"report" for what is drawn and simulated by the report itself."""
 
 
 class Dataset(Part):
@@ -52,9 +65,7 @@ class Learning(Part):
 
     steps: list[float]
     success: list[Number]
-    returns: list[Number] = Field(
-        validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
-    )
+    """Of the training episodes that ended, wherever in the task they began."""
 
 
 class BandMeans(Part):
@@ -102,13 +113,6 @@ class MethodResults(Part):
     """Empty for a row that is not trained."""
 
 
-class Improvement(Part):
-    """How likely a seed of the best ASTRA row beats a seed of another row."""
-
-    best: str
-    over: dict[str, Comparison]
-
-
 class Results(Part):
     """All that the page and the figures show."""
 
@@ -117,22 +121,20 @@ class Results(Part):
     task: str
     command: str
     """The command that produced these results."""
-    commit: str | None
-    dirty: bool | None
-    """Whether the checkout differed from `commit`."""
-    machine: Machine
+    origins: list[Origin]
+    """Normally one; more if code or machine changed on the way."""
     wall_seconds: dict[str, float]
     """By stage over all rows and seeds, and "total"; stages that record no time are left out."""
-    packages: dict[str, str]
     datasets: list[Dataset]
     evaluated_with: list[DatasetUse]
     seeds: list[int]
     episodes: int
     """Per row and seed."""
     methods: dict[str, MethodResults]
-    probability_of_improvement: Improvement | None
+    probability_of_improvement: dict[str, dict[str, Comparison]]
+    """ASTRA's row → another that is trained alike → how likely a seed of the one beats one of the other."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
-    """stage → figure → row, or grounding that rows share → one value per seed."""
+    """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
 
     def gaps(self) -> dict[str, GapMeans]:
         """Return each grounding's gap once, though rows share it."""

@@ -1,11 +1,11 @@
 """Results → Markdown: tables, figures and how to read them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
 from astra_data.figures import method_title
-from astra_data.results.model import BandMeans, Results
+from astra_data.results.model import BandMeans, Origin, Results
 from astra_data.rows import is_plus
 from astra_data.statistics import Summary
 
@@ -17,18 +17,20 @@ HOW_TO_READ = {
     ),
     "trajectories": (
         "Orange, dashed: the policy in the simulator that it was trained in. Blue: the same policy in the "
-        "target. An episode that fails ends with a cross; the star is the goal. The closer blue follows "
-        "orange, the better the simulator was grounded. The number is the success rate over all episodes "
-        "and seeds."
+        "target. An episode that fails ends with a cross, one that succeeds at the star, its goal. Starts "
+        "and goals are drawn apart in the two worlds, so the lines are no pairs: compare the ways that they "
+        "take and where they end. The number is the success rate in the target over all episodes and seeds."
     ),
     "mismatch": (
-        "The same commands in the ungrounded simulator (blue) and, repeatedly, in the target (orange: "
+        "The same commands in the ungrounded simulator (orange) and, repeatedly, in the target (blue: "
         "mean; bands: 25 to 75 % and 5 to 95 %). Where they part, the simulator lacks something."
     ),
     "learning": (
-        "Success in the simulator while the policy learns: mean over seeds, band from the worst seed to "
-        "the best. Episodes that start in the midst of a recorded one count as well. High here and low in "
-        "the table means that the policy learned what the target does not do."
+        "Share of the training episodes that reach the goal, in the simulator that the policy is trained in: "
+        "mean over seeds, band from the worst seed to the best; plus rows have a panel of their own. With "
+        "`data_start_share` in the recipe that share of the episodes starts in the midst of a recorded "
+        "trajectory, often nearer to the goal, so these figures are no success rates of the task; those are "
+        "in the table. High here and low there means that the policy learned what the target does not do."
     ),
     "gap": (
         "The simulator is given the target's actions from a target state on; the error is its distance "
@@ -73,14 +75,15 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 
 
 def _head(results: Results) -> str:
-    machine, total = results.machine, results.wall_seconds["total"]
+    stages = [origin for origin in results.origins if origin.machine and origin.stages != ["report"]]
+    machines = " and ".join(dict.fromkeys(_machine(origin) for origin in stages))
     seeds = ", ".join(str(seed) for seed in results.seeds)
     return (
         f"# {results.recipe}\n\n"
         f"Task `{results.task}`, seeds {seeds}, {results.episodes} episodes per row and seed. Produced by\n\n"
         f"```\n{results.command}\n```\n\n"
-        f"on {machine.cpu}, {machine.cores} cores, {machine.memory_gib:g} GiB of memory. "
-        f"Wall time of the stages, summed: {_duration(total)}."
+        f"on {machines or 'a machine that was not recorded'}. "
+        f"Wall time of the stages, summed: {_duration(results.wall_seconds['total'])}."
     )
 
 
@@ -116,16 +119,20 @@ def _table(results: Results) -> str:
 
 
 def _comparison(results: Results) -> str:
-    improvement = results.probability_of_improvement
-    if improvement is None or not improvement.over:
+    rows = results.methods
+    lines = [
+        _line([rows[ours].title, rows[other].title, f"{found.probability:.2f}{_ends(found.low, found.high)}"])
+        for ours, over in results.probability_of_improvement.items()
+        for other, found in over.items()
+    ]
+    if not lines:
         return ""
-    title = results.methods[improvement.best].title
-    lines = [_line([f"{title} beats", "probability [95 %]"]), _line(["---", "---:"])]
-    for method, comparison in improvement.over.items():
-        ends = _ends(comparison.low, comparison.high)
-        lines.append(_line([results.methods[method].title, f"{comparison.probability:.2f}{ends}"]))
-    note = "How likely a seed of the one has a higher success rate than a seed of the other; ties count half."
-    return "## Probability of improvement\n\n" + "\n".join(lines) + f"\n\n{note}"
+    head = [_line(["row", "beats", "probability [95 %]"]), _line(["---", "---", "---:"])]
+    note = (
+        "How likely a seed of the one has a higher success rate than a seed of the other; ties count half. "
+        "Only rows that are trained alike are compared: all with the `[plus]` settings, or all without."
+    )
+    return "## Probability of improvement\n\n" + "\n".join(head + lines) + f"\n\n{note}"
 
 
 def _encoders(results: Results) -> str:
@@ -178,7 +185,11 @@ def _cost(results: Results) -> str:
             time = "-" if seconds is None else _duration(seconds)
             lines.append(_line([stage, time, "; ".join(shown)]))
     lines.append(_line(["total", _duration(results.wall_seconds["total"]), ""]))
-    note = "Summed over rows and seeds; a dash where a stage recorded no time."
+    note = (
+        "Wall time: summed over rows and seeds, which run side by side; a dash where a stage recorded none. "
+        "Speed: of one item beside the others, averaged over seeds. Simulator steps/s: the world alone; PPO "
+        "steps/s: world and learning."
+    )
     return "## Cost\n\n" + "\n".join(lines) + f"\n\n{note}"
 
 
@@ -191,9 +202,11 @@ def _rates(rows: Mapping[str, list[float]]) -> str:
 
 
 def _origin(results: Results) -> str:
-    commit = "no commit" if results.commit is None else f"commit `{results.commit}`"
-    state = ", with uncommitted changes" if results.dirty else ""
-    lines = [f"- Code: {commit}{state}."]
+    lines = [
+        f"- Code: {_by_stage(results.origins, _commit)}.",
+        f"- Machine: {_by_stage(results.origins, _machine)}.",
+        f"- Versions: {_by_stage(results.origins, _versions)}.",
+    ]
     hashes_of: dict[tuple[str, str, str], list[str]] = {}
     for dataset in results.datasets:
         key = (dataset.stage, dataset.name, dataset.version)
@@ -206,8 +219,37 @@ def _origin(results: Results) -> str:
         hashes = ", ".join(dict.fromkeys(f"`{digest}`" for digest in use.hashes if digest is not None))
         named = f"{versions or 'no dataset'}{f' ({hashes})' if hashes else ''}"
         lines.append(f"- Dataset named by the evaluations of {rows}: {named}.")
-    packages = ", ".join(f"{name} {version}" for name, version in results.packages.items())
-    return "## Where this comes from\n\n" + "\n".join(lines) + f"\n- Versions: {packages}."
+    return "## Where this comes from\n\n" + "\n".join(lines)
+
+
+def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:
+    """Return what all origins say, or each text with the stages that it holds for."""
+    stages: dict[str, list[str]] = {}
+    for origin in origins:
+        stages.setdefault(text(origin), []).extend(origin.stages)
+    if len(stages) == 1:
+        return next(iter(stages))
+    return "; ".join(f"{said} ({', '.join(dict.fromkeys(of))})" for said, of in stages.items())
+
+
+def _commit(origin: Origin) -> str:
+    if origin.commit is None:
+        return "not recorded"
+    commit = origin.commit.removesuffix("-dirty")
+    return f"commit `{commit}`{' with uncommitted changes' if commit != origin.commit else ''}"
+
+
+def _machine(origin: Origin) -> str:
+    machine = origin.machine
+    if machine is None:
+        return "not recorded"
+    gpu = f", {machine.gpu}" if machine.gpu else ""
+    return f"{machine.cpu}, {machine.cores} cores, {machine.memory_gib:g} GiB of memory{gpu}"
+
+
+def _versions(origin: Origin) -> str:
+    known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
+    return ", ".join(known) or "not recorded"
 
 
 def _figure(name: str, figures: Mapping[str, str]) -> str:
@@ -239,7 +281,9 @@ def _ends(low: float | None, high: float | None) -> str:
 
 
 def _unit(figure: str) -> str:
-    return figure.removesuffix("_per_second").replace("_", " ") + "/s"
+    """Return "target steps/s" for "target_steps_per_second"; bare steps are PPO's."""
+    steps = figure.removesuffix("_per_second").replace("_", " ")
+    return f"{'PPO ' if steps == 'steps' else ''}{steps}/s"
 
 
 def _short(rate: float) -> str:

@@ -1,60 +1,35 @@
-"""Where numbers came from: commit, machine, package versions."""
+"""Where an artefact comes from: commit, package versions and machine."""
 
 import os
 import platform
-import subprocess
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
-PACKAGE = Path(__file__).resolve().parents[1]
+import torch
 
-PACKAGES = ("astra-data", "torch", "torchrl", "mujoco", "gymnasium", "lerobot", "numpy", "scipy", "rliable")
-"""Packages whose versions can move a result."""
-
-
-def commit() -> tuple[str | None, bool | None]:
-    """Return the commit of this checkout, and whether files differ from it; None where there is no checkout.
-
-    Published results do not count as differences: they are written by the report itself.
-    """
-    top = _git("rev-parse", "--show-toplevel")
-    if top is None or Path(top).resolve() != PACKAGE.parent:
-        return None, None
-    changes = _git("status", "--porcelain", "--", ":/", ":(top,exclude)recipes/results")
-    return _git("rev-parse", "--verify", "--quiet", "HEAD"), None if changes is None else bool(changes)
+from astra_data.cores import cores
+from astra_data.dataset.provenance import git_commit, package_versions
 
 
-def cpu_name() -> str:
-    """Return the processor's name."""
+def origin(device: str = "cpu") -> dict[str, Any]:
+    """Return what every artefact says of its making; ask when a stage begins."""
+    return {"git_commit": git_commit(), "packages": package_versions(), "machine": machine(device)}
+
+
+def machine(device: str = "cpu") -> dict[str, Any]:
+    """Return the processor, its cores and the memory of this machine, and the GPU if `device` is one."""
+    return {
+        "cpu": _cpu_name(),
+        "cores": cores(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else None,
+    }
+
+
+def _cpu_name() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-def memory_gib() -> float:
-    """Return the machine's memory in GiB, to one decimal."""
-    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-
-
-def package_versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that can move a result, where installed."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return versions
-
-
-def _git(*arguments: str) -> str | None:
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(PACKAGE), *arguments], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()

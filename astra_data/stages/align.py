@@ -16,6 +16,7 @@ from astra_data.models.alignment import TargetEncoder, gaussian_mmd
 from astra_data.models.grounding import GroundingModel, Windows
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative, Positive
+from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.target_encoder_file import save_target_encoder
 
@@ -56,6 +57,7 @@ def align(
     Raises:
         BadInputError: an input is not there or not what was expected.
     """
+    made = origin(device)
     model = load_grounding(grounding / "grounding.safetensors", device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
@@ -92,7 +94,7 @@ def align(
                 progress((update + 1) / config.updates, note)
         seconds = time.perf_counter() - began
         save_target_encoder(folder / "target_encoder.safetensors", encoder)
-        metrics: dict[str, Any] = {
+        metrics: dict[str, Any] = made | {
             "windows_per_second": config.updates * config.batch_windows / seconds,
             "wall_seconds": seconds,
             "points": points,

@@ -24,6 +24,7 @@ from astra_data.columns import (
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative
+from astra_data.results.provenance import machine
 from astra_data.seeding import derive, generator
 from astra_data.tasks import Task, task_named
 
@@ -59,8 +60,6 @@ def collect(
     """
     world = task_named(task)
     began = time.perf_counter()
-    columns, lengths = _record(world, config, seed, num_threads, progress)
-    seconds = time.perf_counter() - began
     description = {
         "name": f"{task}-{config.behavior}",
         "stage": "collect",
@@ -76,6 +75,8 @@ def collect(
         description=description,
         subset_seed=derive(seed, "subset"),
     ) as writer:
+        columns, lengths = _record(world, config, seed, num_threads, progress)
+        rate = float(lengths.sum() / (time.perf_counter() - began))
         for index, length in enumerate(lengths):
             values = {name: stacked[:length, index] for name, stacked in columns.items()}
             writer.add(
@@ -90,7 +91,9 @@ def collect(
                     },
                 )
             )
-    progress(1.0, f"{len(lengths)} episodes, {lengths.sum() / seconds:,.0f} target steps/s")
+        seconds = time.perf_counter() - began
+        writer.made = {"wall_seconds": seconds, "target_steps_per_second": rate, "machine": machine()}
+    progress(1.0, f"{len(lengths)} episodes, {rate:,.0f} target steps/s")
 
 
 def _record(

@@ -19,6 +19,7 @@ from astra_data.methods.follower import CarefulFollower
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive
+from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
@@ -97,6 +98,7 @@ def evaluate(
         raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     began = time.perf_counter()
     told: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
+    told |= origin()
     tensors: dict[str, Tensor] = {}
     if policy is None:
         outcome, rate = _in_target(world, None, config, seed, num_threads, progress)

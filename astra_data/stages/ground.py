@@ -18,6 +18,7 @@ from astra_data.methods import method_named
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive, Share
+from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 
@@ -68,7 +69,7 @@ def ground(
     weights = method_named(method).loss_weights
     if weights is None:
         raise BadInputError(f"method '{method}' does not ground its simulator")
-    world = task_named(task)
+    world, made = task_named(task), origin(device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "grounding"))
@@ -97,7 +98,7 @@ def ground(
         progress(1.0, "gap report")
         gap = gap_report(world, model, held_out, seed=seed)
         save_grounding(folder / "grounding.safetensors", model, episodes)
-        (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
+        (folder / "metrics.json").write_text(json.dumps(made | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
@@ -116,7 +117,7 @@ def _fit(
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
-    epochs: list[dict[str, float]] = []
+    epochs: list[dict[str, float | None]] = []
     seconds, first = 0.0, 0
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
@@ -153,8 +154,9 @@ def _fit(
         if done % 10 == 0:
             rate = done * config.batch_windows / seconds
             note = f"{rate:,.0f} windows/s"
-            if epochs:
-                note += f"  held-out R² of the correction {epochs[-1]['r2_state']:.3f}"
+            explained = epochs[-1]["r2_state"] if epochs else None
+            if explained is not None:
+                note += f"  held-out R² of the correction {explained:.3f}"
             progress(done / config.updates, note)
     return {
         "windows_per_second": config.updates * config.batch_windows / seconds,
@@ -165,21 +167,24 @@ def _fit(
 
 
 @torch.no_grad()
-def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights) -> dict[str, float]:
+def telemetry(
+    model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights
+) -> dict[str, float | None]:
     """Return what falling losses do not show, on `episodes`.
 
-    R² of each head that is trained (of the correction: of the simulator's error that it removes), the mean
-    standard deviation of the latent's entries, and the latent's effective rank (exponential of the entropy
-    of the covariance's normalised eigenvalues).
+    R² of each head that is trained (of the correction: of the simulator's error that it removes), None where
+    there is nothing to explain, as in a perfect simulator; the mean standard deviation of the latent's
+    entries, and the latent's effective rank (exponential of the entropy of the covariance's normalised
+    eigenvalues).
     """
     windows = episodes.windows
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
     latent, _ = model.encoder(inputs)
     mask = windows.mask.bool()
     corrected = model.correct(latent, windows.action, windows.simulated_next)
-    wrong = ((corrected - windows.next_state) / model.correction_std)[mask].square().mean()
-    raw = ((windows.simulated_next - windows.next_state) / model.correction_std)[mask].square().mean()
-    figures = {"r2_state": float(1.0 - wrong / raw)}
+    wrong = ((corrected - windows.next_state) / model.correction_std)[mask].square().sum()
+    raw = ((windows.simulated_next - windows.next_state) / model.correction_std)[mask].square().sum()
+    figures = {"r2_state": _explained(wrong, raw)}
     if weights.reward > 0:
         predicted = model.predict_reward_parts(latent, windows.action)[mask]
         for part, name in enumerate(("r2_reward", "r2_final_reward")):
@@ -196,9 +201,12 @@ def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeig
     return figures
 
 
-def _r2(predicted: Tensor, true: Tensor) -> float:
-    residual = (predicted - true).square().sum()
-    return float(1.0 - residual / (true - true.mean(0)).square().sum())
+def _r2(predicted: Tensor, true: Tensor) -> float | None:
+    return _explained((predicted - true).square().sum(), (true - true.mean(0)).square().sum())
+
+
+def _explained(residual: Tensor, total: Tensor) -> float | None:
+    return float(1.0 - residual / total) if total > 0 else None
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """Pair: put the abstract simulator where the target was, give it the same action, keep where it lands."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,6 @@ from astra_data.columns import (
     NEXT_STATE,
     STATE,
     Array,
-    Column,
     Episode,
 )
 from astra_data.dataset.reader import Dataset
@@ -22,6 +22,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError
 from astra_data.progress import Progress
 from astra_data.recipe import Config, NotNegative
+from astra_data.results.provenance import machine
 from astra_data.tasks import Task, task_named
 
 
@@ -52,18 +53,14 @@ def pair(task: str, config: PairConfig, *, dataset: Path, out: Path, progress: P
         "simulator": {"id": "point_mass", **world.simulator(1).parameters},
     }
     meanings = {
-        ABSTRACT_STATE: "abstract state of the target before the action",
         ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
         ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
     }
-    size = len(world.abstract_names)
-    added = [
-        Column(name, size=size, names=world.abstract_names, meaning=text) for name, text in meanings.items()
-    ]
+    added = [replace(world.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps = 0
     with DatasetWriter(
         out,
-        [*source.schema, *added],
+        [*source.schema, world.abstract_state, *added],
         fps=source.info["fps"],
         task=world.instruction,
         description=description,
@@ -81,6 +78,8 @@ def pair(task: str, config: PairConfig, *, dataset: Path, out: Path, progress: P
             steps += len(episode)
             rate = steps / (time.perf_counter() - began)
             progress((index + 1) / len(source), f"{rate:,.0f} pairs/s")
+        seconds = time.perf_counter() - began
+        writer.made = {"wall_seconds": seconds, "pairs_per_second": steps / seconds, "machine": machine()}
 
 
 def pair_steps(
@@ -93,8 +92,9 @@ def pair_steps(
     difference = (simulator.state - abstract).abs()
     if float(difference.max()) > tolerance:
         step, entry = divmod(int(difference.argmax()), abstract.shape[1])
+        name = (task.abstract_state.names or range(abstract.shape[1]))[entry]
         raise BadInputError(
-            f"the simulator, reset to φ(s) of step {step}, shows {task.abstract_names[entry]} = "
+            f"the simulator, reset to φ(s) of step {step}, shows {name} = "
             f"{float(simulator.state[step, entry]):.6g} and not {float(abstract[step, entry]):.6g} "
             f"(tolerance {tolerance:g}): check its reset_to and the task's abstraction"
         )

@@ -1,8 +1,10 @@
 """Train: optimise a policy by PPO in the raw or grounded simulator (Algorithm 2)."""
 
 import json
+import math
 import time
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -17,6 +19,7 @@ from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Count
+from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.tasks import task_named
 from astra_data.training_world import WorldConfig, training_world, world_parts
@@ -53,7 +56,7 @@ def train(
     Raises:
         BadInputError: the method has no policy to train, or needs a grounding and got none.
     """
-    base, world = method_named(method), task_named(task)
+    base, world, made = method_named(method), task_named(task), origin(device)
     if not base.trains:
         raise BadInputError(f"method '{method}' has no policy to train")
     if base.grounds and grounding is None:
@@ -81,7 +84,7 @@ def train(
         PolicyFile(
             policy, parts.thinness, parts.scatter, switches, episodes.reference, episodes.content_hash
         ).save(folder / "policy.safetensors")
-        (folder / "curve.json").write_text(json.dumps(curve, indent=1))
+        (folder / "curve.json").write_text(json.dumps(made | curve, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
 
@@ -89,7 +92,7 @@ def train(
 def _optimise(
     ppo: Ppo, env: NavigationWorld, ramp: float, folder: Path, device: str, progress: Progress
 ) -> dict[str, Any]:
-    points: list[dict[str, float]] = []
+    points: list[dict[str, float | None]] = []
     seconds = 0.0
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
@@ -102,11 +105,14 @@ def _optimise(
     while not ppo.done:
         env.caution = min(1.0, ppo.steps / (ppo.config.total_steps * ramp)) if ramp else 1.0
         metrics = ppo.iterate()
-        points.append({"steps": ppo.steps, **metrics})
+        # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
+        known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
+        points.append({"steps": ppo.steps, **known})
         seconds = time.perf_counter() - began
         rate = ppo.steps / seconds
-        recent = [point["success"] for point in points[-10:]]
-        note = f"{rate:,.0f} steps/s  success in simulation {sum(recent) / len(recent):.2f}"
+        recent = [point["success"] for point in points[-10:] if point["success"] is not None]
+        success = f"{fmean(recent):.2f}" if recent else "unknown yet"
+        note = f"{rate:,.0f} steps/s  success of training episodes {success}"
         progress(ppo.steps / ppo.config.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0:
             state = {"ppo": ppo.state_dict(), "world": ppo.env.state_dict()}

@@ -1,3 +1,4 @@
+import math
 from statistics import fmean
 from typing import Any
 
@@ -88,16 +89,23 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(terminates_after: fl
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
     with_memory = train(ppo(Recall(64), 60, horizon=100, memory=8, learning_rate=5e-3))
     without = train(ppo(Recall(64), 60, horizon=100, learning_rate=5e-3))
-    assert fmean(point["return"] for point in with_memory[-5:]) > 0.7
-    assert fmean(point["return"] for point in without[-5:]) < 0.2
+    # An episode of three steps is worth at most 1.
+    assert 3 * fmean(point["reward"] for point in with_memory[-5:]) > 0.7
+    assert 3 * fmean(point["reward"] for point in without[-5:]) < 0.2
 
 
 def test_metrics_count_finished_episodes() -> None:
-    learner = ppo(ConstantReward(4, 8.0), 1, horizon=10**6)
-    metrics = learner.iterate()
+    metrics = ppo(ConstantReward(4, 8.0), 1, horizon=10**6).iterate()
     assert metrics["episodes"] == 4 * 16 / 8
     assert metrics["success"] == 1.0
-    assert metrics["return"] == pytest.approx(8.0)
+    assert metrics["reward"] == pytest.approx(1.0)
+
+
+def test_without_finished_episodes_success_is_unknown() -> None:
+    metrics = ppo(ConstantReward(4, math.inf), 1, horizon=10**6).iterate()
+    assert metrics["episodes"] == 0
+    assert math.isnan(metrics["success"])
+    assert metrics["reward"] == pytest.approx(1.0)
 
 
 def test_fewer_environments_than_minibatches_are_enough() -> None:

@@ -15,6 +15,7 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
         "target_encoder.safetensors",
     }
     metrics = json.loads((aligned / "metrics.json").read_text())
+    assert {"git_commit", "packages", "machine"} <= metrics.keys()
     first, last = metrics["points"]
     assert (first["step"], last["step"]) == (50, 100)
     assert 0 < last["mmd"] < first["mmd"]

@@ -49,12 +49,22 @@ def test_commands_are_held_for_a_while(collected: Path) -> None:
 
 
 def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path: Path) -> None:
-    hashes = []
+    hashes, contents = [], []
     for number, (seed, threads) in enumerate([(1, 1), (1, 2), (2, 2)]):
         out = tmp_path / str(number)
         collect(task, TINY, seed=seed, out=out, progress=silent, num_threads=threads)
         hashes.append(Dataset.open(out).content_hash)
+        files = [path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "dataset.json"]
+        contents.append([path.read_bytes() for path in files])
     assert hashes[0] == hashes[1] != hashes[2]
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_time_speed_and_machine_are_recorded(collected: Path) -> None:
+    dataset = Dataset.open(collected)
+    said = dataset.description
+    assert 0 < dataset.lengths.sum() / said["target_steps_per_second"] <= said["wall_seconds"]
+    assert said["machine"].keys() == {"cpu", "cores", "memory_gib", "gpu"}
 
 
 def test_an_unknown_task_is_told(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,9 +9,10 @@ from small_run import GROUND
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding
+from astra_data.models.grounding import LossWeights
 from astra_data.progress import Progress, silent
 from astra_data.stages import ground as stage
-from astra_data.stages.ground import ground
+from astra_data.stages.ground import ground, telemetry
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
@@ -35,6 +37,7 @@ def test_the_artefact_is_complete(grounded: Path) -> None:
     assert {file.name for file in grounded.iterdir()} == files
     metrics = json.loads((grounded / "metrics.json").read_text())
     assert metrics["parameters"] > 1000
+    assert {"git_commit", "packages", "machine"} <= metrics.keys()
     (epoch,) = metrics["epochs"]
     heads = {
         "loss_latent",
@@ -58,6 +61,17 @@ def test_the_artefact_is_complete(grounded: Path) -> None:
                 "low": 3,
                 "high": 3,
             }
+
+
+def test_where_there_is_nothing_to_explain_r2_is_unknown(grounded: Path, paired: Path) -> None:
+    model, episodes = load_grounding(grounded / "grounding.safetensors"), PairedEpisodes.load(paired)
+    windows = episodes.windows
+    perfect = replace(windows, simulated_next=windows.next_state, reward=torch.zeros_like(windows.reward))
+    weights = LossWeights()
+    figures = telemetry(model, replace(episodes, windows=perfect), weights)
+    assert [figures[name] for name in ("r2_state", "r2_reward", "r2_final_reward")] == [None] * 3
+    known = telemetry(model, episodes, weights)["r2_state"]
+    assert known is not None and known < 1.0
 
 
 def test_the_residual_is_the_scatter_on_held_out_episodes(grounded: Path, paired: Path) -> None:

@@ -41,12 +41,27 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
     before, after = Dataset.open(collected), Dataset.open(paired)
     assert after.description["parents"] == [before.identity]
     assert after.description["simulator"] == {"id": "point_mass", "timestep_s": 0.05, "radius_m": 0.1}
+    steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
+    assert steps == pytest.approx(after.lengths.sum())
+    assert after.description["machine"] == before.description["machine"]
     assert after.order == before.order
     assert after.metadata == before.metadata
     for one, other in zip(before.episodes(), after.episodes(), strict=True):
         assert one.uid == other.uid
         for name, values in one.columns.items():
             np.testing.assert_array_equal(values, other.columns[name])
+
+
+def test_abstract_columns_have_units_frames_and_roles(paired: Path) -> None:
+    features = Dataset.open(paired).features
+    meanings = set()
+    for name in (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE):
+        astra = features[name]["astra"]
+        meanings.add(astra["meaning"])
+        assert features[name]["names"] == ["x", "y", "vx", "vy"]
+        for key in ("unit", "frame", "role"):  # as in the target's columns
+            assert astra[key] == [features[STATE]["astra"][key][index] for index in _PLANAR]
+    assert len(meanings) == 3
 
 
 def test_a_simulator_that_does_not_show_its_reset_is_refused() -> None:

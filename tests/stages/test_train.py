@@ -45,12 +45,31 @@ def stop(fraction: float, note: str) -> None:
 def test_the_artefact_is_complete(trained: Path) -> None:
     assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
     curve = json.loads((trained / "curve.json").read_text())
+    assert {"git_commit", "packages", "machine"} <= curve.keys()
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
-    assert {"success", "return"} <= curve["points"][0].keys()
+    assert curve["points"][0].keys() == {"steps", "success", "episodes", "reward", "std"}
     policy = PolicyFile.load(trained / "policy.safetensors")
     assert policy.dataset == "antmaze-short-random@data-1.0.0"
     assert policy.policy.memory is None
     assert not policy.scatter.any()
+
+
+def test_success_is_null_while_no_episode_has_ended(task: str, paired: Path, tmp_path: Path) -> None:
+    notes: list[str] = []
+    config = TRAIN.model_copy(update={"num_envs": 1, "rollout_steps": 2, "total_steps": 60})
+    make(
+        task, "direct_transfer", paired, None, tmp_path / "train", config, lambda _, note: notes.append(note)
+    )
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no JSON")
+
+    text = (tmp_path / "train" / "curve.json").read_text()
+    points = json.loads(text, parse_constant=refuse)["points"]
+    assert all((point["success"] is None) == (point["episodes"] == 0) for point in points)
+    assert {point["episodes"] for point in points} >= {0.0, 1.0}
+    assert notes[0].endswith("success of training episodes unknown yet")
+    assert notes[-1].endswith("success of training episodes 0.00")
 
 
 def test_a_raw_simulator_needs_a_memory(task: str, paired: Path, tmp_path: Path) -> None:
