@@ -34,3 +34,20 @@ def test_every_command_is_in_the_table_and_has_help(name: str) -> None:
 
 def test_the_table_names_no_command_that_is_not_there() -> None:
     assert set(re.findall(r"^\| `[^`]*astra-data (\w+)", README, re.MULTILINE)) == set(COMMANDS)
+
+
+def test_links_and_figures_lead_somewhere() -> None:
+    linked = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
+    assert linked
+    assert [link for link in linked if not (HOUSE / link).exists()] == []
+
+
+def test_nothing_is_left_to_fill_in() -> None:
+    assert re.findall(r"^[A-Z_]{4,}$|\b[A-Z]+_MINUTES\b", README, re.MULTILINE) == []
+
+
+def test_the_code_compiles() -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        compile(block, "README.md", "exec")
