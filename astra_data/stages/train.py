@@ -33,8 +33,6 @@ class TrainConfig(WorldConfig, PpoConfig):
 
     num_envs: Count = 256
     """Worlds stepped side by side."""
-    episode_steps: Count | None = None
-    """Episodes are cut after so many steps, without ending the task; by default at the task's horizon."""
     hidden_sizes: tuple[int, ...] = (64, 64)
     """Of actor and critic."""
     memory_size: int = 64
@@ -79,7 +77,7 @@ def train(
             hidden_sizes=config.hidden_sizes,
         )
     ).to(device)
-    ppo = Ppo(env, policy, config, horizon=config.episode_steps or world.navigation.horizon, seed=seed)
+    ppo = Ppo(env, policy, config, horizon=world.navigation.horizon, seed=seed)
     with finished_folder(out) as folder:
         curve = _optimise(ppo, env, config.ramp, folder, device, progress)
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})

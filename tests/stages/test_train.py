@@ -72,14 +72,6 @@ def test_success_is_null_while_no_episode_has_ended(task: str, paired: Path, tmp
     assert notes[-1].endswith("success of training episodes 0.00")
 
 
-def test_episodes_are_cut_after_the_given_steps(task: str, paired: Path, tmp_path: Path) -> None:
-    config = TRAIN.model_copy(update={"episode_steps": 2})
-    make(task, "direct_transfer", paired, None, tmp_path / "train", config)
-    points = json.loads((tmp_path / "train" / "curve.json").read_text())["points"]
-    # 8 worlds, 8 steps: each world ends 4 episodes, whatever its age at first.
-    assert [point["episodes"] for point in points] == [32.0] * 6
-
-
 def test_a_raw_simulator_needs_a_memory(task: str, paired: Path, tmp_path: Path) -> None:
     make(task, "direct_transfer", paired, None, tmp_path / "train")
     policy = PolicyFile.load(tmp_path / "train" / "policy.safetensors").policy
