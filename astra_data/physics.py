@@ -1,10 +1,11 @@
 """Step B copies of one MuJoCo model at once, on every core.
 
-Each copy keeps its own `MjData`, so warm starts carry over between control steps exactly as in a single
-Gymnasium environment (`mujoco.rollout` starts every call cold), and contacts stay readable.
-`mj_step` releases the interpreter lock, so plain threads use all cores.
+The copies' states, warm starts included, lie in one array, so that each goes on exactly as a single
+Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thread carries them through one
+`MjData`, which so stays in the core's cache; `mj_step` releases the interpreter lock.
 """
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -16,6 +17,9 @@ from astra_data.cores import cores
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
+
 
 class BatchedPhysics:
     """B independent copies of `model`, stepped `substeps` physics steps per control step.
@@ -23,6 +27,7 @@ class BatchedPhysics:
     Attributes:
         qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`.
         qvel: velocities, (B, nv) float64, likewise.
+        touching: whether anything touched a watched geom when the copy was last stepped, (B,) bool.
     """
 
     def __init__(
@@ -31,52 +36,63 @@ class BatchedPhysics:
         num_envs: int,
         *,
         substeps: int,
+        watched_geoms: tuple[int, int] | None = None,
         num_threads: int | None = None,
     ) -> None:
+        """Allocate B copies in the model's initial state.
+
+        Args:
+            model: what is stepped.
+            num_envs: B.
+            substeps: physics steps per control step.
+            watched_geoms: first and last id of the geoms whose touch is reported, by default none.
+            num_threads: by default one per core.
+        """
         self.model = model
         self.num_envs = num_envs
         self.substeps = substeps
-        self.qpos: Floats = np.zeros((num_envs, model.nq))
-        self.qvel: Floats = np.zeros((num_envs, model.nv))
-        self._data = [mujoco.MjData(model) for _ in range(num_envs)]
-        self._views = [(data, data.ctrl, data.qpos, data.qvel) for data in self._data]
         self.num_threads = min(num_threads or cores(), num_envs)
+        self._watched = watched_geoms
+        self._state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
+        after_time, end = 1 + model.nq, 1 + model.nq + model.nv
+        self.qpos: Floats = self._state[:, 1:after_time]
+        self.qvel: Floats = self._state[:, after_time:end]
+        self.touching: Bools = np.zeros(num_envs, dtype=bool)
+        self._control: Floats = self._state[:, self._state.shape[1] - model.nu :]
+        self._rows = list(self._state)
+        self._data = [mujoco.MjData(model) for _ in range(self.num_threads)]
         self._pool = ThreadPoolExecutor(self.num_threads)
+        self.set_state(np.arange(num_envs), np.tile(model.qpos0, (num_envs, 1)), np.zeros_like(self.qvel))
 
     def set_state(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats) -> None:
         """Reset the copies `rows` (n,) to `qpos` (n, nq) and `qvel` (n, nv), clearing warm starts."""
+        data = self._data[0]
         for row, position, velocity in zip(rows, qpos, qvel, strict=True):
-            data = self._data[row]
             mujoco.mj_resetData(self.model, data)
             data.qpos[:] = position
             data.qvel[:] = velocity
             mujoco.mj_forward(self.model, data)
-        self.qpos[rows] = qpos
-        self.qvel[rows] = qvel
+            mujoco.mj_getState(self.model, data, self._rows[row], _STATE)
+        self.touching[rows] = False
 
     def step(self, control: Floats, active: Bools | None = None) -> None:
         """Apply `control` (B, nu) for one control step to the copies in `active` (B,), by default to all."""
-        rows = np.arange(self.num_envs) if active is None else np.flatnonzero(active)
-        # Several small shares per thread, so that no core waits for a slow share at the end.
-        shares = np.array_split(rows, min(4 * self.num_threads, max(len(rows), 1)))
-        if self.num_threads == 1:
-            self._step_rows(rows, control)
-        else:
-            list(self._pool.map(self._step_rows, shares, [control] * len(shares)))
+        self._control[:] = control
+        # All threads draw from one iterator (its `next` is atomic), so that none waits for a slow share.
+        waiting = iter(range(self.num_envs) if active is None else np.flatnonzero(active).tolist())
+        helpers = [self._pool.submit(self._step_rows, data, waiting) for data in self._data[1:]]
+        self._step_rows(self._data[0], waiting)
+        for helper in helpers:
+            helper.result()
 
-    def _step_rows(self, rows: NDArray[np.intp], control: Floats) -> None:
-        model, substeps, step = self.model, self.substeps, mujoco.mj_step
-        for row in rows.tolist():
-            data, ctrl, qpos, qvel = self._views[row]
-            ctrl[:] = control[row]
+    def _step_rows(self, data: mujoco.MjData, rows: Iterator[int]) -> None:
+        model, substeps, watched = self.model, self.substeps, self._watched
+        get_state, set_state, step = mujoco.mj_getState, mujoco.mj_setState, mujoco.mj_step
+        for row in rows:
+            state = self._rows[row]
+            set_state(model, data, state, _STATE)
             step(model, data, substeps)
-            self.qpos[row] = qpos
-            self.qvel[row] = qvel
-
-    def touches(self, rows: NDArray[np.intp], first_geom: int, last_geom: int) -> Bools:
-        """Tell for each copy in `rows` (n,) whether anything touches a geom with id in [first, last]."""
-        touching = np.zeros(len(rows), dtype=bool)
-        for index, row in enumerate(rows.tolist()):
-            geoms = self._data[row].contact.geom
-            touching[index] = bool(((geoms >= first_geom) & (geoms <= last_geom)).any())
-        return touching
+            get_state(model, data, state, _STATE)
+            if watched is not None:
+                geoms = data.contact.geom
+                self.touching[row] = ((geoms >= watched[0]) & (geoms <= watched[1])).any()

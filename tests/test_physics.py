@@ -72,10 +72,13 @@ def test_a_reset_forgets_the_past() -> None:
     np.testing.assert_array_equal(physics.qpos[0], fresh.qpos[0])
 
 
-def test_touches_tells_the_floor_apart() -> None:
-    physics = BatchedPhysics(ant_model(), 2, substeps=1, num_threads=1)
+def test_a_watched_floor_is_felt_by_those_who_touch_it() -> None:
+    physics = BatchedPhysics(ant_model(), 2, substeps=1, watched_geoms=(0, 0), num_threads=1)
     qpos, qvel = standing(2)
     qpos[:, 7:] = [0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0]
     qpos[0, 2], qpos[1, 2] = 0.3, 2.0
     physics.set_state(np.arange(2), qpos, qvel)
-    assert physics.touches(np.arange(2), 0, 0).tolist() == [True, False]
+    physics.step(np.zeros((2, 8)))
+    assert physics.touching.tolist() == [True, False]
+    physics.set_state(np.arange(2), qpos, qvel)
+    assert not physics.touching.any()

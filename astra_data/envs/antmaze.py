@@ -20,9 +20,6 @@ from astra_data.batched import Step
 from astra_data.navigation import Navigation
 from astra_data.physics import BatchedPhysics, Floats
 
-_REACH_M = 1.6
-"""No part of the standard ant is farther than this from its torso's centre."""
-
 
 class AntMazeEnv:
     """B ants in a maze; action: world-frame velocity command in m/s, (B, 2), clipped to ±1 per axis.
@@ -31,7 +28,7 @@ class AntMazeEnv:
     Reaching the goal and toppling end an episode; touching a wall is recorded, not punished.
 
     Attributes:
-        state: (B, 29) float32. goal: (B, 2) float32. toppled, wall_contact: (B,) bool, of the last step.
+        state: (B, 29) float32. goal: (B, 2) float32. toppled: (B,) bool, of the last step.
     """
 
     observation_size = STATE_SIZE + 2
@@ -65,19 +62,26 @@ class AntMazeEnv:
         self.start_anywhere = start_anywhere
         self.controller = controller or VelocityController.load()
         model = ant_model(navigation.maze, leg_scale=leg_scale)
-        self.physics = BatchedPhysics(model, num_envs, substeps=CONTROL_SUBSTEPS, num_threads=num_threads)
+        self.physics = BatchedPhysics(
+            model,
+            num_envs,
+            substeps=CONTROL_SUBSTEPS,
+            watched_geoms=wall_geoms(model),
+            num_threads=num_threads,
+        )
         self.goal = torch.zeros(num_envs, 2)
         self.toppled = torch.zeros(num_envs, dtype=torch.bool)
-        self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
-        walls = wall_geoms(model)
-        assert walls is not None
-        self._walls = walls
         self.reseed(seed)
 
     @property
     def state(self) -> Tensor:
         """The full target states, (B, 29) float32."""
         return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Which ants touched a wall in their last step, (B,) bool."""
+        return torch.from_numpy(self.physics.touching)
 
     def reseed(self, seed: int) -> None:
         """Draw later starts, goals and headings from `seed`."""
@@ -101,7 +105,6 @@ class AntMazeEnv:
         """Set the ants `rows` (n,) to `state` (n, 29)."""
         self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
         self.toppled[rows] = False
-        self.wall_contact[rows] = False
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stand frozen."""
@@ -111,7 +114,6 @@ class AntMazeEnv:
         self.physics.step(torques, None if active is None else active.numpy())
         after = torch.from_numpy(self.physics.qpos[:, :2]).float()
         self.toppled = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
-        self._find_wall_contacts()
         success = self.navigation.reached(after, self.goal)
         return Step(
             observation=self._observe(),
@@ -119,13 +121,6 @@ class AntMazeEnv:
             terminated=success | self.toppled,
             success=success,
         )
-
-    def _find_wall_contacts(self) -> None:
-        clearance = self.navigation.maze.clearance(self.physics.qpos[:, :2])
-        near = np.flatnonzero(clearance < _REACH_M * self.leg_scale)
-        contact = np.zeros(self.num_envs, dtype=bool)
-        contact[near] = self.physics.touches(near, *self._walls)
-        self.wall_contact = torch.from_numpy(contact)
 
     def _observe(self) -> Tensor:
         return torch.cat([self.state, self.goal], dim=-1)

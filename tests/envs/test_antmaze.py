@@ -89,11 +89,20 @@ def test_walls_are_felt_and_the_floor_is_not() -> None:
 
 def test_wall_contact_equals_a_search_through_all_contacts() -> None:
     env = placed([[x, 4.0] for x in (-5.5, -5.0, -4.5, -4.0)], leg_scale=1.25)
-    first, last = wall_geoms(ant_model(U_MAZE)) or (0, 0)
+    model = ant_model(U_MAZE, leg_scale=1.25)
+    first, last = wall_geoms(model) or (0, 0)
+    copies = [mujoco.MjData(model) for _ in range(4)]
+    for data, qpos in zip(copies, env.physics.qpos, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+    command = torch.tensor([[-1.0, 0.0]]).expand(4, 2)
     for _ in range(20):
-        env.step(torch.tensor([[-1.0, 0.0]]).expand(4, 2))
+        torques = env.controller(env.physics.qpos, env.physics.qvel, command.double().numpy())
+        env.step(command)
         touching = []
-        for data in env.physics._data:
+        for data, control in zip(copies, torques, strict=True):
+            data.ctrl[:] = control
+            mujoco.mj_step(model, data, 5)
             pairs = [{int(geom) for geom in contact.geom} for contact in data.contact]
             touching.append(any(first <= geom <= last for pair in pairs for geom in pair))
         assert env.wall_contact.tolist() == touching
