@@ -10,5 +10,5 @@ learning    tasks  world  training_world  method  policy_file  deployment  gap  
             learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect pair ground train align evaluate report)
-roof        plan  schedule  display  run  cli
+roof        plan  schedule  display  run  commands/  cli
 """

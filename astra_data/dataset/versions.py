@@ -1,0 +1,140 @@
+"""Which dataset is meant: `name@data-1.2.0`, or its folder.
+
+Datasets that are given no folder live at home, which is $ASTRA_DATA_HOME, by default ./datasets:
+
+<home>/<name>/data-<version>/
+
+A version never changes. Of MAJOR.MINOR.PATCH, a change of the columns moves the first number, a change of the
+episodes the second, a change of the description alone the third.
+"""
+
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from astra_data.dataset.reader import Dataset
+from astra_data.errors import BadInputError
+from astra_data.recipe import did_you_mean
+
+Change = Literal["columns", "episodes", "description"]
+
+_REFERENCE = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*)(@(data-)?(?P<version>\d+\.\d+\.\d+))?")
+
+
+@dataclass(frozen=True, order=True)
+class Version:
+    """MAJOR.MINOR.PATCH; newer versions are greater."""
+
+    major: int
+    minor: int
+    patch: int
+
+    @classmethod
+    def parse(cls, text: str) -> "Version":
+        """Read "1.2.0".
+
+        Raises:
+            BadInputError: it is not three numbers.
+        """
+        if not re.fullmatch(r"\d+\.\d+\.\d+", text):
+            raise BadInputError(f"version '{text}': expected three numbers such as 1.2.0")
+        return cls(*map(int, text.split(".")))
+
+    def __str__(self) -> str:
+        """Write "1.2.0"."""
+        return f"{self.major}.{self.minor}.{self.patch}"
+
+    def next(self, change: Change, taken: Iterable["Version"] = ()) -> "Version":
+        """Return the version after `change`, beyond all of `taken` that it might be confused with."""
+        if change == "columns":
+            return Version(max([self.major, *(version.major for version in taken)]) + 1, 0, 0)
+        alike = [version for version in (self, *taken) if version.major == self.major]
+        if change == "episodes":
+            return Version(self.major, max(version.minor for version in alike) + 1, 0)
+        patches = [version.patch for version in alike if version.minor == self.minor]
+        return Version(self.major, self.minor, max(patches) + 1)
+
+
+def home() -> Path:
+    """Return where datasets live that are given no folder."""
+    return Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
+
+
+def place(description: Mapping[str, Any]) -> Path:
+    """Return the folder at home of the dataset with this "name" and "version"."""
+    return home() / str(description["name"]) / f"data-{description['version']}"
+
+
+def versions_at_home(name: str) -> list[Version]:
+    """Return the versions of dataset `name` at home, the oldest first."""
+    folders = (home() / name).glob("data-*.*.*")
+    texts = (folder.name.removeprefix("data-") for folder in folders if folder.is_dir())
+    return sorted(Version.parse(text) for text in texts if re.fullmatch(r"\d+\.\d+\.\d+", text))
+
+
+def locate(dataset: str | Path) -> Path:
+    """Return the folder of `dataset`: a folder, `name@data-1.2.0`, or `name` for its newest version at home.
+
+    Raises:
+        BadInputError: there is no such folder and no such name at home.
+    """
+    if Path(dataset).is_dir():
+        return Path(dataset)
+    reference = _REFERENCE.fullmatch(str(dataset))
+    if not reference:
+        raise BadInputError(f"{dataset}: no such folder; expected a folder, name or name@data-1.2.0")
+    name, version = reference["name"], reference["version"]
+    versions = versions_at_home(name)
+    if not versions:
+        names = sorted(path.name for path in home().glob("*") if versions_at_home(path.name))
+        raise BadInputError(f"no dataset '{name}' in {home()}{did_you_mean(name, names)}")
+    if version and Version.parse(version) not in versions:
+        known = ", ".join(f"data-{known}" for known in versions)
+        raise BadInputError(f"{name} has no version data-{version} in {home()}; it has {known}")
+    return place({"name": name, "version": version or versions[-1]})
+
+
+def open_dataset(dataset: str | Path) -> Dataset:
+    """Open `dataset`, named as `locate` takes it.
+
+    Raises:
+        BadInputError: there is none.
+        CorruptDatasetError: it is incomplete or was altered.
+    """
+    return Dataset.open(locate(dataset))
+
+
+def successor(
+    source: Dataset,
+    change: Change,
+    *,
+    stage: str,
+    config: Mapping[str, Any],
+    out: Path | None = None,
+    parents: Iterable[Dataset] = (),
+    **more: Any,  # noqa: ANN401 - JSON
+) -> tuple[dict[str, Any], Path]:
+    """Describe the version that follows `source`, and say where it goes: to `out`, or to its place at home.
+
+    Args:
+        source: what it is made of; its name, seeds, environment and simulator are carried over.
+        change: what moves the version.
+        stage: what makes it.
+        config: how.
+        out: its folder.
+        parents: further datasets that it is made of.
+        more: keys of the description that differ from those of `source`.
+
+    Returns:
+        the description that `DatasetWriter` takes, and the folder.
+    """
+    kept = {key: source.description[key] for key in ("name", "seeds", "environment", "simulator")}
+    taken = versions_at_home(source.description["name"]) if out is None else []
+    version = Version.parse(source.description["version"]).next(change, taken)
+    identities = [dataset.identity for dataset in (source, *parents)]
+    changed = {"version": str(version), "stage": stage, "config": dict(config), "parents": identities}
+    description = {**kept, **changed, **more}
+    return description, place(description) if out is None else out

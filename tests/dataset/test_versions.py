@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import pytest
+from fake_dataset import write_fake
+
+from astra_data.dataset.versions import Version, locate, open_dataset, place, successor
+from astra_data.errors import BadInputError
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+def versions(*texts: str) -> list[Version]:
+    return [Version.parse(text) for text in texts]
+
+
+def test_versions_order_as_numbers() -> None:
+    assert sorted(versions("1.10.0", "1.9.3", "0.0.1")) == versions("0.0.1", "1.9.3", "1.10.0")
+    assert str(Version.parse("1.10.0")) == "1.10.0"
+    with pytest.raises(BadInputError, match="expected three numbers"):
+        Version.parse("1.2")
+
+
+def test_each_kind_of_change_moves_its_number() -> None:
+    version = Version.parse("1.2.3")
+    assert str(version.next("columns")) == "2.0.0"
+    assert str(version.next("episodes")) == "1.3.0"
+    assert str(version.next("description")) == "1.2.4"
+
+
+def test_the_next_version_is_free() -> None:
+    taken = versions("1.2.3", "1.4.0", "1.2.7", "3.1.0")
+    version = Version.parse("1.2.3")
+    assert str(version.next("columns", taken)) == "4.0.0"
+    assert str(version.next("episodes", taken)) == "1.5.0"
+    assert str(version.next("description", taken)) == "1.2.8"
+
+
+def test_a_dataset_is_found_by_folder_name_and_version(home: Path, tmp_path: Path) -> None:
+    for version in ("1.2.0", "1.10.0"):
+        (home / f"ant/data-{version}").mkdir(parents=True)
+    (home / "ant/.data-2.0.0.tmp-1").mkdir()
+    assert locate("ant") == home / "ant/data-1.10.0"
+    assert locate("ant@data-1.2.0") == locate("ant@1.2.0") == home / "ant/data-1.2.0"
+    assert locate(str(tmp_path)) == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ("ent", "did you mean 'ant'"),
+        ("ant@data-9.0.0", "no version data-9.0.0 in .*home; it has data-1.2.0"),
+        ("some/where", "no such folder"),
+    ],
+)
+def test_a_dataset_that_is_not_there_is_told(home: Path, asked: str, told: str) -> None:
+    (home / "ant/data-1.2.0").mkdir(parents=True)
+    with pytest.raises(BadInputError, match=told):
+        locate(asked)
+
+
+def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:
+    source = write_fake(tmp_path / "first")
+    description, folder = successor(source, "episodes", stage="subset", config={"count": 2})
+    assert description["version"] == "1.1.0"
+    assert description["parents"] == [source.identity]
+    assert folder == place(description) == home / source.description["name"] / "data-1.1.0"
+    folder.mkdir(parents=True)
+    assert successor(source, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
+    elsewhere = successor(source, "columns", stage="pair", config={}, out=tmp_path / "here")
+    assert (elsewhere[0]["version"], elsewhere[1]) == ("2.0.0", tmp_path / "here")
+    assert open_dataset(tmp_path / "first").reference == source.reference
