@@ -22,7 +22,7 @@ from astra_data.columns import (
     Column,
     Episode,
 )
-from astra_data.dataset import Dataset, DatasetWriter, atomic
+from astra_data.dataset import Dataset, DatasetWriter, StagedWriter, atomic
 
 COLUMNS = (
     Column(
@@ -85,6 +85,11 @@ def write_fake(root: Path, **changes: Any) -> Dataset:  # noqa: ANN401
         for episode in fake_episodes():
             open_writer.add(episode)
     return Dataset.open(root)
+
+
+def staged_writer(root: Path, **changes: Any) -> StagedWriter:  # noqa: ANN401
+    settings: dict[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
+    return StagedWriter(root, **settings | changes)
 
 
 def concatenated(name: str) -> Array:

@@ -8,6 +8,7 @@
 """
 
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.writer import DatasetWriter
 
-__all__ = ["Dataset", "DatasetWriter"]
+__all__ = ["Dataset", "DatasetWriter", "StagedWriter"]

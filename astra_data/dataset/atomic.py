@@ -32,10 +32,10 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         try:
             yield folder
             for path in folder.rglob("*"):
-                _sync(path)
+                sync(path)
             _refuse(target)
             os.replace(folder, target)
-            _sync(target.parent)
+            sync(target.parent)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -53,7 +53,8 @@ def _sweep(target: Path) -> None:
                     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Have a file or folder on the disk itself before going on."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -15,6 +15,7 @@ from astra_data import columns as names
 from astra_data.columns import Array, Column, Episode, Scalar
 from astra_data.dataset import format as layout
 from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.episode_checks import EpisodeChecks
 from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
 from astra_data.dataset.provenance import ContentHash, complete_description, permutation
@@ -83,7 +84,7 @@ class DatasetWriter:
         self._frames = 0
         self._lengths: dict[int, int] = {}
         self._metadata: list[Mapping[str, Scalar]] = []
-        self._metadata_types: dict[str, type] = {}
+        self._checks = EpisodeChecks(columns)
         self._exit = ExitStack()
 
     def __enter__(self) -> "DatasetWriter":
@@ -103,9 +104,7 @@ class DatasetWriter:
 
     def add(self, episode: Episode) -> None:
         """Append `episode`; one that is refused leaves the dataset as it was."""
-        faults = self._faults(episode)
-        if faults:
-            raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
+        self._checks.accept(episode)
         length = len(episode)
         frames = np.arange(length)
         values = {name: episode.columns[name] for name in self._columns} | {
@@ -126,22 +125,6 @@ class DatasetWriter:
         self._frames += length
         self._lengths[episode.uid] = length
         self._metadata.append(episode.metadata)
-        self._metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
-
-    def _faults(self, episode: Episode) -> list[str]:
-        faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
-        for name, values in episode.columns.items():
-            column = self._columns.get(name)
-            faults += column.faults(values) if column else [f"{name}: unknown column"]
-        for key, value in episode.metadata.items():
-            found, known = type(value), self._metadata_types.get(key, type(value))
-            if found is not known:
-                faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
-            if key in layout.METADATA_KEYS:
-                faults.append(f"metadata {key}: is the writer's, leave it out")
-        if episode.uid in self._lengths:
-            faults.append("an earlier episode has the same uid")
-        return faults
 
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -163,7 +146,7 @@ class DatasetWriter:
         self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
         metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}
-        for key, kind_ in sorted(self._metadata_types.items()):
+        for key, kind_ in sorted(self._checks.metadata_types.items()):
             metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
         faults = Dataset.open(self._folder).verify()

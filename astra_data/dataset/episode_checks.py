@@ -1,0 +1,47 @@
+"""Does an episode fit the dataset that it is added to?"""
+
+from collections.abc import Sequence
+
+from astra_data.columns import Column, Episode
+from astra_data.dataset.format import METADATA_KEYS
+from astra_data.errors import BadInputError
+
+
+class EpisodeChecks:
+    """Checks one episode after another against the dataset's columns and against the earlier ones.
+
+    Attributes:
+        metadata_types: type of each metadata key seen so far.
+    """
+
+    def __init__(self, columns: Sequence[Column]) -> None:
+        self._columns = {column.name: column for column in columns}
+        self._uids: set[int] = set()
+        self.metadata_types: dict[str, type] = {}
+
+    def accept(self, episode: Episode) -> None:
+        """Remember `episode`, or refuse it.
+
+        Raises:
+            BadInputError: it does not fit; lists every fault.
+        """
+        faults = self._faults(episode)
+        if faults:
+            raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
+        self._uids.add(episode.uid)
+        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
+
+    def _faults(self, episode: Episode) -> list[str]:
+        faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
+        for name, values in episode.columns.items():
+            column = self._columns.get(name)
+            faults += column.faults(values) if column else [f"{name}: unknown column"]
+        for key, value in episode.metadata.items():
+            found, known = type(value), self.metadata_types.get(key, type(value))
+            if found is not known:
+                faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
+            if key in METADATA_KEYS:
+                faults.append(f"metadata {key}: is the writer's, leave it out")
+        if episode.uid in self._uids:
+            faults.append("an earlier episode has the same uid")
+        return faults

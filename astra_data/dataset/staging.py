@@ -1,0 +1,200 @@
+"""Record episodes that cannot be had again: each is safe on disk at once, and a killed recording goes on.
+
+<parent>/.<name>.staged/plan.json            what is being recorded
+<parent>/.<name>.staged/000012.arrow         one finished episode
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import pyarrow as pa
+
+from astra_data.columns import Column, Episode
+from astra_data.dataset import format as layout
+from astra_data.dataset.atomic import sync
+from astra_data.dataset.episode_checks import EpisodeChecks
+from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.lock import held
+
+
+class StagedWriter:
+    """Writes a dataset whose episodes must not be lost, such as a robot's.
+
+        with StagedWriter(root, columns, fps=20, task="walk", description=..., resume=True) as writer:
+            writer.add(episode)
+
+    An episode is safe when `add` returns. Leaving the block turns all of them into the dataset; after an
+    exception or a kill they wait, and a writer with `resume` goes on with them.
+
+    Attributes:
+        staged: positions of the episodes that are safe; the dataset has them in this order.
+        made: as in `DatasetWriter`.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        columns: Sequence[Column],
+        *,
+        fps: int,
+        task: str,
+        description: Mapping[str, Any],
+        subset_seed: int = 0,
+        resume: bool = False,
+        fsync: bool = True,
+    ) -> None:
+        """Prepare to record; entering the block starts.
+
+        Args:
+            root: the dataset's folder; must not exist yet.
+            columns: as in `DatasetWriter`, like `fps`, `task`, `description` and `subset_seed`.
+            fps: steps per second.
+            task: what the episodes do.
+            description: where they come from.
+            subset_seed: of the permutation whose prefixes are the nested subsets.
+            resume: go on with what an interrupted recording left, if anything.
+            fsync: have every episode on the disk itself when `add` returns, so that it outlives a power
+                failure, and not only a killed process. Costs about 5 ms per episode.
+
+        Raises:
+            BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
+        """
+        self._writer = DatasetWriter(
+            root, columns, fps=fps, task=task, description=description, subset_seed=subset_seed
+        )
+        self.root = root
+        self.made: dict[str, Any] = {}
+        self.staged: set[int] = set()
+        self._folder = root.with_name(f".{root.name}.staged")
+        self._columns = list(columns)
+        self._schema = layout.data_schema(columns)
+        self._plan = {
+            "columns": {column.name: column.feature() for column in columns},
+            "fps": fps,
+            "task": task,
+            "description": dict(description),
+            "subset_seed": subset_seed,
+        }
+        self._resume = resume
+        self._fsync = fsync
+        self._checks = EpisodeChecks(columns)
+        self._exit = ExitStack()
+
+    def __enter__(self) -> "StagedWriter":
+        """Start the recording, or go on with it."""
+        waiting = len(list(self._folder.glob("*.arrow")))
+        if waiting and not self._resume and not self.root.exists():
+            raise BadInputError(
+                f"{self.root}: an interrupted recording left {waiting} episodes; "
+                f"resume it, or delete {self._folder} to start anew."
+            )
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            if not stack.enter_context(held(self._folder)):
+                raise BadInputError(
+                    f"{self.root} is being recorded right now; wait or choose another folder."
+                )
+            if self.root.exists():
+                # What is still staged is in the dataset: the process was killed before it could clean up.
+                shutil.rmtree(self._folder)
+                raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
+            self._agree_on_the_plan()
+            for path in sorted(self._folder.glob("*.arrow")):
+                self._checks.accept(self._load(path))
+                self.staged.add(int(path.stem))
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write the dataset and remove the staged episodes; after an error, leave them to be resumed."""
+        with self._exit:
+            try:
+                if error is None:
+                    self._writer.made = self.made
+                    with self._writer:
+                        for position in sorted(self.staged):
+                            self._writer.add(self._load(self._path(position)))
+            finally:
+                if self.root.exists() or not self.staged:
+                    shutil.rmtree(self._folder)
+
+    def add(self, episode: Episode, position: int | None = None) -> None:
+        """Make `episode` safe; one that is refused changes nothing.
+
+        Args:
+            episode: the episode.
+            position: its place in the dataset, by default after the last one.
+
+        Raises:
+            BadInputError: it does not fit the columns, or the place is taken.
+        """
+        place = max(self.staged, default=-1) + 1 if position is None else position
+        if place in self.staged:
+            raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
+        self._checks.accept(episode)
+        told = json.dumps({"uid": episode.uid, "metadata": dict(episode.metadata)})
+        schema = self._schema.with_metadata({"episode": told})
+        arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]
+        path = self._path(place)
+        partial = path.with_suffix(".partial")
+        with pa.OSFile(str(partial), "wb") as sink, pa.ipc.new_file(sink, schema) as file:
+            file.write_table(pa.Table.from_arrays(arrays, schema=schema))
+        if self._fsync:
+            sync(partial)
+        os.replace(partial, path)
+        if self._fsync:
+            sync(self._folder)
+        self.staged.add(place)
+
+    def _path(self, position: int) -> Path:
+        return self._folder / f"{position:06d}.arrow"
+
+    def _load(self, path: Path) -> Episode:
+        try:
+            with pa.memory_map(str(path)) as source, pa.ipc.open_file(source) as file:
+                table = file.read_all()
+                told = json.loads(table.schema.metadata[b"episode"])
+                values = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in self._columns}
+        except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+            raise CorruptDatasetError(
+                f"{path} is no whole episode ({first_line(error)}); delete it and resume the recording."
+            ) from error
+        return Episode(told["uid"], values, told["metadata"])
+
+    def _agree_on_the_plan(self) -> None:
+        path = self._folder / "plan.json"
+        text = json.dumps(self._plan, indent=1, sort_keys=True)
+        if path.exists():
+            before, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
+            differing = _differences(before, now)
+            if differing:
+                raise BadInputError(
+                    f"{self.root}: the interrupted recording differs in {', '.join(differing)}; "
+                    f"resume it with the same settings, or delete {self._folder}."
+                )
+        partial = path.with_suffix(".partial")
+        partial.write_text(text, encoding="utf-8")
+        sync(partial)
+        os.replace(partial, path)
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Return the dotted keys whose values differ."""
+    differing = []
+    for key in sorted(before.keys() | now.keys()):
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            differing += _differences(old, new, f"{prefix}{key}.")
+        elif old != new:
+            differing.append(f"{prefix}{key}")
+    return differing
