@@ -6,8 +6,8 @@ words       errors  columns  seeding  recipe  rows  batched  simulator  progress
 knowledge   mazes  free_space  navigation  ant  physics  abstraction  checkpoint  models/
 data        dataset/  grounding_file  target_encoder_file  figures/  results/
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
-learning    tasks  world  training_world  method  policy_file  deployment  gap  mismatch  gymnasium_faces
-            learners/
+learning    tasks  world  target_world  training_world  method  policy_file  deployment  behaviors  gap
+            mismatch  gymnasium_faces  pairing  learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect pair ground train align evaluate report)
 roof        plan  schedule  display  run  commands/  cli

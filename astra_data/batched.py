@@ -45,15 +45,3 @@ class BatchedEnv(Protocol):
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A) to every row."""
         ...
-
-
-class ResumableEnv(BatchedEnv, Protocol):
-    """An environment that a training can be resumed in."""
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return everything that `load_state_dict` needs to go on from here."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
-        """Go on from `state`; return the observations (B, O)."""
-        ...

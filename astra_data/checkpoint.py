@@ -1,5 +1,6 @@
 """Weights and training states on disk: safetensors and JSON, whole or not at all, nothing unpickled."""
 
+import hashlib
 import json
 import os
 import re
@@ -46,6 +47,11 @@ def _with_sorted_metadata(data: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data[start:]
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

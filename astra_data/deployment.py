@@ -1,4 +1,4 @@
-"""Run a policy in worlds: step by step, deterministically, with its encoders and memory carried along."""
+"""Run a policy in worlds: step by step, with its encoders and memory carried along."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -31,8 +31,15 @@ class DeployedPolicy:
     target_encoder: TargetEncoder | None = None
     command_limit_m_s: float = 2.0
 
-    def start(self, count: int) -> None:
-        """Forget everything; B = `count`."""
+    @property
+    def observation_size(self) -> int:
+        """Values that the task and the grounding show to a policy."""
+        navigation = len(policy_observation(self.task.maze, torch.zeros(4), torch.zeros(2), None))
+        return navigation + (self.model.shape.latent_size if self.model is not None else 0)
+
+    def start(self, count: int, generator: torch.Generator | None = None) -> None:
+        """Forget everything; B = `count`. With `generator`, actions are drawn as in training."""
+        self._generator = generator
         self._previous_output = torch.zeros(count, self.policy.shape.action_size)
         self._previous_action = torch.zeros_like(self._previous_output)
         self._hidden = self.policy.initial_hidden(count)
@@ -52,7 +59,9 @@ class DeployedPolicy:
             latent = encoder.encoder.latent(self._encoder_hidden)
         observation = policy_observation(self.task.maze, abstract, goal, latent)
         features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
-        mean, _ = self.policy.policy(features)
-        self._previous_output = mean
-        self._previous_action = limit_command(mean, self.command_limit_m_s)
+        output, std = self.policy.policy(features)
+        if self._generator is not None:
+            output = torch.normal(output, std, generator=self._generator).clamp(-1.0, 1.0)
+        self._previous_output = output
+        self._previous_action = limit_command(output, self.command_limit_m_s)
         return self._previous_action

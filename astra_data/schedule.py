@@ -30,7 +30,7 @@ class Item:
 
     key: str
     inputs: tuple[str, ...]
-    call: Callable[..., None]
+    call: Callable[..., object]
 
 
 class Watcher(Protocol):
@@ -173,7 +173,7 @@ def _serve(connection: Connection, prepare: Callable[[], object] | None) -> None
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
         # The log is in place before the item's modules are imported, which is when they may warn.
-        call: Callable[..., None] = connection.recv()
+        call: Callable[..., object] = connection.recv()
         try:
             call(progress=_Reporter(connection))
         except AstraDataError as error:

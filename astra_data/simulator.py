@@ -1,20 +1,22 @@
-"""What the toolkit needs of an abstract simulator; bring your own by writing these three."""
+"""What the toolkit needs of an abstract simulator; bring your own by writing these four."""
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from torch import Tensor
 
 
 class AbstractSimulator(Protocol):
-    """B abstract states that can be set and stepped.
+    """B abstract states that can be set and stepped."""
 
-    Attributes:
-        state: (B, X) float32.
-    """
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """What a dataset paired with this simulator records about it."""
+        ...
 
     @property
     def state(self) -> Tensor:
-        """The present states, (B, X)."""
+        """The present states, (B, X) float32."""
         ...
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:

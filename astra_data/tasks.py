@@ -26,6 +26,7 @@ class Task:
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
+        simulator_id: names the abstract simulator in datasets.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Task:
     state_columns: tuple[Column, ...]
     abstract_state: Column
     timestep_s: float
+    simulator_id: str = "point_mass"
 
     @property
     def maze(self) -> Maze:

@@ -32,6 +32,8 @@ class Contents:
         lengths: steps of each episode, (E,).
         starts: first row of each episode, (E,).
         order: the permutation of episode indices whose prefixes are the nested subsets.
+        subset_seed: its seed.
+        task: what the episodes do.
         paths: the data files in order.
     """
 
@@ -43,6 +45,8 @@ class Contents:
     lengths: Ints
     starts: Ints
     order: list[int]
+    subset_seed: int
+    task: str
     paths: list[Path]
 
 
@@ -73,8 +77,9 @@ def read_contents(root: Path) -> Contents:
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
     tables = list(read_blocks(sorted((root / "meta/episodes").glob("*/*.parquet")), _LOCATION))
     facts = list(read_blocks([root / layout.METADATA_PATH]))
-    if not tables or not facts:
-        raise CorruptDatasetError(f"meta/episodes or {layout.METADATA_PATH} has no rows")
+    tasks = list(read_blocks([root / layout.TASKS_PATH], ["task"]))
+    if not tables or not facts or not tasks:
+        raise CorruptDatasetError(f"meta/episodes, {layout.METADATA_PATH} or {layout.TASKS_PATH} has no rows")
     metadata = pa.concat_tables(facts).to_pydict()
     index, lengths, chunks, files, starts = (
         to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
@@ -99,8 +104,19 @@ def read_contents(root: Path) -> Contents:
     if faults:
         raise CorruptDatasetError("; ".join(faults))
     position = {uid: episode for episode, uid in enumerate(uids.tolist())}
-    order = [position[uid] for uid in subsets["uids"]]
-    return Contents(root, info, description, metadata, uids, lengths, starts, order, list(rows))
+    return Contents(
+        root=root,
+        info=info,
+        description=description,
+        metadata=metadata,
+        uids=uids,
+        lengths=lengths,
+        starts=starts,
+        order=[position[uid] for uid in subsets["uids"]],
+        subset_seed=subsets["seed"],
+        task=tasks[0].column("task")[0].as_py(),
+        paths=list(rows),
+    )
 
 
 def _read_json(path: Path) -> dict[str, Any]:

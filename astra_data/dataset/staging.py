@@ -15,7 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from astra_data.columns import Column, Episode
+from astra_data.columns import Column, Episode, Scalar
 from astra_data.dataset import format as layout
 from astra_data.dataset.atomic import sync
 from astra_data.dataset.episode_checks import EpisodeChecks
@@ -35,7 +35,7 @@ class StagedWriter:
     exception or a kill they wait, and a writer with `resume` goes on with them.
 
     Attributes:
-        staged: positions of the episodes that are safe; the dataset has them in this order.
+        staged: metadata of the episodes that are safe, by their position in the dataset.
         made: as in `DatasetWriter`.
     """
 
@@ -72,7 +72,7 @@ class StagedWriter:
         )
         self.root = root
         self.made: dict[str, Any] = {}
-        self.staged: set[int] = set()
+        self.staged: dict[int, Mapping[str, Scalar]] = {}
         self._folder = root.with_name(f".{root.name}.staged")
         self._columns = list(columns)
         self._schema = layout.data_schema(columns)
@@ -108,8 +108,9 @@ class StagedWriter:
                 raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
             self._agree_on_the_plan()
             for path in sorted(self._folder.glob("*.arrow")):
-                self._checks.accept(self._load(path))
-                self.staged.add(int(path.stem))
+                episode = self._load(path)
+                self._checks.accept(episode)
+                self.staged[int(path.stem)] = episode.metadata
             self._exit = stack.pop_all()
         return self
 
@@ -154,7 +155,7 @@ class StagedWriter:
         os.replace(partial, path)
         if self._fsync:
             sync(self._folder)
-        self.staged.add(place)
+        self.staged[place] = episode.metadata
 
     def _path(self, position: int) -> Path:
         return self._folder / f"{position:06d}.arrow"

@@ -18,7 +18,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from astra_data.batched import ResumableEnv
+from astra_data.batched import BatchedEnv
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.seeding import derive
@@ -62,7 +62,7 @@ class Ppo:
     """
 
     def __init__(
-        self, env: ResumableEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
+        self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
     ) -> None:
         """Prepare to train `policy` in `env`.
 

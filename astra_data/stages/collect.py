@@ -1,4 +1,4 @@
-"""Collect: random behaviour in the target environment, stored as a LeRobot dataset."""
+"""Collect: a behaviour in the target environment, stored as a LeRobot dataset."""
 
 import time
 from pathlib import Path
@@ -6,7 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands, suboptimal_policy
+from astra_data.checkpoint import file_hash
 from astra_data.columns import (
     ACTION,
     DONE,
@@ -21,25 +24,44 @@ from astra_data.columns import (
     Array,
     Episode,
 )
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.staging import StagedWriter
+from astra_data.deployment import DeployedPolicy
+from astra_data.envs.antmaze import AntMazeEnv
+from astra_data.errors import BadInputError
+from astra_data.grounding_file import load_grounding
+from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative
 from astra_data.results.provenance import machine
-from astra_data.seeding import derive, generator
+from astra_data.seeding import derive
+from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
 
 
 class CollectConfig(Config):
     """What to collect; 200 episodes of random behaviour of up to 500 steps are the paper's."""
 
-    behavior: Literal["random"] = "random"
-    """"random": commands drawn from U[-1, 1]² m/s, each held for a while."""
+    behavior: Literal["random", "policy", "suboptimal_ppo"] = "random"
+    """"random": commands drawn from U[-1, 1]² m/s, each held for a while. "policy": a saved policy, and
+    "suboptimal_ppo": one trained by PPO in the target and stopped early; both draw actions as in training."""
     episodes: Count = 200
-    """Recorded side by side."""
+    """In all."""
     max_steps: Count = 500
     """Longest episode, in control steps; longer ones are truncated."""
+    num_envs: Count = 200
+    """Episodes recorded side by side; decides which random numbers an episode gets."""
+    start: Literal["anywhere", "task"] = "anywhere"
+    """Where episodes start: anywhere in the free space, or where the task does."""
     hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
+    ppo_steps: Count = 300_000
+    """Environment steps after which the suboptimal policy's training is stopped."""
+    policy: str | None = None
+    """Folder of the saved policy, as the stage `train` writes it."""
+    grounding: str | None = None
+    """Folder of the grounding that the saved policy's latent comes from, if it has one."""
+    target_encoder: str | None = None
+    """Folder of the aligned target encoder; by default the grounding's own encoder is used."""
 
 
 def collect(
@@ -50,93 +72,169 @@ def collect(
     out: Path,
     progress: Progress,
     num_threads: int | None = None,
+    name: str | None = None,
+    resume: bool = True,
 ) -> None:
-    """Record episodes that start anywhere in the free space and write them to `out`.
+    """Record episodes in the target and write them to `out`.
 
     The physics runs on `num_threads`, by default one per core; the outcome is the same with any number.
 
+    Args:
+        task: a name in `TASKS`.
+        config: what to collect.
+        seed: of everything random.
+        out: the dataset's folder.
+        progress: is told how far it is.
+        num_threads: of the physics.
+        name: the dataset's, by default made of task, behaviour and seed.
+        resume: go on with the finished episodes that an interrupted call left.
+
     Raises:
-        BadInputError: the task is unknown or `out` exists.
+        BadInputError: the task is unknown, `out` exists, or the behaviour lacks something.
     """
     world = task_named(task)
     began = time.perf_counter()
     description = {
-        "name": f"{task}-{config.behavior}",
+        "name": name or f"{task}-{config.behavior}-seed{seed}".replace("_", "-"),
         "stage": "collect",
         "config": config.model_dump(mode="json"),
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
         "environment": {"id": task, "integrator": "RK4", "timestep_s": world.timestep_s, "leg_scale": 1.0},
     }
-    with DatasetWriter(
+    with StagedWriter(
         out,
         [*world.state_columns, *OUTCOME_COLUMNS],
         fps=world.fps,
         task=world.instruction,
         description=description,
         subset_seed=derive(seed, "subset"),
+        resume=resume,
+        fsync=False,
     ) as writer:
-        columns, lengths = _record(world, config, seed, num_threads, progress)
-        rate = float(lengths.sum() / (time.perf_counter() - began))
-        for index, length in enumerate(lengths):
-            values = {name: stacked[:length, index] for name, stacked in columns.items()}
-            writer.add(
-                Episode(
-                    uid=index,
-                    columns=values,
-                    metadata={
-                        "success": bool(values[SUCCESS].any()),
-                        "toppled": bool(values[TERMINATED][-1] and not values[SUCCESS][-1]),
-                        "return": float(values[REWARD].sum(dtype=np.float64)),
-                        "seed": seed,
-                    },
-                )
-            )
+        behavior, told = _behavior(world, config, seed, num_threads, progress)
+        trained = time.perf_counter()
+        steps = 0
+        for first in range(0, config.episodes, config.num_envs):
+            rows = range(first, min(first + config.num_envs, config.episodes))
+            if not writer.staged.keys() >= set(rows):
+                steps += _record(world, config, behavior, rows, seed, writer, num_threads, progress)
+        rate = steps / (time.perf_counter() - trained)
+        returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
+        told |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
         seconds = time.perf_counter() - began
-        writer.made = {"wall_seconds": seconds, "target_steps_per_second": rate, "machine": machine()}
-    progress(1.0, f"{len(lengths)} episodes, {rate:,.0f} target steps/s")
+        writer.made = {
+            "behavior": told,
+            "wall_seconds": seconds,
+            "target_steps_per_second": rate,
+            "machine": machine(),
+        }
+    note = f"return {told['return_mean']:.2f}, success {told['success_rate']:.2f}"
+    progress(1.0, f"{config.episodes} episodes, {note}, {rate:,.0f} target steps/s")
+
+
+def _behavior(
+    task: Task, config: CollectConfig, seed: int, num_threads: int | None, progress: Progress
+) -> tuple[Behavior, dict[str, Any]]:
+    """Return what acts, and what is to be told about it."""
+    if config.behavior == "random":
+        fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
+        return RandomCommands((fewest, most)), {}
+    if config.behavior == "suboptimal_ppo":
+        deployed = suboptimal_policy(
+            task, steps=config.ppo_steps, seed=seed, num_threads=num_threads, progress=progress
+        )
+        return PolicyBehavior(deployed), {"trained_steps": config.ppo_steps}
+    if config.policy is None:
+        raise BadInputError('behaviour "policy": expected the folder of a trained policy as policy, got none')
+    path = Path(config.policy) / "policy.safetensors"
+    trained = PolicyFile.load(path)
+    model = load_grounding(Path(config.grounding) / "grounding.safetensors") if config.grounding else None
+    encoder = None
+    if config.target_encoder:
+        encoder = load_target_encoder(Path(config.target_encoder) / "target_encoder.safetensors")
+    deployed = DeployedPolicy(task, trained.policy, model, encoder, trained.world.command_limit_m_s)
+    if deployed.observation_size != trained.policy.shape.observation_size:
+        raise BadInputError(
+            f"{path} sees {trained.policy.shape.observation_size} values, the task shows "
+            f"{deployed.observation_size}: expected a policy of {task.name} and, if it was trained in a "
+            "grounded simulator, its grounding"
+        )
+    return PolicyBehavior(deployed), {"policy_dataset": trained.dataset, "policy_sha256": file_hash(path)}
 
 
 def _record(
-    task: Task, config: CollectConfig, seed: int, num_threads: int | None, progress: Progress
-) -> tuple[dict[str, Array], Array]:
-    """Return columns (T, B, ...) of all episodes side by side, and their lengths (B,)."""
-    count = config.episodes
-    env = task.target(count, seed=derive(seed, "collect"), start_anywhere=True, num_threads=num_threads)
-    rng = generator(seed, "behavior")
+    task: Task,
+    config: CollectConfig,
+    behavior: Behavior,
+    rows: range,
+    seed: int,
+    writer: StagedWriter,
+    num_threads: int | None,
+    progress: Progress,
+) -> int:
+    """Record the episodes `rows` side by side, staging each when it ends; return the number of steps.
+
+    The outcome depends on the whole batch, so episodes of it that are staged already are recorded again,
+    with the same outcome, and left alone.
+    """
+    count = len(rows)
+    batch_seed = derive(seed, f"episodes from {rows.start}") if rows.start else seed
+    env = task.target(
+        count,
+        seed=derive(batch_seed, "collect"),
+        start_anywhere=config.start == "anywhere",
+        num_threads=num_threads,
+    )
     env.reset()
-    low, high = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
-    command = np.zeros((count, 2))
-    hold = np.zeros(count, dtype=int)
-    lengths = np.zeros(count, dtype=int)
+    behavior.start(count, batch_seed)
     active = torch.ones(count, dtype=torch.bool)
-    rows: dict[str, list[Any]] = {}
+    columns: dict[str, Array] = {}
+    steps = 0
     began = time.perf_counter()
     for step in range(config.max_steps):
-        due = np.flatnonzero(hold == 0)
-        command[due] = rng.uniform(-1.0, 1.0, (len(due), 2))
-        hold[due] = rng.integers(low, high + 1, len(due))
-        hold -= 1
-        action = torch.from_numpy(command).float()
-        state = env.state
-        outcome = env.step(action, active)
-        truncated = torch.full((count,), step == config.max_steps - 1) & ~outcome.terminated
-        row = {
-            STATE: state,
-            GOAL: env.goal.clone(),
-            ACTION: action,
-            NEXT_STATE: env.state,
-            REWARD: outcome.reward,
-            TERMINATED: outcome.terminated,
-            TRUNCATED: truncated,
-            DONE: outcome.terminated | truncated,
-            SUCCESS: outcome.success,
-        }
+        row = _step(env, behavior, active, last=step == config.max_steps - 1)
         for name, values in row.items():
-            rows.setdefault(name, []).append(values.numpy())
-        lengths += active.numpy()
-        active &= ~outcome.terminated
-        rate = lengths.sum() / (time.perf_counter() - began)
-        progress((step + 1) / config.max_steps, f"{rate:,.0f} target steps/s")
+            if name not in columns:
+                columns[name] = np.empty((config.max_steps, *values.shape), values.numpy().dtype)
+            columns[name][step] = values.numpy()
+        steps += int(active.sum())
+        for index in torch.nonzero(active & row[DONE]).squeeze(1).tolist():
+            if rows[index] not in writer.staged:
+                episode = {name: values[: step + 1, index] for name, values in columns.items()}
+                writer.add(_episode(rows[index], episode, seed), rows[index])
+        active &= ~row[DONE]
+        done = rows.start + count * (step + 1) / config.max_steps
+        rate = steps / (time.perf_counter() - began)
+        progress(done / config.episodes, f"{rate:,.0f} target steps/s")
         if not active.any():
             break
-    return {name: np.stack(values) for name, values in rows.items()}, lengths
+    return steps
+
+
+def _step(env: AntMazeEnv, behavior: Behavior, active: Tensor, *, last: bool) -> dict[str, Tensor]:
+    state, goal = env.state, env.goal.clone()
+    action = behavior.act(state, goal)
+    outcome = env.step(action, active)
+    truncated = torch.full_like(outcome.terminated, last) & ~outcome.terminated
+    return {
+        STATE: state,
+        GOAL: goal,
+        ACTION: action,
+        NEXT_STATE: env.state,
+        REWARD: outcome.reward,
+        TERMINATED: outcome.terminated,
+        TRUNCATED: truncated,
+        DONE: outcome.terminated | truncated,
+        SUCCESS: outcome.success,
+    }
+
+
+def _episode(uid: int, values: dict[str, Array], seed: int) -> Episode:
+    success = bool(values[SUCCESS].any())
+    metadata = {
+        "success": success,
+        "toppled": bool(values[TERMINATED][-1]) and not success,
+        "return": float(values[REWARD].sum(dtype=np.float64)),
+        "seed": seed,
+    }
+    return Episode(uid, values, metadata)

@@ -1,6 +1,7 @@
 """Pair: put the abstract simulator where the target was, give it the same action, keep where it lands."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,12 +19,19 @@ from astra_data.columns import (
     Episode,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError
+from astra_data.pairing import Pairing, checked_abstraction, explained, pairing_named
 from astra_data.progress import Progress
 from astra_data.recipe import Config, NotNegative
 from astra_data.results.provenance import machine
-from astra_data.tasks import Task, task_named
+from astra_data.simulator import AbstractSimulator
+
+BATCH = 4096
+"""Simulators that are reset and stepped side by side."""
+_BLOCK = 8 * BATCH
+"""Steps that are held in memory before they are paired, rounded up to whole episodes."""
 
 
 class PairConfig(Config):
@@ -33,74 +41,160 @@ class PairConfig(Config):
     """Largest difference between φ(s) and what the simulator shows after being reset to it."""
 
 
-def pair(task: str, config: PairConfig, *, dataset: Path, out: Path, progress: Progress) -> None:
-    """Add the columns `abstract.*` to `dataset`, one vectorised reset and step per episode.
+def pair(
+    simulator: str, config: PairConfig, *, dataset: Path, out: Path | None = None, progress: Progress
+) -> Path:
+    """Add the columns `abstract.*` to `dataset`, vectorised over its steps; return the new folder.
+
+    Args:
+        simulator: a task, for its abstract simulator, or `path.py:MySimulator`; see `pairing_named`.
+        config: settings.
+        dataset: folder of the dataset.
+        out: folder of the new version, by default its place at home.
+        progress: is told how far it is.
 
     Raises:
-        BadInputError: the simulator does not show the state it was reset to.
+        BadInputError: the simulator does not show the state it was reset to, or does not fit the dataset.
         CorruptDatasetError: `dataset` is incomplete.
     """
-    world = task_named(task)
+    pairing = pairing_named(simulator)
     source = Dataset.open(dataset)
+    _check_columns(source)
     began = time.perf_counter()
-    description = {
-        "name": source.description["name"],
-        "stage": "pair",
-        "config": config.model_dump(mode="json"),
-        "parents": [source.identity],
-        "seeds": source.description["seeds"],
-        "environment": source.description["environment"],
-        "simulator": {"id": "point_mass", **world.simulator(1).parameters},
-    }
+    with explained(f"{pairing.id}({BATCH})"):
+        batch = pairing.simulator(BATCH)
+    description, out = successor(
+        source,
+        "columns",
+        stage="pair",
+        config=config.model_dump(mode="json"),
+        out=out,
+        simulator={"id": pairing.id, **batch.parameters},
+    )
     meanings = {
+        ABSTRACT_STATE: "abstract state of the target before the action",
         ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
         ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
     }
-    added = [replace(world.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
-    steps = 0
+    added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
+    steps, simulating, reset_error = 0, 0.0, 0.0
     with DatasetWriter(
         out,
-        [*source.schema, world.abstract_state, *added],
+        [*source.schema, *added],
         fps=source.info["fps"],
-        task=world.instruction,
+        task=source.task,
         description=description,
-        subset_seed=source.description["seeds"].get("subset", 0),
+        subset_seed=source.subset_seed,
     ) as writer:
-        for index, episode in enumerate(source.episodes()):
-            paired = pair_steps(
-                world,
-                episode.columns[STATE],
-                episode.columns[ACTION],
-                episode.columns[NEXT_STATE],
-                config.reset_tolerance,
+        for episodes in _blocks(source):
+            before = time.perf_counter()
+            state, action, next_state = (
+                np.concatenate([episode.columns[name] for episode in episodes])
+                for name in (STATE, ACTION, NEXT_STATE)
             )
-            writer.add(Episode(episode.uid, {**episode.columns, **paired}, episode.metadata))
-            steps += len(episode)
+            paired, error = pair_steps(
+                pairing, batch, state, action, next_state, tolerance=config.reset_tolerance
+            )
+            simulating += time.perf_counter() - before
+            reset_error = max(reset_error, error)
+            first = 0
+            for episode in episodes:
+                values = {name: array[first : first + len(episode)] for name, array in paired.items()}
+                writer.add(Episode(episode.uid, {**episode.columns, **values}, episode.metadata))
+                first += len(episode)
+            steps += first
             rate = steps / (time.perf_counter() - began)
-            progress((index + 1) / len(source), f"{rate:,.0f} pairs/s")
+            progress(steps / int(source.lengths.sum()), f"{rate:,.0f} pairs/s")
         seconds = time.perf_counter() - began
-        writer.made = {"wall_seconds": seconds, "pairs_per_second": steps / seconds, "machine": machine()}
+        writer.made = {
+            "reset_error": reset_error,
+            "wall_seconds": seconds,
+            "pairs_per_second": steps / seconds,
+            "simulated_pairs_per_second": steps / simulating,
+            "machine": machine(),
+        }
+    return out
 
 
 def pair_steps(
-    task: Task, state: Array, action: Array, next_state: Array, tolerance: float
-) -> dict[str, Array]:
-    """Return the `abstract.*` columns (T, X) for target steps `state` (T, S), `action` (T, A), (T, S)."""
-    abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
-    simulator = task.simulator(len(state))
-    simulator.reset_to(abstract)
-    difference = (simulator.state - abstract).abs()
-    if float(difference.max()) > tolerance:
-        step, entry = divmod(int(difference.argmax()), abstract.shape[1])
-        name = (task.abstract_state.names or range(abstract.shape[1]))[entry]
-        raise BadInputError(
-            f"the simulator, reset to φ(s) of step {step}, shows {name} = "
-            f"{float(simulator.state[step, entry]):.6g} and not {float(abstract[step, entry]):.6g} "
-            f"(tolerance {tolerance:g}): check its reset_to and the task's abstraction"
-        )
-    landed = simulator.step(torch.from_numpy(np.ascontiguousarray(action)))
-    return {
-        ABSTRACT_STATE: abstract.numpy(),
-        ABSTRACT_NEXT_STATE: np.ascontiguousarray(task.abstraction(next_state)),
-        ABSTRACT_SIMULATED_NEXT_STATE: landed.numpy(),
+    pairing: Pairing,
+    batch: AbstractSimulator,
+    state: Array,
+    action: Array,
+    next_state: Array,
+    *,
+    tolerance: float,
+) -> tuple[dict[str, Array], float]:
+    """Reset `batch` to φ of each of N target steps and give it the step's action.
+
+    Args:
+        pairing: the simulator and φ.
+        batch: B of these simulators; the N steps are taken B at a time.
+        state: target states, (N, S).
+        action: (N, A), or (N,).
+        next_state: (N, S).
+        tolerance: see `PairConfig`.
+
+    Returns:
+        the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
+
+    Raises:
+        BadInputError: the difference is larger than `tolerance`, or the simulator gives no numbers.
+    """
+    abstract = checked_abstraction(pairing, state)
+    landed = np.empty_like(abstract)
+    size = len(batch.state)
+    largest = 0.0
+    for first in range(0, len(state), size):
+        rows = np.arange(first, first + size).clip(max=len(state) - 1)
+        wanted = torch.from_numpy(abstract[rows])
+        with explained(f"reset_to of {pairing.id}"):
+            batch.reset_to(wanted)
+        difference = (batch.state - wanted).abs()
+        if not float(difference.max()) <= tolerance:
+            row, entry = divmod(int(difference.argmax()), wanted.shape[1])
+            raise BadInputError(
+                f"the simulator, reset to φ(s) of step {rows[row]}, shows {_name(pairing, entry)} = "
+                f"{float(batch.state[row, entry]):.6g} and not {float(wanted[row, entry]):.6g} "
+                f"(tolerance {tolerance:g}): check its reset_to and the abstraction"
+            )
+        largest = max(largest, float(difference.max()))
+        with explained(f"step of {pairing.id}"):
+            reached = batch.step(torch.from_numpy(action[rows].reshape(size, -1))).numpy()
+        if not np.isfinite(reached).all():
+            row, entry = np.argwhere(~np.isfinite(reached))[0]
+            raise BadInputError(
+                f"the simulator, stepped from φ(s) of step {rows[row]}, gives {_name(pairing, entry)} = "
+                f"{reached[row, entry]}: expected finite states from its step"
+            )
+        landed[first : first + size] = reached[: len(state) - first]
+    columns = {
+        ABSTRACT_STATE: abstract,
+        ABSTRACT_NEXT_STATE: checked_abstraction(pairing, next_state),
+        ABSTRACT_SIMULATED_NEXT_STATE: landed,
     }
+    return columns, largest
+
+
+def _name(pairing: Pairing, entry: int) -> str:
+    names = pairing.abstract_state.names
+    return names[entry] if names else f"value {entry}"
+
+
+def _check_columns(source: Dataset) -> None:
+    faults = [f"no column {name}" for name in (STATE, ACTION, NEXT_STATE) if name not in source.features]
+    if ABSTRACT_STATE in source.features:
+        faults.append(f"{ABSTRACT_STATE} already: it has been paired")
+    if faults:
+        raise BadInputError(f"{source.root} has {' and '.join(faults)}; expected a dataset to be paired")
+
+
+def _blocks(source: Dataset) -> Iterator[list[Episode]]:
+    block: list[Episode] = []
+    for episode in source.episodes():
+        block.append(episode)
+        if sum(map(len, block)) >= _BLOCK:
+            yield block
+            block = []
+    if block:
+        yield block

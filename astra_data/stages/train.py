@@ -99,7 +99,7 @@ def _optimise(
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
         world = {name: values.to(device) for name, values in state["world"].items()}
-        ppo.load_state_dict(state["ppo"], ppo.env.load_state_dict(world))
+        ppo.load_state_dict(state["ppo"], env.load_state_dict(world))
         points, seconds = told["points"], told["seconds"]
     began, first = time.perf_counter() - seconds, ppo.steps
     while not ppo.done:
@@ -115,7 +115,7 @@ def _optimise(
         note = f"{rate:,.0f} steps/s  success of training episodes {success}"
         progress(ppo.steps / ppo.config.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0:
-            state = {"ppo": ppo.state_dict(), "world": ppo.env.state_dict()}
+            state = {"ppo": ppo.state_dict(), "world": env.state_dict()}
             save_tensors(checkpoint, flatten(state), {"points": points, "seconds": seconds})
     return {
         "steps_per_second": ppo.steps / max(seconds, 1e-9),

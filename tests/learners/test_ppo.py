@@ -6,14 +6,14 @@ import pytest
 import torch
 from toy_worlds import ConstantReward, GoToZero, Recall
 
-from astra_data.batched import ResumableEnv
+from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, unflatten
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 
 
 def ppo(
-    env: ResumableEnv,
+    env: BatchedEnv,
     iterations: int,
     *,
     horizon: int,
@@ -56,14 +56,15 @@ def test_learns_to_go_to_a_target() -> None:
 def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
     whole = ppo(GoToZero(8), 6, horizon=7, memory=memory)
     train(whole)
-    begun = ppo(GoToZero(8), 6, horizon=7, memory=memory)
+    world, other_world = GoToZero(8), GoToZero(8)
+    begun = ppo(world, 6, horizon=7, memory=memory)
     for _ in range(3):
         begun.iterate()
-    saved = unflatten(flatten({"ppo": begun.state_dict(), "world": begun.env.state_dict()}))
+    saved = unflatten(flatten({"ppo": begun.state_dict(), "world": world.state_dict()}))
     saved = {name: _cloned(state) for name, state in saved.items()}
     begun.iterate()  # goes on elsewhere; must not reach into what was saved
-    resumed = ppo(GoToZero(8), 6, horizon=7, memory=memory)
-    resumed.load_state_dict(saved["ppo"], resumed.env.load_state_dict(saved["world"]))
+    resumed = ppo(other_world, 6, horizon=7, memory=memory)
+    resumed.load_state_dict(saved["ppo"], other_world.load_state_dict(saved["world"]))
     assert resumed.steps == whole.steps / 2
     train(resumed)
     for name, value in whole.policy.state_dict().items():

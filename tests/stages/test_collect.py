@@ -1,3 +1,4 @@
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +14,20 @@ from astra_data.columns import (
     SUCCESS,
     TERMINATED,
     TRUNCATED,
+    Episode,
 )
-from astra_data.dataset import Dataset
+from astra_data.dataset import Dataset, StagedWriter
 from astra_data.errors import BadInputError
 from astra_data.progress import silent
 from astra_data.stages.collect import CollectConfig, collect
+from astra_data.tasks import TASKS
 
 TINY = CollectConfig(episodes=3, max_steps=15)
 
 
 def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -> None:
     dataset = Dataset.open(collected)
-    assert dataset.reference == f"{TASK}-random@data-1.0.0"
+    assert dataset.reference == f"{TASK}-random-seed0@data-1.0.0"
     assert len(dataset) == COLLECT.episodes
     for index, episode in enumerate(dataset.episodes()):
         columns = episode.columns
@@ -65,6 +68,98 @@ def test_time_speed_and_machine_are_recorded(collected: Path) -> None:
     said = dataset.description
     assert 0 < dataset.lengths.sum() / said["target_steps_per_second"] <= said["wall_seconds"]
     assert said["machine"].keys() == {"cpu", "cores", "memory_gib", "gpu"}
+
+
+def test_what_it_earned_is_recorded(collected: Path) -> None:
+    dataset = Dataset.open(collected)
+    told = dataset.description["behavior"]
+    for name, key in (("return", "return_mean"), ("success", "success_rate")):
+        values = np.array(dataset.metadata[name], dtype=np.float64)
+        assert told[key] == pytest.approx(values.mean())
+
+
+def test_batches_follow_each_other(task: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    collect(task, TINY.model_copy(update={"num_envs": 2}), seed=0, out=out, progress=silent)
+    collect(task, TINY.model_copy(update={"episodes": 2}), seed=0, out=tmp_path / "two", progress=silent)
+    batched, two = Dataset.open(out), Dataset.open(tmp_path / "two")
+    assert batched.uids.tolist() == [0, 1, 2]
+    first, second, third = batched.episodes()
+    for one, other in zip((first, second), two.episodes(), strict=True):
+        np.testing.assert_array_equal(one.columns[STATE], other.columns[STATE])
+    assert (third.columns[STATE][0] != first.columns[STATE][0]).any()
+
+
+def test_an_interrupted_recording_goes_on_to_the_same_bytes(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TINY.model_copy(update={"num_envs": 2, "episodes": 5})
+    collect(task, config, seed=0, out=tmp_path / "whole", progress=silent)
+    add = StagedWriter.add
+    told: list[int | None] = []
+
+    def failing(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        if len(told) == 3:
+            raise KeyboardInterrupt
+        add(writer, episode, position)
+        told.append(position)
+
+    out = tmp_path / "out"
+    monkeypatch.setattr(StagedWriter, "add", failing)
+    with pytest.raises(KeyboardInterrupt):
+        collect(task, config, seed=0, out=out, progress=silent)
+    monkeypatch.setattr(StagedWriter, "add", add)
+    with pytest.raises(BadInputError, match="left 3 episodes; resume it"):
+        collect(task, config, seed=0, out=out, progress=silent, resume=False)
+    assert not out.exists()
+    collect(task, config, seed=0, out=out, progress=silent)
+    assert Dataset.open(out).content_hash == Dataset.open(tmp_path / "whole").content_hash
+
+
+def test_episodes_can_begin_where_the_task_does(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"start": "task", "max_steps": 1})
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    position = Dataset.open(tmp_path / "out").columns([STATE])[STATE][:, :2]
+    maze = TASKS[task].maze
+    assert np.abs(position - maze.cell_centre(*maze.start)).max() < 0.7
+
+
+def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"behavior": "suboptimal_ppo", "ppo_steps": 1, "max_steps": 3})
+    hashes = []
+    for number in range(2):
+        out = tmp_path / str(number)
+        collect(task, config, seed=0, out=out, progress=silent)
+        hashes.append(Dataset.open(out).content_hash)
+    assert hashes[0] == hashes[1]
+    dataset = Dataset.open(out)
+    assert dataset.reference == f"{TASK}-suboptimal-ppo-seed0@data-1.0.0"
+    assert dataset.description["behavior"]["trained_steps"] == 1
+
+
+def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
+    latent = {"policy": str(trained), "grounding": str(grounded), "target_encoder": str(aligned)}
+    config = TINY.model_copy(update={"behavior": "policy", "max_steps": 4, **latent})
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent, name="walks")
+    dataset = Dataset.open(tmp_path / "out")
+    assert dataset.reference == "walks@data-1.0.0"
+    told = dataset.description["behavior"]
+    assert told["policy_sha256"] == hashlib.sha256((trained / "policy.safetensors").read_bytes()).hexdigest()
+    assert told["policy_dataset"] == f"{TASK}-random-seed0@data-2.0.0"
+    actions = dataset.columns([ACTION])[ACTION]
+    # Drawn, not the mean: alike starts would give alike commands.
+    assert np.abs(np.diff(actions, axis=0)).min() > 0
+    assert np.abs(actions).max() <= 1.0
+
+
+def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Path, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"behavior": "policy"})
+    with pytest.raises(BadInputError, match=r'behaviour "policy": expected the folder'):
+        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    without_latent = config.model_copy(update={"policy": str(trained)})
+    with pytest.raises(BadInputError, match=r"sees 24 values, the task shows 8: expected a policy of"):
+        collect(task, without_latent, seed=0, out=tmp_path / "out", progress=silent)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_task_is_told(tmp_path: Path) -> None:

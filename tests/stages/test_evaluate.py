@@ -61,7 +61,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert told.keys() == keys
     assert (told["method"], told["seed"], told["episodes"], told["encoder"]) == ("astra", 0, 3, "target")
     assert told["encoders"].keys() == {"source", "target"}
-    assert told["dataset_version"] == "antmaze-short-random@data-1.0.0"
+    assert told["dataset_version"] == "antmaze-short-random-seed0@data-2.0.0"
     check_outcome(told["target"], paths["target.position"])
     check_outcome(told["simulated"], paths["simulated.position"])
     with_source = CONFIG.model_copy(update={"encoder": "source"})

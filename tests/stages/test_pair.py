@@ -1,10 +1,8 @@
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from astra_data.columns import (
     ABSTRACT_NEXT_STATE,
@@ -16,12 +14,14 @@ from astra_data.columns import (
 )
 from astra_data.dataset import Dataset
 from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.pairing import pairing_named
 from astra_data.progress import silent
 from astra_data.stages.pair import PairConfig, pair, pair_steps
 from astra_data.tasks import TASKS
 
 _PLANAR = [0, 1, 15, 16]
 """x, y, vx and vy in an ant's qpos (15) and qvel (14)."""
+MINE = Path(__file__).parents[1] / "my_simulator.py"
 
 
 def test_the_simulator_starts_where_the_target_was_and_takes_its_action(paired: Path) -> None:
@@ -40,6 +40,8 @@ def test_the_simulator_starts_where_the_target_was_and_takes_its_action(paired: 
 def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path) -> None:
     before, after = Dataset.open(collected), Dataset.open(paired)
     assert after.description["parents"] == [before.identity]
+    assert after.reference == before.reference.replace("1.0.0", "2.0.0")
+    assert after.description["reset_error"] == 0.0
     assert after.description["simulator"] == {"id": "point_mass", "timestep_s": 0.05, "radius_m": 0.1}
     steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
     assert steps == pytest.approx(after.lengths.sum())
@@ -64,16 +66,56 @@ def test_abstract_columns_have_units_frames_and_roles(paired: Path) -> None:
     assert len(meanings) == 3
 
 
-def test_a_simulator_that_does_not_show_its_reset_is_refused() -> None:
-    task = TASKS["antmaze-umaze"]
-    shifted = replace(task, abstraction=_unclean)
-    with pytest.raises(BadInputError, match=r"step 0, shows x = .* and not") as caught:
-        pair_steps(shifted, np.zeros((2, 29), "f4"), np.zeros((2, 2), "f4"), np.zeros((2, 29), "f4"), -1.0)
+def test_many_simulators_give_what_one_gives(collected: Path) -> None:
+    columns = Dataset.open(collected).columns([STATE, ACTION, NEXT_STATE])
+    steps = [values[:25] for values in columns.values()]
+    pairing = pairing_named("antmaze-umaze")
+    wide, _ = pair_steps(pairing, pairing.simulator(64), *steps, tolerance=0.0)
+    for size in (1, 7, 25):
+        narrow, error = pair_steps(pairing, pairing.simulator(size), *steps, tolerance=0.0)
+        assert error == 0.0
+        for name, values in wide.items():
+            np.testing.assert_array_equal(narrow[name], values)
+
+
+def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
+    pair(f"{MINE}:Glider", PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
+    dataset = Dataset.open(tmp_path / "out")
+    assert dataset.description["simulator"] == {"id": "Glider", "timestep_s": 0.05}
+    assert dataset.features[ABSTRACT_STATE]["names"] == ["x", "y"]
+    columns = dataset.columns([STATE, ACTION, ABSTRACT_SIMULATED_NEXT_STATE])
+    expected = columns[STATE][:, :2] + np.float32(0.05) * columns[ACTION]
+    np.testing.assert_array_equal(columns[ABSTRACT_SIMULATED_NEXT_STATE], expected)
+
+
+@pytest.mark.parametrize(
+    ("simulator", "told"),
+    [
+        (f"{MINE}:Forgetful", r"reset to φ\(s\) of step \d+, shows [xy] = .* and not .*: check its reset_to"),
+        (f"{MINE}:Exploding", r"stepped from φ\(s\) of step 0, gives x = .*: expected finite states"),
+        (f"{MINE}:Greedy", r"abstraction of Greedy, given states \(\d+, 29\), fails with IndexError"),
+        (f"{MINE}:Clumsy", r"Clumsy\(4096\) fails with TypeError"),
+        (f"{MINE}:Lazy", r"step of Lazy fails with NotImplementedError"),
+        (f"{MINE}:Wide", r"abstraction of Wide makes \(\d+, 3\) of states .* expected \(\d+, 2\)"),
+        (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),
+        (f"{MINE}:Gilder", r"has no class 'Gilder'; it has .*Glider"),
+        (f"{MINE}", r"expected the class after a colon"),
+        ("nowhere.py:Glider", r"nowhere.py does not exist: expected a Python file"),
+        ("antmaze-umase", r"unknown task 'antmaze-umase': did you mean 'antmaze-umaze'"),
+    ],
+)
+def test_a_simulator_that_does_not_fit_is_refused(
+    collected: Path, tmp_path: Path, simulator: str, told: str
+) -> None:
+    with pytest.raises(BadInputError, match=told) as caught:
+        pair(simulator, PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
     assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
 
 
-def _unclean(state: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> torch.Tensor:
-    return state[..., _PLANAR]  # type: ignore[return-value]
+def test_a_paired_dataset_is_not_paired_again(paired: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"has abstract.state already: it has been paired"):
+        pair("antmaze-umaze", PairConfig(), dataset=paired, out=tmp_path / "out", progress=silent)
 
 
 def test_a_damaged_dataset_is_refused(task: str, collected: Path, tmp_path: Path) -> None:

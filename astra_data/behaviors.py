@@ -1,0 +1,84 @@
+"""Behaviours: what acts in the target while data is collected."""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.deployment import DeployedPolicy
+from astra_data.learners.ppo import Ppo, PpoConfig
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.progress import Progress
+from astra_data.seeding import derive, generator
+from astra_data.target_world import TargetWorld
+from astra_data.tasks import Task
+
+_ENVS = 128
+"""Targets that the suboptimal policy is trained in."""
+
+
+class Behavior(Protocol):
+    """Acts on B robots."""
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots; `seed` decides everything random."""
+        ...
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        ...
+
+
+class RandomCommands:
+    """Commands from U[-1, 1]² m/s, each held for a random number of steps."""
+
+    def __init__(self, hold_steps: tuple[int, int]) -> None:
+        """Take the fewest and the most steps for which a command is held."""
+        self._hold_steps = hold_steps
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots."""
+        self._rng = generator(seed, "behavior")
+        self._command = np.zeros((count, 2))
+        self._left = np.zeros(count, dtype=int)
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return commands (B, 2) in m/s; neither state nor goal matters."""
+        due = np.flatnonzero(self._left == 0)
+        fewest, most = self._hold_steps
+        self._command[due] = self._rng.uniform(-1.0, 1.0, (len(due), 2))
+        self._left[due] = self._rng.integers(fewest, most + 1, len(due))
+        self._left -= 1
+        return torch.from_numpy(self._command).float()
+
+
+class PolicyBehavior:
+    """A policy that draws its actions from its distribution, as it does in training."""
+
+    def __init__(self, deployed: DeployedPolicy) -> None:
+        self._deployed = deployed
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots."""
+        self._deployed.start(count, torch.Generator().manual_seed(derive(seed, "behavior")))
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        return self._deployed.act(state, goal)
+
+
+def suboptimal_policy(
+    task: Task, *, steps: int, seed: int, num_threads: int | None, progress: Progress
+) -> DeployedPolicy:
+    """Train a policy without memory by PPO in the target, and stop after `steps` environment steps."""
+    torch.manual_seed(derive(seed, "suboptimal policy"))
+    world = TargetWorld(task, _ENVS, seed=derive(seed, "suboptimal world"), num_threads=num_threads)
+    policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
+    config = PpoConfig(total_steps=steps)
+    ppo = Ppo(world, policy, config, horizon=task.navigation.horizon, seed=seed)
+    while not ppo.done:
+        metrics = ppo.iterate()
+        note = f"training the behaviour: reward per step {metrics['reward']:.3f}"
+        progress(min(1.0, ppo.steps / steps), note)
+    return DeployedPolicy(task, policy.requires_grad_(False))
