@@ -1,11 +1,14 @@
 """What a run shows: a live line per running item in a terminal, plain lines elsewhere."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from astra_data.progress import Progress as Notes
 from astra_data.schedule import Watcher
 
 SECONDS_OF_SPEED = 600
@@ -27,6 +30,16 @@ def display(total: int, console: Console) -> Iterator[Watcher]:
     )
     with Progress(*columns, console=console, speed_estimate_period=SECONDS_OF_SPEED) as progress:
         yield LiveDisplay(total, progress)
+
+
+@contextmanager
+def shown(key: str) -> Iterator[Notes]:
+    """Show one job of this process getting on; yield what it is to tell."""
+    began = time.perf_counter()
+    with display(1, Console()) as watch:
+        watch.started(key)
+        yield partial(watch.progressed, key)
+        watch.finished(key, time.perf_counter() - began)
 
 
 class PlainDisplay:

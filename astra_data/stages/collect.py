@@ -25,6 +25,7 @@ from astra_data.columns import (
     Episode,
 )
 from astra_data.dataset.staging import StagedWriter
+from astra_data.dataset.versions import place
 from astra_data.deployment import DeployedPolicy
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
@@ -69,13 +70,13 @@ def collect(
     config: CollectConfig,
     *,
     seed: int,
-    out: Path,
+    out: Path | None = None,
     progress: Progress,
     num_threads: int | None = None,
     name: str | None = None,
     resume: bool = True,
-) -> None:
-    """Record episodes in the target and write them to `out`.
+) -> Path:
+    """Record episodes in the target; return the dataset's folder.
 
     The physics runs on `num_threads`, by default one per core; the outcome is the same with any number.
 
@@ -83,7 +84,7 @@ def collect(
         task: a name in `TASKS`.
         config: what to collect.
         seed: of everything random.
-        out: the dataset's folder.
+        out: the dataset's folder, by default its place at home.
         progress: is told how far it is.
         num_threads: of the physics.
         name: the dataset's, by default made of task, behaviour and seed.
@@ -96,13 +97,15 @@ def collect(
     began = time.perf_counter()
     description = {
         "name": name or f"{task}-{config.behavior}-seed{seed}".replace("_", "-"),
+        "version": "1.0.0",
         "stage": "collect",
         "config": config.model_dump(mode="json"),
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
         "environment": {"id": task, "integrator": "RK4", "timestep_s": world.timestep_s, "leg_scale": 1.0},
     }
+    folder = out or place(description)
     with StagedWriter(
-        out,
+        folder,
         [*world.state_columns, *OUTCOME_COLUMNS],
         fps=world.fps,
         task=world.instruction,
@@ -130,6 +133,7 @@ def collect(
         }
     note = f"return {told['return_mean']:.2f}, success {told['success_rate']:.2f}"
     progress(1.0, f"{config.episodes} episodes, {note}, {rate:,.0f} target steps/s")
+    return folder
 
 
 def _behavior(

@@ -1,0 +1,64 @@
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from astra_data import cli
+from astra_data.dataset import Dataset
+from astra_data.dataset.versions import open_dataset
+from astra_data.errors import AstraDataError
+
+SMALL = ["--episodes", "2", "--max-steps", "3"]
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+def call(*arguments: str) -> Result:
+    return CliRunner().invoke(cli.app, arguments)
+
+
+def test_a_dataset_is_collected_and_paired_without_a_recipe(home: Path) -> None:
+    collected = call("collect", "antmaze-umaze", *SMALL, "--seed", "3")
+    folder = home / "antmaze-umaze-random-seed3/data-1.0.0"
+    assert collected.output.splitlines()[-1] == f"finished: {folder}"
+    assert "target steps/s" in collected.output
+    dataset = Dataset.open(folder)
+    assert (len(dataset), dataset.lengths.tolist()) == (2, [3, 3])
+    paired = call("pair", "antmaze-umaze-random-seed3", "--simulator", "antmaze-umaze")
+    assert paired.output.splitlines()[-1] == f"finished: {folder.with_name('data-2.0.0')}"
+    newest = open_dataset("antmaze-umaze-random-seed3")
+    assert newest.description["parents"] == [dataset.identity]
+
+
+def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
+    assert (
+        call("collect", "antmaze-long", *SMALL, "--out", str(tmp_path / "a"), "--name", "walks").exit_code
+        == 0
+    )
+    assert Dataset.open(tmp_path / "a").reference == "walks@data-1.0.0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["collect", "recipe.toml", "--episodes", "3"], r"in \[collect\]: leave out --episodes"),
+        (["collect", "recipe.toml", "--resume"], r"leave out --resume"),
+        (["collect", "antmaze-umaze", "--seed", "1", "--seed", "2"], r"takes one --seed"),
+        (["collect", "antmaze-umaze", "--behavior", "wild"], r"behavior: expected 'random', .*got 'wild'"),
+        (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),
+        (["pair", "recipe.toml", "--simulator", "antmaze-umaze"], r"in \[pair\]: leave out --simulator"),
+        (["pair", "walks", "--jobs", "2", "--simulator", "antmaze-umaze"], r"neither --seed nor --jobs"),
+        (["pair", "walks"], r"expected --simulator"),
+        (["pair", "walks", "--simulator", "antmaze-umaze"], r"no dataset 'walks'"),
+    ],
+)
+def test_what_does_not_fit_is_told(home: Path, arguments: list[str], told: str) -> None:
+    error = call(*arguments).exception
+    assert isinstance(error, AstraDataError)
+    with pytest.raises(AstraDataError, match=told):
+        raise error
+    assert not home.exists()
