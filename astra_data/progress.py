@@ -8,3 +8,8 @@ Progress = Callable[[float, str], None]
 
 def silent(fraction: float, note: str) -> None:
     """Tell nobody."""
+
+
+def part(progress: Progress, begin: float, end: float) -> Progress:
+    """Return the progress of a part of the job, which goes from `begin` to `end` of the whole."""
+    return lambda fraction, note: progress(begin + (end - begin) * fraction, note)

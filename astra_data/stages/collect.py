@@ -31,12 +31,16 @@ from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding
 from astra_data.policy_file import PolicyFile
-from astra_data.progress import Progress
+from astra_data.progress import Progress, part
 from astra_data.recipe import Config, Count, NotNegative
 from astra_data.results.provenance import machine
 from astra_data.seeding import derive
 from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
+
+
+_TRAINING_SHARE = 0.8
+"""Part of the progress that training the suboptimal policy takes."""
 
 
 class CollectConfig(Config):
@@ -114,13 +118,15 @@ def collect(
         resume=resume,
         fsync=False,
     ) as writer:
-        behavior, told = _behavior(world, config, seed, num_threads, progress)
+        share = _TRAINING_SHARE if config.behavior == "suboptimal_ppo" else 0.0
+        behavior, told = _behavior(world, config, seed, num_threads, part(progress, 0.0, share))
+        recording = part(progress, share, 1.0)
         trained = time.perf_counter()
         steps = 0
         for first in range(0, config.episodes, config.num_envs):
             rows = range(first, min(first + config.num_envs, config.episodes))
             if not writer.staged.keys() >= set(rows):
-                steps += _record(world, config, behavior, rows, seed, writer, num_threads, progress)
+                steps += _record(world, config, behavior, rows, seed, writer, num_threads, recording)
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
         told |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
