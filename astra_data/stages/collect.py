@@ -38,7 +38,6 @@ from astra_data.seeding import derive
 from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
 
-
 _TRAINING_SHARE = 0.8
 """Part of the progress that training the suboptimal policy takes."""
 
