@@ -33,6 +33,9 @@ TIMESTEP_S = 0.05
 TOPPLE_COSINE = 0.2
 """The ant has toppled when the cosine between its up axis and the vertical falls below this."""
 TORSO_HEIGHT_M = 0.75
+WALL_REACH_M = 1.3
+"""Farther from all walls than this, measured on the maze's grid, the ant touches none: a stretched leg ends
+1.21 m from the torso's centre, and the grid is up to 0.1 m off."""
 WALL_HEIGHT = 0.5
 """In units of the maze scale, as in gymnasium-robotics."""
 # Ankle axes alternate; these signs make every leg look like leg 1 (angle 30..70 degrees).

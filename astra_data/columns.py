@@ -52,8 +52,8 @@ RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDE
 """Columns that the writer fills in; all but the first are LeRobot's own."""
 
 DTYPES = ("float32", "int64", "bool")
-ROLES = ("position", "vector", "heading", "quaternion", "invariant")
-"""What a planar rotation and shift does to an index: see `Column.astra`."""
+ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
+"""What a change of the planar frame does to an index, see `Column.astra`; and to how many at once."""
 
 Array = NDArray[Any]
 Scalar = float | int | bool | str
@@ -69,9 +69,13 @@ class Column:
         size: values per step.
         names: a name for each of them.
         meaning: one sentence.
-        astra: "unit", "frame" and "role", each a list with one word per index. Roles are how a change of the
-            planar frame acts: "position" and "vector" come as consecutive (x, y) pairs, "heading" is an angle
-            in rad, "quaternion" four consecutive values (w, x, y, z), "invariant" is left alone.
+        astra: "unit", "frame", "role" and "mirror", each a list with one word per index. Roles are how a
+            rotation and shift of the planar frame act: "position" and "vector" come as consecutive (x, y)
+            pairs, "heading" is an angle in rad, "quaternion" four consecutive values (w, x, y, z) that turn
+            from the body's frame to the world's, "invariant" is left alone. What is seen from the body is
+            therefore invariant, also its angular rates. A mirror image of the robot follows from the roles
+            too, but for its invariant values: "mirror" names the value that each becomes, "-hip_2" with its
+            sign changed, and is "" elsewhere.
     """
 
     name: str
@@ -93,15 +97,66 @@ class Column:
         if self.names is not None and len(self.names) != self.size:
             faults.append(f"{len(self.names)} names for {self.size} values")
         for key, words in (self.astra or {}).items():
-            if key not in ("unit", "frame", "role"):
-                faults.append(f"astra has {key!r}, expected unit, frame, role")
+            if key not in ("unit", "frame", "role", "mirror"):
+                faults.append(f"astra has {key!r}, expected unit, frame, role, mirror")
             elif len(words) != self.size:
                 faults.append(f"{len(words)} words in astra's {key} for {self.size} values")
         unknown = sorted(set((self.astra or {}).get("role", [])) - set(ROLES))
         if unknown:
             faults.append(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
+        if not faults:
+            faults = [*self._role_faults(), *self._mirror_faults()]
         if faults:
             raise BadInputError(f"Column {self.name!r}: {'; '.join(faults)}.")
+
+    @property
+    def roles(self) -> list[tuple[str, slice]]:
+        """Each role with the indices that it acts on at once, in order; empty where roles are not told."""
+        groups, index, roles = [], 0, (self.astra or {}).get("role", [])
+        while index < len(roles):
+            width = ROLES[roles[index]]
+            groups.append((roles[index], slice(index, index + width)))
+            index += width
+        return groups
+
+    @property
+    def mirror(self) -> tuple[list[int], list[int]] | None:
+        """What a mirror image does to invariant values: the index that each becomes, and its sign, +1 or -1.
+
+        All other values stay where they are. None where it is not told though there are invariant values.
+        """
+        astra = self.astra or {}
+        words = astra.get("mirror")
+        if words is None:
+            return None if "invariant" in astra.get("role", []) else ([*range(self.size)], [1] * self.size)
+        names = list(self.names or ())
+        source = [names.index(word.lstrip("-")) if word else index for index, word in enumerate(words)]
+        return source, [-1 if word.startswith("-") else 1 for word in words]
+
+    def _role_faults(self) -> list[str]:
+        words = (self.astra or {}).get("role", [])
+        return [
+            f"role {role} at index {group.start}, expected {ROLES[role]} indices of it side by side"
+            for role, group in self.roles
+            if words[group] != [role] * ROLES[role]
+        ]
+
+    def _mirror_faults(self) -> list[str]:
+        words = (self.astra or {}).get("mirror")
+        if words is None:
+            return []
+        roles, names = (self.astra or {}).get("role", []), self.names or ()
+        of = {name: word for name, word, role in zip(names, words, roles, strict=False) if role == "invariant"}
+        faults = [
+            f"mirror {word!r} of a {role}, expected '': its role says it"
+            for word, role in zip(words, roles, strict=False)
+            if word and role != "invariant"
+        ]
+        for name, word in of.items():
+            other, sign = word.lstrip("-"), "-" if word.startswith("-") else ""
+            if of.get(other) != sign + name:
+                faults.append(f"mirror {word!r} of {name}, expected a value whose mirror is {sign}{name}")
+        return faults if of else [*faults, "a mirror without names and roles of invariant values"]
 
     def feature(self) -> dict[str, Any]:
         """Return the column's entry in LeRobot's `features`."""

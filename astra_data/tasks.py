@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from astra_data.abstraction import ant_to_point_mass
-from astra_data.ant import TIMESTEP_S
+from astra_data.ant import TIMESTEP_S, WALL_REACH_M
 from astra_data.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
@@ -26,6 +26,8 @@ class Task:
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
+        action_limit: largest action along each axis; both worlds cut off what is beyond.
+        wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
         simulator_id: names the abstract simulator in datasets.
     """
 
@@ -36,6 +38,8 @@ class Task:
     state_columns: tuple[Column, ...]
     abstract_state: Column
     timestep_s: float
+    action_limit: float
+    wall_reach_m: float
     simulator_id: str = "point_mass"
 
     @property
@@ -57,11 +61,21 @@ class Task:
         return PointMass(self.maze, num_envs, timestep_s=self.timestep_s, device=device)
 
 
-def _roles(names: tuple[str, ...], units: list[str], frames: list[str], roles: list[str]) -> dict[str, Any]:
-    return {"names": names, "astra": {"unit": units, "frame": frames, "role": roles}}
+def _roles(
+    names: tuple[str, ...],
+    units: list[str],
+    frames: list[str],
+    roles: list[str],
+    mirror: list[str] | None = None,
+) -> dict[str, Any]:
+    astra = {"unit": units, "frame": frames, "role": roles}
+    return {"names": names, "astra": astra if mirror is None else {**astra, "mirror": mirror}}
 
 
 _JOINTS = tuple(f"{joint}_{leg}" for leg in range(1, 5) for joint in ("hip", "ankle"))
+# Left and right swap: legs 1 (front left) and 4, legs 2 (back left) and 3. The hips' axes are vertical, so
+# they turn the other way; the ankles' axes are each other's mirror image.
+_MIRRORED_JOINTS = [joint for leg in (4, 3, 2, 1) for joint in (f"-hip_{leg}", f"ankle_{leg}")]
 _ANT_STATE = _roles(
     (
         *("x", "y", "z", "qw", "qx", "qy", "qz", *_JOINTS),
@@ -75,6 +89,13 @@ _ANT_STATE = _roles(
     + ["invariant"] * 8
     + ["vector"] * 2
     + ["invariant"] * 12,
+    [""] * 2
+    + ["z"]
+    + [""] * 4
+    + _MIRRORED_JOINTS
+    + [""] * 2
+    + ["vz", "-wx", "wy", "-wz"]
+    + [f"{joint}_rate" for joint in _MIRRORED_JOINTS],
 )
 _GOAL = _roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
 _COMMAND = _roles(("command_vx", "command_vy"), ["m/s"] * 2, ["world"] * 2, ["vector"] * 2)
@@ -108,6 +129,8 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         state_columns=_ANT_COLUMNS,
         abstract_state=_POINT_MASS,
         timestep_s=TIMESTEP_S,
+        action_limit=1.0,
+        wall_reach_m=WALL_REACH_M,
     )
 
 
