@@ -7,7 +7,7 @@ knowledge   geometry  mazes  free_space  navigation  ant  physics  abstraction  
 data        dataset/  grounding_file  target_encoder_file  figures/  results/
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
 learning    tasks  world  target_world  training_world  method  policy_file  deployment  behaviors  gap
-            mismatch  gymnasium_faces  pairing  learners/
+            mismatch  gymnasium_faces  pairing  relocation  learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
 roof        plan  schedule  display  run  commands/  cli

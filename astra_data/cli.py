@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands import building, recipes
+from astra_data.commands import augmenting, building, recipes
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -41,6 +41,7 @@ for command in (
     recipes.run,
     recipes.check,
     building.collect,
+    augmenting.augment,
     building.pair,
     recipes.ground,
     recipes.train,

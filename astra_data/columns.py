@@ -146,7 +146,9 @@ class Column:
         if words is None:
             return []
         roles, names = (self.astra or {}).get("role", []), self.names or ()
-        of = {name: word for name, word, role in zip(names, words, roles, strict=False) if role == "invariant"}
+        of = {
+            name: word for name, word, role in zip(names, words, roles, strict=False) if role == "invariant"
+        }
         faults = [
             f"mirror {word!r} of a {role}, expected '': its role says it"
             for word, role in zip(words, roles, strict=False)

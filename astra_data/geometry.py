@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 def wrapped(angle: Floats) -> Floats:
     """Return `angle` in rad, any shape, in [-π, π)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,9 @@ class PlanarMap:
 
     def inverse(self) -> "PlanarMap":
         """Return the map that undoes this one."""
-        back = PlanarMap(self.rotation_rad if self.reflected else -self.rotation_rad, reflected=self.reflected)
+        back = PlanarMap(
+            self.rotation_rad if self.reflected else -self.rotation_rad, reflected=self.reflected
+        )
         x, y = back.vectors(-np.array(self.shift_m))
         return PlanarMap(back.rotation_rad, (float(x), float(y)), self.reflected)
 
@@ -51,7 +53,7 @@ class PlanarMap:
         """Turn velocities and other differences of positions (..., 2), in the world's frame."""
         x, y = values[..., 0], -values[..., 1] if self.reflected else values[..., 1]
         cos, sin = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        return np.asarray(np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1))
 
     def positions(self, values: Floats) -> Floats:
         """Move positions (..., 2) in m."""
@@ -82,7 +84,7 @@ class PlanarMap:
         faults = self.faults(column)
         if faults:
             raise BadInputError(f"{'; '.join(faults)}.")
-        before = values.reshape(len(values), column.size).astype(np.float64)
+        before: Floats = values.reshape(len(values), column.size).astype(np.float64)
         if self.reflected and column.mirror is not None:
             source, sign = column.mirror
             before = before[:, source] * sign

@@ -28,6 +28,7 @@ class Task:
         timestep_s: the control period.
         action_limit: largest action along each axis; both worlds cut off what is beyond.
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
+        is_mirrorable: whether the robot, its controller included, is its own mirror image.
         simulator_id: names the abstract simulator in datasets.
     """
 
@@ -40,6 +41,7 @@ class Task:
     timestep_s: float
     action_limit: float
     wall_reach_m: float
+    is_mirrorable: bool
     simulator_id: str = "point_mass"
 
     @property
@@ -131,6 +133,8 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         timestep_s=TIMESTEP_S,
         action_limit=1.0,
         wall_reach_m=WALL_REACH_M,
+        # The body is its own mirror image, the learned low-level controller is not.
+        is_mirrorable=False,
     )
 
 

@@ -88,3 +88,28 @@ def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> No
     with pytest.raises(BadInputError) as caught:
         Episode(0, columns)
     assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("astra", "told"),
+    [
+        ({"role": ["position", "vector", "vector"]}, "role position at index 0, expected 2 indices"),
+        ({"role": ["heading", "heading", "position"]}, "role position at index 2, expected 2 indices"),
+        ({"role": ["invariant"] * 3, "mirror": ["b", "-a", "c"]}, "mirror 'b' of a, expected a value whose"),
+        ({"role": ["invariant"] * 3, "mirror": ["a", "b", "d"]}, "mirror 'd' of c, expected a value whose"),
+        ({"role": ["invariant", "heading", "heading"], "mirror": ["a", "-b", ""]}, "'-b' of a heading"),
+        ({"role": ["heading"] * 3, "mirror": [""] * 3}, "without names and roles of invariant values"),
+        ({"mirror": ["a", "b", "c"]}, "without names and roles of invariant values"),
+    ],
+)
+def test_roles_and_mirror_images_must_make_sense(astra: dict[str, list[str]], told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        Column("pose", size=3, names=("a", "b", "c"), astra=astra)
+
+
+def test_a_mirror_image_is_a_swap_with_signs() -> None:
+    role = ["heading", "invariant", "invariant"]
+    told = Column("pose", size=3, names=("a", "b", "c"), astra={"role": role, "mirror": ["", "-c", "-b"]})
+    assert told.mirror == ([0, 2, 1], [1, -1, -1])
+    assert Column("pose", size=3, astra={"role": role}).mirror is None
+    assert Column("pose", size=3, astra={"role": ["heading"] * 3}).mirror == ([0, 1, 2], [1, 1, 1])

@@ -59,9 +59,7 @@ def random_values(column: Column, count: int, seed: int = 0) -> Array:
 def test_points_and_directions_move_as_a_matrix_says(change: PlanarMap) -> None:
     values = np.random.default_rng(0).normal(size=(3, 4, 2))
     whole = matrix(change)
-    np.testing.assert_allclose(
-        change.positions(values), values @ whole[:2, :2].T + whole[:2, 3], atol=1e-12
-    )
+    np.testing.assert_allclose(change.positions(values), values @ whole[:2, :2].T + whole[:2, 3], atol=1e-12)
     np.testing.assert_allclose(change.vectors(values), values @ whole[:2, :2].T, atol=1e-12)
     heading = np.arctan2(values[..., 1], values[..., 0])
     turned = change.vectors(values)
@@ -120,7 +118,8 @@ def test_columns_of_every_task_tell_all(column: Column) -> None:
 def test_values_keep_their_type_and_lone_headings_their_shape() -> None:
     yaw = Column("yaw", astra={"role": ["heading"]})
     moved = PlanarMap(rotation_rad=np.pi).of_column(yaw, np.array([0.5, -0.5], np.float32))
-    assert (moved.dtype, moved.shape) == (np.float32, (2,))
+    assert moved.dtype == np.float32
+    assert moved.shape == (2,)
     np.testing.assert_allclose(moved, [0.5 - np.pi, np.pi - 0.5], rtol=1e-6)
 
 

@@ -1,0 +1,279 @@
+"""Augment: more episodes from few, by turning, moving and mirroring them on the floor.
+
+What is copied is true of the copy as well, for nothing in the robot's dynamics knows where it is and which
+way it faces, but for three things, which decide how it is done:
+
+* Walls. A robot that was stopped by a wall would be stopped by nothing in another place. So only stretches
+  of an episode are copied that keep out of the walls' reach, and copies keep out of it too.
+* The goal. It belongs to the maze and does not move along: every copy gets a goal of its own, drawn as the
+  task draws it. Rewards and ends are the task's judgement of the copy; it ends where that goal is reached.
+* Commands. Where the worlds cut off what is beyond ±1 m/s along each axis, a command that is turned out of
+  that square is no longer what the robot did; such turns are drawn again.
+
+Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator
+
+from astra_data.columns import (
+    ABSTRACT_STATE,
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    Column,
+    Episode,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import successor
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.errors import BadInputError
+from astra_data.geometry import PlanarMap
+from astra_data.progress import Progress
+from astra_data.recipe import Config, Count, NotNegative
+from astra_data.relocation import Relocation, Rotations, outcomes, positions
+from astra_data.seeding import derive, generator
+from astra_data.tasks import TASKS, Task, task_named
+
+DEFAULT_COPIES = 3
+_OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
+
+
+class AugmentConfig(Config):
+    """How many copies, and how they may differ; the paper makes 200 episodes of 50 by turning and moving."""
+
+    copies: Count | None = None
+    """Copies of each training episode; by default 3, or as many as `episodes` needs."""
+    episodes: Count | None = None
+    """Episodes in all, originals and held-out ones included; instead of `copies`."""
+    rotations: Rotations = "quarter"
+    """"quarter": by multiples of 90 degrees, which no corridor, no friction cone and no limit on commands
+    along the axes can tell apart. "any": by any angle, as far as commands stay within their limit."""
+    translations: bool = True
+    """To anywhere in the maze; otherwise the copy starts where the original did."""
+    reflections: bool = Field(default=False, validate_default=True)
+    """Mirror half of the copies; only where the robot and its controller are their own mirror image."""
+    held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    """Share of the episodes that is set aside before, at least one unless it is 0."""
+    keep_originals: bool = True
+    """Whether the training episodes themselves are part of the new dataset; held-out ones always are."""
+    margin_m: NotNegative | None = None
+    """Clearance from the walls kept by copies and by what is copied; by default the robot's reach."""
+    min_steps: Count = 20
+    """Shortest stretch that is copied."""
+    tries: Count = 100
+    """Turns that are drawn for a copy before it is given up, with 64 places for each."""
+
+    @field_validator("episodes")
+    @classmethod
+    def _is_not_told_twice(cls, episodes: int | None, info: ValidationInfo) -> int | None:
+        if episodes is not None and info.data.get("copies") is not None:
+            raise ValueError("expected either copies or episodes, got both")
+        return episodes
+
+    @field_validator("reflections")
+    @classmethod
+    def _changes_something(cls, reflections: bool, info: ValidationInfo) -> bool:
+        if not reflections and info.data.get("rotations") == "none" and not info.data.get("translations"):
+            raise ValueError("expected rotations, translations or reflections, got none of them")
+        return reflections
+
+
+def augment(
+    task: str | None,
+    config: AugmentConfig,
+    *,
+    dataset: Path,
+    seed: int,
+    out: Path | None = None,
+    progress: Progress,
+) -> Path:
+    """Write a version of `dataset` with copies of its training episodes; return its folder.
+
+    Every episode's metadata says whether it is `held_out`; a copy's also `source_episode` (uid),
+    `augmentation_first_step` (of the source) and the map from it, p ↦ R(`augmentation_rotation_rad`) M p +
+    (`augmentation_x_m`, `augmentation_y_m`), where M turns y into -y if `augmentation_reflected`.
+
+    Args:
+        task: that judges copies; by default the one that the dataset was collected for.
+        config: settings.
+        dataset: folder of the dataset, not paired.
+        seed: of everything random; the same seed gives the same bytes.
+        out: folder of the new version, by default its place at home.
+        progress: is told how far it is.
+
+    Raises:
+        BadInputError: the dataset does not fit the task, was paired or augmented, does not say how its
+            columns move, or has no stretch to copy or no place for any copy.
+        CorruptDatasetError: `dataset` is incomplete.
+    """
+    source = Dataset.open(dataset)
+    world = _task_of(source, task)
+    _check(source, world, config)
+    relocation = Relocation(
+        world,
+        rotations=config.rotations,
+        translations=config.translations,
+        reflections=config.reflections,
+        margin_m=world.wall_reach_m if config.margin_m is None else config.margin_m,
+        min_steps=config.min_steps,
+        tries=config.tries,
+    )
+    held_out, copies = _shares(source, relocation, config, seed)
+    description, out = successor(
+        source,
+        "episodes",
+        stage="augment",
+        config=config.model_dump(mode="json"),
+        out=out,
+        seeds=source.description["seeds"] | {"augment": seed},
+    )
+    taken = set(source.uids.tolist())
+    placed, lost = 0, 0
+    with DatasetWriter(
+        out,
+        source.schema,
+        fps=source.info["fps"],
+        task=source.task,
+        description=description,
+        subset_seed=source.subset_seed,
+    ) as writer:
+        for index, episode in enumerate(source.episodes()):
+            if held_out[index] or config.keep_originals:
+                metadata = {**episode.metadata, "held_out": bool(held_out[index])}
+                writer.add(Episode(episode.uid, episode.columns, metadata))
+            for copy in range(copies[index]):
+                rng = generator(seed, f"augment {episode.uid} {copy}")
+                drawn = relocation.draw(episode, rng)
+                if drawn is None:
+                    lost += 1
+                    continue
+                purpose = f"{source.content_hash} {config.model_dump_json()} {episode.uid} {copy}"
+                uid = _free_uid(derive(seed, purpose), taken)
+                writer.add(_copied(source, world, episode, uid, *drawn, rng))
+                placed += 1
+            progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
+        if not placed:
+            raise BadInputError(
+                f"{source.reference}: no place was found for any of {lost} copies: lower --margin-m "
+                f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
+            )
+        skipped = int((~held_out & (copies == 0)).sum())
+        writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
+    return out
+
+
+def _task_of(source: Dataset, task: str | None) -> Task:
+    collected_for = source.description["environment"].get("id")
+    if task is None and collected_for is None:
+        raise BadInputError(f"{source.reference} does not say what task it was collected for: give --task")
+    if task is not None and collected_for in TASKS and task != collected_for:
+        raise BadInputError(f"{source.reference} was collected for {collected_for}, not for {task}")
+    return task_named(task or str(collected_for))
+
+
+def _check(source: Dataset, world: Task, config: AugmentConfig) -> None:
+    columns = {column.name: column for column in source.schema}
+    faults = [f"no column {name}" for name in _OUTCOMES if name not in columns]
+    for expected in world.state_columns:
+        found = columns.get(expected.name)
+        if found is None or found.size != expected.size:
+            size = "none" if found is None else str(found.size)
+            faults.append(f"{expected.name}: expected {expected.size} values per step, got {size}")
+    if ABSTRACT_STATE in columns:
+        faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
+    if "held_out" in source.metadata:
+        faults.append("held_out: it has been augmented; augment its parent")
+    if config.reflections and not world.is_mirrorable:
+        faults.append("its controller does not act in mirror images: leave out --reflections")
+    change = PlanarMap(reflected=config.reflections)
+    for column in _moving(source):
+        faults += change.faults(column)
+    if faults:
+        raise BadInputError(f"{source.root} cannot be augmented for {world.name}: {'; '.join(faults)}")
+
+
+def _moving(source: Dataset) -> list[Column]:
+    """Return the columns that move along: not the goal, the outcomes, or what is counted or told apart."""
+    still = (*_OUTCOMES, GOAL)
+    return [column for column in source.schema if column.dtype == "float32" and column.name not in still]
+
+
+def _shares(
+    source: Dataset, relocation: Relocation, config: AugmentConfig, seed: int
+) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Return which episodes are held out (E,), and how many copies each is to have (E,)."""
+    count = len(source)
+    order = generator(seed, "held-out episodes").permutation(count)
+    held = max(1, round(config.held_out_share * count)) if config.held_out_share else 0
+    held_out = np.isin(np.arange(count), order[:held])
+    usable = ~held_out
+    for index, episode in enumerate(source.episodes([STATE, NEXT_STATE])):
+        usable[index] &= bool(relocation.stretches(episode))
+    if not usable.any():
+        raise BadInputError(
+            f"{source.reference}: none of {count - held} training episodes keeps {relocation.margin_m:g} m "
+            f"from the walls for {config.min_steps} steps: lower --margin-m, --min-steps or --held-out-share "
+            f"({held} episodes)"
+        )
+    copies = np.zeros(count, dtype=np.intp)
+    copies[usable] = config.copies or DEFAULT_COPIES
+    if config.episodes is not None:
+        kept = count if config.keep_originals else held
+        if config.episodes <= kept:
+            raise BadInputError(f"--episodes {config.episodes}: expected more than the {kept} that are kept")
+        each, more = divmod(config.episodes - kept, int(usable.sum()))
+        copies[usable] = each
+        copies[order[usable[order]][:more]] += 1
+    return held_out, copies
+
+
+def _copied(
+    source: Dataset,
+    world: Task,
+    episode: Episode,
+    uid: int,
+    change: PlanarMap,
+    steps: slice,
+    rng: np.random.Generator,
+) -> Episode:
+    """Return the steps `steps` of `episode` after `change`, with a goal of its own, judged by the task."""
+    cut = {name: values[steps] for name, values in episode.columns.items()}
+    moved = {column.name: change.of_column(column, cut[column.name]) for column in _moving(source)}
+    goal = world.navigation.draw_goals(rng, 1)[0].astype(np.float32)
+    columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
+    before, after = (positions(world, columns[name]) for name in (STATE, NEXT_STATE))
+    judged = outcomes(world.navigation, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
+    length = len(judged[DONE])
+    return Episode(
+        uid,
+        {name: values[:length] for name, values in columns.items()} | judged,
+        {
+            "success": bool(judged[SUCCESS][-1]),
+            "toppled": bool(judged[TERMINATED][-1] and not judged[SUCCESS][-1]),
+            "return": float(judged[REWARD].sum(dtype=np.float64)),
+            "held_out": False,
+            "source_episode": episode.uid,
+            "augmentation_first_step": int(steps.start),
+            "augmentation_rotation_rad": change.rotation_rad,
+            "augmentation_x_m": change.shift_m[0],
+            "augmentation_y_m": change.shift_m[1],
+            "augmentation_reflected": change.reflected,
+        },
+    )
+
+
+def _free_uid(uid: int, taken: set[int]) -> int:
+    while uid in taken:
+        uid = (uid + 1) % 2**63
+    taken.add(uid)
+    return uid

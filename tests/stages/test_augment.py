@@ -1,0 +1,259 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_run import TASK, short_task
+
+from astra_data.ant import WALL_REACH_M, rotation_matrix, up_cosine
+from astra_data.columns import (
+    ACTION,
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Episode,
+)
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.errors import BadInputError
+from astra_data.progress import silent
+from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.tasks import TASKS
+
+CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
+MIRRORED = AugmentConfig(copies=3, rotations="any", reflections=True, min_steps=5)
+
+
+@pytest.fixture(autouse=True)
+def known_task(task: str) -> None:
+    """Let the task of the small run be known."""
+
+
+@pytest.fixture(scope="module")
+def augmented(collected: Path) -> Path:
+    with short_task():
+        return augment(
+            None, CONFIG, dataset=collected, seed=1, out=collected.with_name("turned"), progress=silent
+        )
+
+
+@pytest.fixture(scope="module")
+def mirrored(collected: Path) -> Path:
+    """Let the ant's controller pass for its own mirror image."""
+    with short_task():
+        TASKS[TASK] = replace(TASKS[TASK], is_mirrorable=True)
+        return augment(
+            None, MIRRORED, dataset=collected, seed=1, out=collected.with_name("mirrored"), progress=silent
+        )
+
+
+def facts(dataset: Dataset, index: int) -> dict[str, Any]:
+    return {key: values[index] for key, values in dataset.metadata.items()}
+
+
+def copies(source: Dataset, dataset: Dataset) -> Iterator[tuple[Episode, Episode]]:
+    """Yield each copy with the stretch of its source that it was made of."""
+    episodes = {episode.uid: episode for episode in source.episodes()}
+    for copy in dataset.episodes():
+        if copy.uid not in episodes:
+            told = copy.metadata
+            original = episodes[int(told["source_episode"])]
+            steps = slice(int(told["augmentation_first_step"]), None)
+            cut = {name: values[steps][: len(copy)] for name, values in original.columns.items()}
+            yield copy, Episode(original.uid, cut, original.metadata)
+
+
+def test_episodes_are_as_many_as_asked_and_none_is_lost(collected: Path, augmented: Path) -> None:
+    source, dataset = Dataset.open(collected), Dataset.open(augmented)
+    assert len(dataset) == CONFIG.episodes
+    assert dataset.verify() == []
+    assert dataset.description["version"] == "1.1.0"
+    assert dataset.description["parents"] == [source.identity]
+    assert dataset.description["seeds"]["augment"] == 1
+    assert dataset.description["copies"] == CONFIG.episodes - len(source)
+    assert dataset.features == source.features
+    kept = {episode.uid: episode for episode in dataset.episodes()}
+    for episode in source.episodes():
+        for name, values in episode.columns.items():
+            np.testing.assert_array_equal(values, kept[episode.uid].columns[name])
+        told = dict(kept[episode.uid].metadata)
+        told.pop("held_out")
+        assert told == episode.metadata
+
+
+def test_no_copy_of_a_held_out_episode_exists(collected: Path, augmented: Path) -> None:
+    dataset = Dataset.open(augmented)
+    told = [facts(dataset, index) for index in range(len(dataset))]
+    held_out = {int(uid) for uid, fact in zip(dataset.uids, told, strict=True) if fact["held_out"]}
+    sources = {fact["source_episode"] for fact in told} - {None}
+    assert len(held_out) == 2
+    assert held_out < set(Dataset.open(collected).uids.tolist())
+    assert sources
+    assert not sources & held_out
+
+
+@pytest.mark.parametrize("kind", ["augmented", "mirrored"])
+def test_copies_are_their_source_moved_as_they_say(
+    collected: Path, augmented: Path, mirrored: Path, kind: str
+) -> None:
+    reflected = set()
+    root = mirrored if kind == "mirrored" else augmented
+    for copy, cut in copies(Dataset.open(collected), Dataset.open(root)):
+        told = copy.metadata
+        reflected.add(told["augmentation_reflected"])
+        angle = float(told["augmentation_rotation_rad"])
+        mirror = np.diag([1, -1 if told["augmentation_reflected"] else 1, 1])
+        turn = np.eye(3)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        whole = turn @ mirror
+        shift = np.array([told["augmentation_x_m"], told["augmentation_y_m"], 0.0])
+        for name in (STATE, NEXT_STATE):
+            before, after = cut.columns[name].astype(np.float64), copy.columns[name].astype(np.float64)
+            np.testing.assert_allclose(after[:, :3], before[:, :3] @ whole.T + shift, atol=1e-5)
+            np.testing.assert_allclose(after[:, 15:18], before[:, 15:18] @ whole.T, atol=1e-5)
+            np.testing.assert_allclose(
+                rotation_matrix(after[:, 3:7]), whole @ rotation_matrix(before[:, 3:7]) @ mirror, atol=1e-5
+            )
+            # The body's rates seen from the world turn the other way in a mirror.
+            rates = [
+                np.einsum("tij,tj->ti", rotation_matrix(s[:, 3:7]), s[:, 18:21]) for s in (before, after)
+            ]
+            np.testing.assert_allclose(rates[1], np.linalg.det(whole) * rates[0] @ whole.T, atol=1e-4)
+            assert (up_cosine(after[:, 3:7]) > -1).all()
+        np.testing.assert_allclose(copy.columns[ACTION], cut.columns[ACTION] @ whole[:2, :2].T, atol=1e-6)
+        assert np.abs(copy.columns[ACTION]).max() <= 1 + 1e-6
+        assert (np.linalg.norm(np.diff(copy.columns[STATE][:, :2], axis=0), axis=1)).sum() == pytest.approx(
+            np.linalg.norm(np.diff(cut.columns[STATE][:, :2], axis=0), axis=1).sum(), rel=1e-4
+        )
+    assert reflected == ({True, False} if kind == "mirrored" else {False})
+
+
+def test_the_target_does_what_copies_say(collected: Path, augmented: Path) -> None:
+    """Put the ant where a copy was, give it the copy's command, and it lands where the copy did."""
+    pairs = list(copies(Dataset.open(collected), Dataset.open(augmented)))
+    moved, original = (
+        [
+            np.concatenate([pair[side].columns[name] for pair in pairs])[::6]
+            for name in (STATE, ACTION, NEXT_STATE)
+        ]
+        for side in (0, 1)
+    )
+
+    def errors(state: Any, action: Any, next_state: Any) -> Any:  # noqa: ANN401
+        env = TASKS[TASK].target(len(state), seed=0, num_threads=1)
+        env.reset_to(np.arange(len(state)), state.astype(np.float64))
+        env.step(torch.from_numpy(action))
+        assert not env.wall_contact.any()
+        return np.abs(env.state.numpy() - next_state).max(axis=1)
+
+    ours, theirs = errors(*moved), errors(*original)
+    assert len(ours) > 40
+    # States are stored as float32 and without the solver's warm start, in the originals as well.
+    assert np.median(ours) < 10 * np.median(theirs) < 1e-4
+    assert np.quantile(ours, 0.9) < 10 * np.quantile(theirs, 0.9) < 1e-3
+
+
+def test_copies_and_what_they_copy_keep_out_of_the_walls_reach(collected: Path, augmented: Path) -> None:
+    clearance = TASKS[TASK].maze.clearance
+    for pair in copies(Dataset.open(collected), Dataset.open(augmented)):
+        for episode in pair:
+            for name in (STATE, NEXT_STATE):
+                assert (clearance(episode.columns[name][:, :2]) > WALL_REACH_M).all()
+
+
+def test_copies_are_judged_with_a_goal_of_their_own(collected: Path, augmented: Path) -> None:
+    navigation = TASKS[TASK].navigation
+    goals = set()
+    for copy, cut in copies(Dataset.open(collected), Dataset.open(augmented)):
+        columns = copy.columns
+        assert (columns[GOAL] == columns[GOAL][0]).all()
+        goals.add(tuple(columns[GOAL][0].tolist()))
+        centre = navigation.maze.cell_centre(*navigation.maze.goal)
+        assert np.abs(columns[GOAL][0] - centre).max() < 0.7
+        near = np.linalg.norm(columns[NEXT_STATE][:, :2] - columns[GOAL], axis=1) <= 0.45
+        np.testing.assert_array_equal(columns[SUCCESS], near)
+        toppled = cut.columns[TERMINATED] & ~cut.columns[SUCCESS]
+        np.testing.assert_array_equal(columns[TERMINATED], near | toppled)
+        np.testing.assert_array_equal(columns[TRUNCATED], columns[DONE] & ~columns[TERMINATED])
+        assert columns[DONE].tolist() == [False] * (len(copy) - 1) + [True]
+        distance = navigation.goal_distance
+        start, end = (torch.from_numpy(columns[name][:, :2].copy()) for name in (STATE, NEXT_STATE))
+        goal = torch.from_numpy(columns[GOAL])
+        metres = (distance(start, goal) - distance(end, goal)).numpy()
+        np.testing.assert_allclose(columns[REWARD], metres + 10.0 * near - 10.0 * toppled, atol=1e-4)
+        assert copy.metadata["return"] == pytest.approx(columns[REWARD].sum(), abs=1e-4)
+        assert copy.metadata["success"] == near.any()
+        assert copy.metadata["toppled"] == (toppled.any() and not near.any())
+    assert len(goals) == CONFIG.episodes - len(Dataset.open(collected))  # type: ignore[operator]
+
+
+def test_the_seed_decides_every_byte(collected: Path, augmented: Path, tmp_path: Path) -> None:
+    def contents(root: Path) -> list[bytes]:
+        return [path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()]
+
+    again = augment(TASK, CONFIG, dataset=collected, seed=1, out=tmp_path / "again", progress=silent)
+    other = augment(TASK, CONFIG, dataset=collected, seed=2, out=tmp_path / "other", progress=silent)
+    assert contents(again) == contents(augmented)
+    uids = [set(Dataset.open(root).uids.tolist()) for root in (collected, augmented, other)]
+    assert uids[1] & uids[2] == uids[0]
+
+
+def test_originals_can_be_left_out(collected: Path, tmp_path: Path) -> None:
+    config = AugmentConfig(copies=1, keep_originals=False, min_steps=5)
+    dataset = Dataset.open(
+        augment(None, config, dataset=collected, seed=0, out=tmp_path / "out", progress=silent)
+    )
+    kept = set(Dataset.open(collected).uids.tolist()) & set(dataset.uids.tolist())
+    assert len(kept) == 1
+    assert sum(value is True for value in dataset.metadata["held_out"]) == 1
+
+
+def test_mirror_images_need_a_mirrorable_controller(collected: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="its controller does not act in mirror images"):
+        augment(None, MIRRORED, dataset=collected, seed=0, out=tmp_path / "out", progress=silent)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"margin_m": 9.0}, r"none of 7 training episodes keeps 9 m from the walls for 20 steps"),
+        ({"episodes": 8}, r"--episodes 8: expected more than the 8 that are kept"),
+    ],
+)
+def test_what_cannot_be_done_is_told(
+    collected: Path, tmp_path: Path, changes: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(BadInputError, match=told):
+        augment(
+            None, AugmentConfig(**changes), dataset=collected, seed=0, out=tmp_path / "out", progress=silent
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_datasets_that_do_not_fit_are_refused(
+    collected: Path, augmented: Path, paired: Path, tmp_path: Path
+) -> None:
+    source = Dataset.open(collected)
+    silent_columns = [replace(c, astra=None) if c.name == STATE else c for c in source.schema]
+    mute = tmp_path / "mute"
+    description = {"name": "mute", "stage": "import"}
+    with DatasetWriter(mute, silent_columns, fps=20, task="run", description=description) as writer:
+        writer.add(next(source.episodes()))
+    for dataset, task, told in (
+        (paired, None, "it has been paired; augment its parent"),
+        (augmented, None, "it has been augmented; augment its parent"),
+        (collected, "antmaze-long", "was collected for antmaze-short, not for antmaze-long"),
+        (mute, None, "give --task"),
+        (mute, TASK, "observation.state: its roles are not told"),
+        (mute, "antmaze-umase", "did you mean 'antmaze-umaze'"),
+    ):
+        with pytest.raises(BadInputError, match=told):
+            augment(task, CONFIG, dataset=dataset, seed=0, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "out").exists()
