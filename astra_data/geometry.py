@@ -53,11 +53,11 @@ class PlanarMap:
         """Turn velocities and other differences of positions (..., 2), in the world's frame."""
         x, y = values[..., 0], -values[..., 1] if self.reflected else values[..., 1]
         cos, sin = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        return np.asarray(np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1))
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
     def positions(self, values: Floats) -> Floats:
         """Move positions (..., 2) in m."""
-        return self.vectors(values) + np.array(self.shift_m)
+        return np.asarray(self.vectors(values) + np.array(self.shift_m))
 
     def headings(self, values: Floats) -> Floats:
         """Turn angles (...) from the world's x axis in rad; the result is in [-π, π)."""

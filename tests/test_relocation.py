@@ -59,8 +59,9 @@ def moved(change: Any, episode: Episode) -> Array:  # noqa: ANN401
 
 def test_quarter_turns_go_everywhere_that_is_free() -> None:
     path = straight((-4.5, 4.0), (-3.5, 4.0), 20)
-    ends = np.array([moved(change, path) for change, _ in draws(80, path)], np.float32)
-    assert (TASK.maze.clearance(ends) > 1.3).all()
+    drawn: Array = np.array([moved(change, path) for change, _ in draws(80, path)])
+    ends = drawn.astype(np.float32)  # as they are stored
+    assert (TASK.maze.clearance(ends.astype(np.float64)) > 1.3).all()
     bearing = np.arctan2(*(ends[:, -1] - ends[:, 0]).T[::-1])
     turns = np.round(bearing / (np.pi / 2))
     np.testing.assert_allclose(bearing, turns * np.pi / 2, atol=1e-6)

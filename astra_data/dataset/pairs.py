@@ -39,12 +39,14 @@ class PairedEpisodes:
     Attributes:
         target_state: s_i, (E, T, S). windows: everything else, (E, T, ...), with the mask of real steps.
         reference: name and version of the dataset. content_hash: its hash.
+        held_out: which episodes the dataset itself sets aside, (E,) bool; None where it does not.
     """
 
     target_state: Tensor
     windows: Windows
     reference: str
     content_hash: str
+    held_out: Tensor | None = None
 
     @classmethod
     def load(cls, root: Path, device: str = "cpu") -> "PairedEpisodes":
@@ -64,6 +66,7 @@ class PairedEpisodes:
             pieces = [torch.from_numpy(piece).float() for piece in np.split(values, ends)]
             return pad_sequence(pieces, batch_first=True).to(device)
 
+        said = [bool(word) for word in dataset.metadata.get("held_out", ())]
         action = padded(columns[ACTION])
         ended = columns[TERMINATED]
         return cls(
@@ -81,6 +84,7 @@ class PairedEpisodes:
             ),
             reference=dataset.reference,
             content_hash=dataset.content_hash,
+            held_out=torch.tensor(said, dtype=torch.bool, device=device) if any(said) else None,
         )
 
     def __len__(self) -> int:
@@ -94,12 +98,20 @@ class PairedEpisodes:
 
     def select(self, episodes: Tensor) -> "PairedEpisodes":
         """Return the episodes `episodes` (n,)."""
-        return PairedEpisodes(
-            self.target_state[episodes], _gather(self.windows, episodes), self.reference, self.content_hash
+        return replace(
+            self,
+            target_state=self.target_state[episodes],
+            windows=_gather(self.windows, episodes),
+            held_out=None if self.held_out is None else self.held_out[episodes],
         )
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
-        """Split by episodes into training and held-out ones, at random."""
+        """Split by episodes into training and held-out ones: as the dataset says, else at random.
+
+        In an augmented dataset a random episode would leave copies of itself behind in the training ones.
+        """
+        if self.held_out is not None:
+            return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
         order = torch.from_numpy(generator(seed, "held-out episodes").permutation(len(self)))
         order = order.to(self.target_state.device)
         count = max(1, round(held_out_share * len(self)))

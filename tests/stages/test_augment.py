@@ -22,9 +22,11 @@ from astra_data.columns import (
     Episode,
 )
 from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.progress import silent
 from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.pair import PairConfig, pair
 from astra_data.tasks import TASKS
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
@@ -162,8 +164,8 @@ def test_the_target_does_what_copies_say(collected: Path, augmented: Path) -> No
 
 def test_copies_and_what_they_copy_keep_out_of_the_walls_reach(collected: Path, augmented: Path) -> None:
     clearance = TASKS[TASK].maze.clearance
-    for pair in copies(Dataset.open(collected), Dataset.open(augmented)):
-        for episode in pair:
+    for both in copies(Dataset.open(collected), Dataset.open(augmented)):
+        for episode in both:
             for name in (STATE, NEXT_STATE):
                 assert (clearance(episode.columns[name][:, :2]) > WALL_REACH_M).all()
 
@@ -257,3 +259,13 @@ def test_datasets_that_do_not_fit_are_refused(
         with pytest.raises(BadInputError, match=told):
             augment(task, CONFIG, dataset=dataset, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()
+
+
+def test_grounding_holds_out_what_was_not_copied(augmented: Path, tmp_path: Path) -> None:
+    folder = pair(TASK, PairConfig(), dataset=augmented, out=tmp_path / "paired", progress=silent)
+    dataset = Dataset.open(folder)
+    first: dict[bool, set[float]] = {False: set(), True: set()}
+    for episode, held in zip(dataset.episodes([STATE]), dataset.metadata["held_out"], strict=True):
+        first[bool(held)].add(float(episode.columns[STATE][0, 0]))
+    for split, held in zip(PairedEpisodes.load(folder).split(0.1, seed=0), (False, True), strict=True):
+        assert set(split.target_state[:, 0, 0].tolist()) == first[held]
