@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands import augmenting, building, recipes
+from astra_data.commands import augmenting, building, inspecting, recipes
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -43,6 +43,7 @@ for command in (
     building.collect,
     augmenting.augment,
     building.pair,
+    inspecting.inspect,
     recipes.ground,
     recipes.train,
     recipes.align,

@@ -1,11 +1,13 @@
-"""The report's figures: pure functions from arrays to a matplotlib Figure, in one style.
+"""Figures: pure functions from arrays to a matplotlib Figure, in one style.
 
 style         colours, titles and roles of the methods; fonts and lines
 scores        success_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
+coverage      coverage: which positions or velocities a dataset holds
 open_loop     open_loop_error: how fast a simulator drifts from the target
 """
 
+from astra_data.figures.coverage import coverage
 from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.figures.scores import Curve, learning_curves, success_bars
@@ -16,6 +18,7 @@ __all__ = [
     "Curve",
     "OpenLoop",
     "Panel",
+    "coverage",
     "dynamics_mismatch",
     "learning_curves",
     "method_colour",

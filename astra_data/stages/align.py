@@ -39,7 +39,8 @@ class AlignConfig(Config):
     paired_weight: NotNegative = 0.0
     """Weight of the direct distance between paired latents; 0 is the paper's loss."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Share of the episodes that only measure the agreement; the same ones as in `ground`."""
+    """Share of the episodes that only measure the agreement, unless the dataset sets some aside itself; the
+    same ones as in `ground`."""
 
 
 def align(

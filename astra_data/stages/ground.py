@@ -47,7 +47,8 @@ class GroundConfig(Config):
     position_octaves: int = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Share of the episodes on which nothing is fitted but the residual's scatter."""
+    """Share of the episodes on which nothing is fitted but the residual's scatter, unless the dataset sets
+    some aside itself."""
 
 
 def ground(
