@@ -218,21 +218,16 @@ def airborne(state: Array) -> Array:
     return high
 
 
-QUARTER_TURNS = [quarters * np.pi / 2 for quarters in range(4)]
-
-
 @properties
 @given(maps)
 def test_the_ant_in_the_air_does_not_feel_any_map(change: PlanarMap) -> None:
     assert ant_error(small(change), STATE_COLUMN, airborne(WALKING)) < 1e-7
 
 
-@pytest.mark.parametrize("rotation", QUARTER_TURNS)
-@pytest.mark.parametrize("reflected", [False, True])
-def test_the_ant_on_the_ground_does_not_feel_quarter_turns(rotation: float, reflected: bool) -> None:
-    # Only those: MuJoCo's friction cones are pyramids along the world's axes.
-    change = PlanarMap(rotation, (1.0, -2.0), reflected)
-    assert ant_error(change, STATE_COLUMN, WALKING) < 1e-4
+@properties
+@given(maps)
+def test_the_ant_on_the_ground_does_not_feel_any_map(change: PlanarMap) -> None:
+    assert ant_error(small(change), STATE_COLUMN, WALKING) < 1e-4
 
 
 def with_words(column: Column, key: str, changes: dict[str, str]) -> Column:
@@ -264,10 +259,12 @@ def test_wrong_words_are_felt(key: str, changes: dict[str, str]) -> None:
     assert ant_error(change, wrong, airborne(WALKING)) > 1e-3
 
 
-@pytest.mark.parametrize("rotation", QUARTER_TURNS)
+@settings(max_examples=8, deadline=None)
+@given(angles)
 def test_the_walking_ant_follows_the_turned_command(rotation: float) -> None:
     change = PlanarMap(rotation, (1.0, -2.0))
-    command = np.random.default_rng(6).uniform(-1, 1, (3, 2))
+    # Short enough for any turn to stay within 1 m/s along each axis.
+    command = np.random.default_rng(6).uniform(-0.7, 0.7, (3, 2))
 
     def stepped(state: Array, command: Array) -> Array:
         env = AntMazeEnv(Navigation(OPEN, 100, "sparse"), len(state), seed=0, num_threads=1)
@@ -276,7 +273,7 @@ def test_the_walking_ant_follows_the_turned_command(rotation: float) -> None:
         return np.concatenate([env.physics.qpos, env.physics.qvel], axis=1)
 
     moved = stepped(change.of_column(STATE_COLUMN, WALKING), change.of_column(ACTION_COLUMN, command))
-    np.testing.assert_allclose(moved, change.of_column(STATE_COLUMN, stepped(WALKING, command)), atol=1e-2)
+    np.testing.assert_allclose(moved, change.of_column(STATE_COLUMN, stepped(WALKING, command)), atol=1e-4)
 
 
 def test_mujoco_sees_the_mirror_image() -> None:

@@ -21,7 +21,7 @@ def augment(
         int | None, typer.Option(help="Episodes in all, instead of --copies.", show_default=False)
     ] = None,
     rotations: Annotated[
-        str | None, typer.Option(help="quarter (turns), any (angle) or none.", show_default="quarter")
+        str | None, typer.Option(help="any (angle), quarter (turns) or none.", show_default="any")
     ] = None,
     translations: Annotated[
         bool | None,

@@ -29,17 +29,15 @@ def inspect(
         return
     from astra_data.figures import coverage, png
 
-    drawn = {
-        "position_coverage.png": (inspection.positions, "position", "m"),
-        "velocity_coverage.png": (inspection.velocities, "velocity", "m/s"),
-    }
-    found = {name: (planar, *words) for name, (planar, *words) in drawn.items() if planar is not None}
+    maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
+    found = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
     if not found:
         raise BadInputError(f"{inspection.reference}: the roles of its state tell no position or velocity")
     try:
         plot.mkdir(parents=True, exist_ok=True)
-        for name, (planar, label, unit) in found.items():
-            (plot / name).write_bytes(png(coverage(planar.counts, planar.extent, label, unit)))
-            typer.echo(f"written: {plot / name}")
+        for planar, label, unit in found:
+            path = plot / f"{label}_coverage.png"
+            path.write_bytes(png(coverage(planar.counts, planar.extent, label, unit)))
+            typer.echo(f"written: {path}")
     except OSError as error:
         raise BadInputError(f"--plot {plot}: expected a folder to write to ({error.strerror})") from None

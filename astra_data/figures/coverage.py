@@ -23,7 +23,7 @@ def coverage(counts: Ints, extent: tuple[float, float, float, float], label: str
         figure = Figure(figsize=(4.2, 3.6), layout="constrained")
         axes = figure.subplots()
         image = axes.imshow(
-            np.ma.masked_equal(counts, 0),
+            np.where(counts > 0, counts, np.nan),
             origin="lower",
             extent=extent,
             cmap="viridis",

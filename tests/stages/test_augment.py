@@ -30,7 +30,7 @@ from astra_data.stages.pair import PairConfig, pair
 from astra_data.tasks import TASKS
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
-MIRRORED = AugmentConfig(copies=3, rotations="any", reflections=True, min_steps=5)
+MIRRORED = AugmentConfig(copies=3, rotations="quarter", reflections=True, min_steps=5)
 
 
 @pytest.fixture(autouse=True)
