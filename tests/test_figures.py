@@ -8,6 +8,7 @@ from astra_data.figures import (
     Curve,
     OpenLoop,
     Panel,
+    coverage,
     dynamics_mismatch,
     learning_curves,
     method_colour,
@@ -166,3 +167,16 @@ def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
     image = png(success_bars({"nas": np.array([0.5])}, {"nas": (0.5, np.nan, np.nan)}, {}))
     assert image.startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
+
+
+def test_only_visited_cells_are_coloured() -> None:
+    counts = np.array([[0, 3], [40, 0], [1, 0]])
+    figure = coverage(counts, (-1.0, 1.0, 0.0, 3.0), "position", "m")
+    axes = figure.axes[0]
+    (image,) = axes.images
+    shown = np.ma.filled(np.ma.asarray(image.get_array()), np.nan)
+    np.testing.assert_array_equal(np.isnan(shown), counts == 0)
+    assert image.origin == "lower"
+    assert (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 1.0), (0.0, 3.0))
+    assert axes.get_xlabel() == "x position (m)"
+    assert png(figure).startswith(b"\x89PNG")

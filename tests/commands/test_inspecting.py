@@ -1,8 +1,9 @@
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
 import pytest
-from fake_dataset import write_fake
+from fake_dataset import COLUMNS, write_fake
 from typer.testing import CliRunner, Result
 
 from astra_data import cli
@@ -26,8 +27,10 @@ def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     write_fake(tmp_path / "fake")
+    write_fake(tmp_path / "mute", columns=[replace(column, astra=None) for column in COLUMNS])
     for arguments, told in (
         ([str(tmp_path / "none")], "no such folder"),
+        ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "roles of its state tell no position"),
         ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "expected a folder to write to"),
     ):
         error = call("inspect", *arguments).exception
