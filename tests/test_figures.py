@@ -174,8 +174,9 @@ def test_only_visited_cells_are_coloured() -> None:
     figure = coverage(counts, (-1.0, 1.0, 0.0, 3.0), "position", "m")
     axes = figure.axes[0]
     (image,) = axes.images
-    shown = np.ma.filled(np.ma.asarray(image.get_array()), np.nan)
-    np.testing.assert_array_equal(np.isnan(shown), counts == 0)
+    shown = image.get_array()
+    assert isinstance(shown, np.ma.MaskedArray)
+    np.testing.assert_array_equal(shown.mask, counts == 0)
     assert image.origin == "lower"
     assert (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 1.0), (0.0, 3.0))
     assert axes.get_xlabel() == "x position (m)"
