@@ -78,8 +78,10 @@ def read_contents(root: Path) -> Contents:
     tables = list(read_blocks(sorted((root / "meta/episodes").glob("*/*.parquet")), _LOCATION))
     facts = list(read_blocks([root / layout.METADATA_PATH]))
     tasks = list(read_blocks([root / layout.TASKS_PATH], ["task"]))
-    if not tables or not facts or not tasks:
-        raise CorruptDatasetError(f"meta/episodes, {layout.METADATA_PATH} or {layout.TASKS_PATH} has no rows")
+    empty = {"meta/episodes": tables, layout.METADATA_PATH: facts, layout.TASKS_PATH: tasks}
+    if not all(empty.values()):
+        names = ", ".join(name for name, found in empty.items() if not found)
+        raise CorruptDatasetError(f"{names} has no rows")
     metadata = pa.concat_tables(facts).to_pydict()
     index, lengths, chunks, files, starts = (
         to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
