@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from astra_data.columns import Array
-from astra_data.dataset.format import CHUNK_SIZE, DATA_FILE_SIZE_MB
+from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
 from astra_data.errors import CorruptDatasetError
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
@@ -97,7 +97,12 @@ class RotatingWriter:
     """
 
     def __init__(
-        self, root: Path, pattern: str, schema: pa.Schema, encodings: Mapping[str, str] | None = None
+        self,
+        root: Path,
+        pattern: str,
+        schema: pa.Schema,
+        encodings: Mapping[str, str] | None = None,
+        compression: str = COMPRESSIONS[0],
     ) -> None:
         """Start the first file; `pattern` names the files, `encodings` those of their columns."""
         self.chunk_index = 0
@@ -106,6 +111,7 @@ class RotatingWriter:
         self._pattern = pattern
         self._schema = schema
         self._encodings = encodings
+        self._compression = compression
         self._open()
 
     def _open(self) -> None:
@@ -116,7 +122,7 @@ class RotatingWriter:
         self._writer = pq.ParquetWriter(
             self._file,
             self._schema,
-            compression="snappy",
+            compression=self._compression,
             use_dictionary=self._encodings is None,
             column_encoding=self._encodings,
         )
