@@ -133,9 +133,10 @@ def measurements(root: Path, data: list[Episode], lerobot: Any) -> Iterator[tupl
             "robomimic's HDF5": hdf5.transitions,
         },
     )
+    steps = len(data[0])
     yield (
         "transitions paired",
-        {"ours": pairs(4096, at_once=True), "Gymnasium loop": pairs(500, at_once=False)},
+        {"ours": pairs(steps, at_once=True), "Gymnasium loop": pairs(steps, at_once=False)},
     )
 
 

@@ -38,7 +38,7 @@ class Samples(data.Dataset[Batch], ABC):
 
     def __getitems__(self, index: Sequence[int] | Tensor) -> Batch:
         """Return the samples `index` (B,) as one batch, column name to (B, ...)."""
-        first = self._first[torch.as_tensor(index, device=self._first.device)]
+        first = take(self._first, torch.as_tensor(index, device=self._first.device))
         return {name: values.to(self._device) for name, values in self._gather(first).items()}
 
     @abstractmethod
@@ -90,3 +90,13 @@ class Batches:
             BadInputError: it is of another order.
         """
         self.order.load_state_dict(state)
+
+
+def take(values: Tensor, rows: Tensor) -> Tensor:
+    """Return the rows `rows` (n,) of `values` (N, ...)."""
+    if values.is_cuda:
+        return values.index_select(0, rows)
+    # numpy is faster, and does not wait for threads where other processes use the cores. Its `take` is the
+    # fastest for many short rows, but would first copy all of an array that is not contiguous.
+    array, index = values.numpy(), rows.numpy()
+    return torch.from_numpy(array.take(index, axis=0) if values.is_contiguous() else array[index])

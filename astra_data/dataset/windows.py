@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from astra_data.dataset.samples import Batch, Samples
+from astra_data.dataset.samples import Batch, Samples, take
 from astra_data.errors import BadInputError
 
 Padding = Literal["valid", "edge"]
@@ -22,7 +22,7 @@ class Transitions(Samples):
         self._columns = columns
 
     def _gather(self, first: Tensor) -> Batch:
-        return {name: values.index_select(0, first) for name, values in self._columns.items()}
+        return {name: take(values, first) for name, values in self._columns.items()}
 
 
 class Windows(Samples):
@@ -66,17 +66,20 @@ class Windows(Samples):
         super().__init__(_every(stride, starts - past, anchors), device)
         self._columns = columns
         self._starts, self._ends = starts, starts + lengths
-        self._length, self._padding, self._past = length, padding, past
+        self._length, self._past = length, past
+        self._rolled = {}
+        if padding == "valid":
+            self._rolled = {name: _rolled(values, length) for name, values in columns.items()}
         self._steps = torch.arange(length, device=starts.device)
 
     def _gather(self, first: Tensor) -> Batch:
-        return self._inside(first) if self._padding == "valid" else self._padded(first)
+        return self._inside(first) if self._rolled else self._padded(first)
 
     def _inside(self, first: Tensor) -> Batch:
         shape = (len(first), self._length)
         batch = {
-            name: _rolled(values, self._length).index_select(0, first).view(*shape, *values.shape[1:])
-            for name, values in self._columns.items()
+            name: take(values, first).view(*shape, *self._columns[name].shape[1:])
+            for name, values in self._rolled.items()
         }
         return batch | {IS_PAD: first.new_zeros(shape, dtype=torch.bool)}
 
@@ -85,7 +88,7 @@ class Windows(Samples):
         wanted = first[:, None] + self._steps
         rows = wanted.clamp(self._starts[episode, None], self._ends[episode, None] - 1)
         batch = {
-            name: values.index_select(0, rows.view(-1)).view(*rows.shape, *values.shape[1:])
+            name: take(values, rows.view(-1)).view(*rows.shape, *values.shape[1:])
             for name, values in self._columns.items()
         }
         return batch | {IS_PAD: rows != wanted}
