@@ -89,7 +89,7 @@ class Dataset(Contents):
         for block in self.blocks(names, episodes):
             for name, values in block.items():
                 out[name][row : row + len(values)] = values
-            row += len(values)
+            row += len(next(iter(block.values()), ()))
         return out
 
     def blocks(
@@ -115,11 +115,13 @@ class Dataset(Contents):
         if episodes is None:
             return np.arange(len(self))
         chosen, counts = np.unique(np.array(list(episodes), dtype=np.int64), return_counts=True)
-        unknown, twice = chosen[(chosen < 0) | (chosen >= len(self))], chosen[counts > 1]
-        faults = [f"has no episode {', '.join(map(str, unknown))}; it has 0 to {len(self) - 1}"]
-        faults = faults * bool(len(unknown)) + [f"episode {episode} is listed twice" for episode in twice]
-        if not len(chosen):
-            faults.append("no episodes are listed")
+        faults = [
+            f"has no episode {episode}, expected 0 to {len(self) - 1}"
+            for episode in chosen
+            if not 0 <= episode < len(self)
+        ]
+        faults += [f"episode {episode} is listed twice" for episode in chosen[counts > 1]]
+        faults += [] if len(chosen) else ["no episodes are listed"]
         if faults:
             raise BadInputError(f"{self.reference}: {'; '.join(faults)}.")
         return chosen
