@@ -142,8 +142,7 @@ def test_samples_come_one_by_one_too(frames: Frames) -> None:
         windows[55]
 
 
-@pytest.mark.parametrize("padding", ["valid", "edge"])
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])
 def test_a_data_loader_draws_the_same_batches(frames: Frames, workers: int, padding: Padding) -> None:
     windows = frames.windows(6, padding=padding)
     expected = list(windows.batches(8, seed=3))
@@ -203,9 +202,8 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
         frames.windows(6, past=1)
     with pytest.raises(BadInputError, match=r"padding 'wrap', expected 'valid' or 'edge'"):
         frames.windows(6, padding="wrap")  # type: ignore[arg-type]
-    with pytest.raises(
-        BadInputError, match=r"has no episode -1, 5; it has 0 to 4; episode 2 is listed twice"
-    ):
+    faults = "has no episode -1, expected 0 to 4; has no episode 5, .*; episode 2 is listed twice"
+    with pytest.raises(BadInputError, match=faults):
         Frames.load(fake, [STATE], episodes=[2, 5, 2, -1])
     with pytest.raises(BadInputError, match="no episodes are listed"):
         Frames.load(fake, [STATE], episodes=[])

@@ -59,8 +59,8 @@ def test_files_cut_without_regard_for_episodes_read_the_same(tmp_path: Path, row
     assert again.verify() == []
     for found, expected in zip(again.episodes(), fake_episodes(), strict=True):
         np.testing.assert_array_equal(found.columns[STATE], expected.columns[STATE])
-    rows = [*range(7, 8), *range(20, 50)]
-    np.testing.assert_array_equal(again.columns([STATE], [3, 1])[STATE], concatenated(STATE)[rows])
+    chosen = [*range(7, 8), *range(20, 50)]
+    np.testing.assert_array_equal(again.columns([STATE], [3, 1])[STATE], concatenated(STATE)[chosen])
 
 
 def test_only_the_row_groups_of_chosen_episodes_are_read(
