@@ -37,6 +37,9 @@ SUBSETS_PATH = "meta/astra/subsets.json"
 METADATA_KEYS = ("episode_uid", "length")
 """First columns of `METADATA_PATH`; the others are the episodes' own metadata."""
 
+COMPRESSIONS = ("snappy", "zstd")
+"""Of the data files: snappy is LeRobot's and faster, zstd smaller; every reader takes both."""
+
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 STORED_STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from astra_data.columns import Array
-from astra_data.dataset.format import CHUNK_SIZE, DATA_FILE_SIZE_MB
+from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
 from astra_data.errors import CorruptDatasetError
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
@@ -45,23 +46,38 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
     return flat if size == 1 else flat.reshape(-1, size)
 
 
-def read_blocks(paths: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[pa.Table]:
+def read_blocks(
+    paths: Sequence[Path], names: Sequence[str] | None = None, wanted: NDArray[np.bool_] | None = None
+) -> Iterator[pa.Table]:
     """Yield columns of all files in order, in blocks of whole row groups, so that memory stays bounded.
+
+    Args:
+        paths: the files.
+        names: the columns, by default all.
+        wanted: marks the rows to be read among all rows of all files, by default all; row groups without
+            any are skipped.
 
     Raises:
         CorruptDatasetError: a file cannot be read.
     """
+    end = 0
     for path in paths:
         try:
             with pq.ParquetFile(path) as file:
+                metadata = file.metadata
                 groups: list[int] = []
+                masks: list[NDArray[np.bool_]] = []
                 rows = 0
-                for group in range(file.num_row_groups):
-                    groups.append(group)
-                    rows += file.metadata.row_group(group).num_rows
-                    if rows >= BLOCK_ROWS or group == file.num_row_groups - 1:
-                        yield file.read_row_groups(groups, columns=names, use_threads=False)
-                        groups, rows = [], 0
+                for group in range(metadata.num_row_groups):
+                    begin, end = end, end + metadata.row_group(group).num_rows
+                    if wanted is None or wanted[begin:end].any():
+                        groups.append(group)
+                        rows += end - begin
+                        masks += [] if wanted is None else [wanted[begin:end]]
+                    if groups and (rows >= BLOCK_ROWS or group == metadata.num_row_groups - 1):
+                        table = file.read_row_groups(groups, columns=names, use_threads=False)
+                        yield table if all(mask.all() for mask in masks) else table.filter(np.hstack(masks))
+                        groups, masks, rows = [], [], 0
         except (OSError, pa.ArrowException) as error:
             name = f"{path.parent.name}/{path.name}"
             raise CorruptDatasetError(f"{name} cannot be read ({first_line(error)})") from error
@@ -81,7 +97,12 @@ class RotatingWriter:
     """
 
     def __init__(
-        self, root: Path, pattern: str, schema: pa.Schema, encodings: Mapping[str, str] | None = None
+        self,
+        root: Path,
+        pattern: str,
+        schema: pa.Schema,
+        encodings: Mapping[str, str] | None = None,
+        compression: str = COMPRESSIONS[0],
     ) -> None:
         """Start the first file; `pattern` names the files, `encodings` those of their columns."""
         self.chunk_index = 0
@@ -90,6 +111,7 @@ class RotatingWriter:
         self._pattern = pattern
         self._schema = schema
         self._encodings = encodings
+        self._compression = compression
         self._open()
 
     def _open(self) -> None:
@@ -100,7 +122,7 @@ class RotatingWriter:
         self._writer = pq.ParquetWriter(
             self._file,
             self._schema,
-            compression="snappy",
+            compression=self._compression,
             use_dictionary=self._encodings is None,
             column_encoding=self._encodings,
         )

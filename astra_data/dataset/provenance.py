@@ -66,8 +66,9 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     return full | {"packages": package_versions(), "git_commit": git_commit()}
 
 
+@cache
 def package_versions() -> dict[str, str]:
-    """Return the versions of Python and of `PACKAGES`, where installed."""
+    """Return the versions of Python and of `PACKAGES`, where installed; asked once."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

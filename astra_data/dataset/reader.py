@@ -1,11 +1,12 @@
 """Read a dataset: whole columns as contiguous arrays, or one episode after the other."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from astra_data.columns import RESERVED, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents
@@ -38,7 +39,7 @@ class Dataset(Contents):
     @property
     def schema(self) -> list[Column]:
         """The columns that were handed to the writer."""
-        return self._specs([name for name in self.features if name not in RESERVED])
+        return self.specs([name for name in self.features if name not in RESERVED])
 
     @property
     def reference(self) -> str:
@@ -68,43 +69,80 @@ class Dataset(Contents):
         columns = ", ".join(f"{c.name} ({c.size}) {c.dtype}" for c in self.schema)
         return f"Dataset({self.reference}, {len(self)} episodes, {self.lengths.sum()} steps, {columns})"
 
-    def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return whole columns by name, contiguous (N, size), or (N,) where there is one value per step.
+    def columns(self, names: Sequence[str], episodes: Collection[int] | None = None) -> dict[str, Array]:
+        """Return whole columns by name, contiguous (n, size), or (n,) where there is one value per step.
+
+        Args:
+            names: of the columns.
+            episodes: indices of the episodes whose n steps are read, by default all; whatever their order
+                here, they come in the dataset's.
 
         Raises:
-            BadInputError: a column does not exist.
+            BadInputError: a column or an episode does not exist, or an episode is listed twice.
             CorruptDatasetError: a file cannot be read.
         """
-        specs = self._specs(names)
-        rows = int(self.lengths.sum())
+        chosen = self.selected(episodes)
+        rows = int(self.lengths[chosen].sum())
+        specs = self.specs(names)
         out = {c.name: np.empty((rows, c.size) if c.size > 1 else rows, c.dtype) for c in specs}
         row = 0
-        with _explained(self.root):
-            for table in read_blocks(self.paths, names):
-                for c in specs:
-                    out[c.name][row : row + len(table)] = to_numpy(table.column(c.name), c.size, c.dtype)
-                row += len(table)
+        for block in self.blocks(names, episodes):
+            for name, values in block.items():
+                out[name][row : row + len(values)] = values
+            row += len(next(iter(block.values()), ()))
         return out
+
+    def blocks(
+        self, names: Sequence[str], episodes: Collection[int] | None = None
+    ) -> Iterator[dict[str, Array]]:
+        """Yield the same values piece by piece; memory stays bounded."""
+        specs = self.specs(names)
+        wanted = None
+        if episodes is not None:
+            wanted = np.zeros(int(self.lengths.sum()), dtype=bool)
+            for episode in self.selected(episodes):
+                wanted[self.starts[episode] : self.starts[episode] + self.lengths[episode]] = True
+        with _explained(self.root):
+            for table in read_blocks(self.paths, names, wanted):
+                yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in specs}
+
+    def selected(self, episodes: Collection[int] | None) -> NDArray[np.int64]:
+        """Return the episode indices `episodes`, by default all, in the dataset's order.
+
+        Raises:
+            BadInputError: one does not exist or is listed twice; lists them.
+        """
+        if episodes is None:
+            return np.arange(len(self))
+        chosen, counts = np.unique(np.array(list(episodes), dtype=np.int64), return_counts=True)
+        faults = [
+            f"has no episode {episode}, expected 0 to {len(self) - 1}"
+            for episode in chosen
+            if not 0 <= episode < len(self)
+        ]
+        faults += [f"episode {episode} is listed twice" for episode in chosen[counts > 1]]
+        faults += [] if len(chosen) else ["no episodes are listed"]
+        if faults:
+            raise BadInputError(f"{self.reference}: {'; '.join(faults)}.")
+        return chosen
 
     def episodes(self, names: Sequence[str] | None = None) -> Iterator[Episode]:
         """Yield all episodes in order with the columns `names`, by default all; memory stays bounded."""
-        specs = self.schema if names is None else self._specs(names)
+        specs = self.schema if names is None else self.specs(names)
         rest: dict[str, Array] = {}
         episode = 0
-        with _explained(self.root):
-            for table in read_blocks(self.paths, [c.name for c in specs]):
-                block = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in specs}
-                rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
-                first, rows = 0, len(next(iter(rest.values())))
-                while episode < len(self) and (last := first + int(self.lengths[episode])) <= rows:
-                    metadata = {key: values[episode] for key, values in self.metadata.items()}
-                    yield Episode(
-                        int(self.uids[episode]),
-                        {name: values[first:last] for name, values in rest.items()},
-                        {key: value for key, value in metadata.items() if value is not None},
-                    )
-                    first, episode = last, episode + 1
-                rest = {name: values[first:] for name, values in rest.items()} if first < rows else {}
+        for block in self.blocks([c.name for c in specs]):
+            rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
+            first, rows = 0, len(next(iter(rest.values())))
+            while episode < len(self) and (last := first + int(self.lengths[episode])) <= rows:
+                metadata = {key: values[episode] for key, values in self.metadata.items()}
+                yield Episode(
+                    int(self.uids[episode]),
+                    {name: values[first:last] for name, values in rest.items()},
+                    {key: value for key, value in metadata.items() if value is not None},
+                )
+                first, episode = last, episode + 1
+            rest = {name: values[first:] for name, values in rest.items()} if first < rows else {}
 
     def subset(self, count: int) -> list[int]:
         """Return `count` episode indices; smaller subsets are prefixes of larger ones.
@@ -118,7 +156,7 @@ class Dataset(Contents):
 
     def verify(self) -> list[str]:
         """Read every value again; return what is wrong, empty if nothing is."""
-        columns = self._specs(list(self.features))
+        columns = self.specs(list(self.features))
         try:
             return list(
                 content_faults(
@@ -133,7 +171,12 @@ class Dataset(Contents):
         except CorruptDatasetError as error:
             return [str(error)]
 
-    def _specs(self, names: Sequence[str]) -> list[Column]:
+    def specs(self, names: Sequence[str]) -> list[Column]:
+        """Return what is known about the columns `names`.
+
+        Raises:
+            BadInputError: one does not exist.
+        """
         unknown = [name for name in names if name not in self.features]
         if unknown:
             known = ", ".join(self.features)

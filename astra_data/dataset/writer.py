@@ -20,7 +20,7 @@ from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
 from astra_data.dataset.provenance import ContentHash, complete_description, permutation
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.statistics import global_statistics, statistics
+from astra_data.dataset.statistics import episode_statistics, global_statistics
 from astra_data.errors import BadInputError, CorruptDatasetError
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
@@ -48,6 +48,7 @@ class DatasetWriter:
         task: str,
         description: Mapping[str, Any],
         subset_seed: int = 0,
+        compression: str = layout.COMPRESSIONS[0],
     ) -> None:
         """Prepare to write; entering the block starts.
 
@@ -58,6 +59,7 @@ class DatasetWriter:
             task: what the episodes do, a sentence or a name.
             description: see `complete_description`.
             subset_seed: of the permutation whose prefixes are the nested subsets.
+            compression: of the data files, one of `format.COMPRESSIONS`.
 
         Raises:
             BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
@@ -69,6 +71,8 @@ class DatasetWriter:
             faults.append("no columns")
         if type(fps) is not int or fps < 1:
             faults.append(f"fps {fps!r}, expected a positive int")
+        if compression not in layout.COMPRESSIONS:
+            faults.append(f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}")
         if faults:
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
         self.root = root
@@ -80,6 +84,7 @@ class DatasetWriter:
         self._description = complete_description(description)
         self.made: dict[str, Any] = {}
         self._subset_seed = subset_seed
+        self._compression = compression
         self._hash = ContentHash()
         self._frames = 0
         self._lengths: dict[int, int] = {}
@@ -91,7 +96,9 @@ class DatasetWriter:
         """Start the hidden folder."""
         self._folder = self._exit.enter_context(atomic_folder(self.root))
         encodings = layout.data_encodings(self._stored)
-        self._data = RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings)
+        self._data = RotatingWriter(
+            self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
+        )
         self._rows = EpisodeRows(self._folder, self._stored, self._task)
         self._exit.push(self._finish)
         return self
@@ -120,8 +127,7 @@ class DatasetWriter:
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         for name, array in values.items():
             self._hash.update(name, array)
-        flat = [array.reshape(length, -1) for array in values.values()]
-        self._rows.append(length, chunk, file, statistics(np.concatenate(flat, axis=1, dtype=np.float64)))
+        self._rows.append(length, chunk, file, episode_statistics(values.values()))
         self._frames += length
         self._lengths[episode.uid] = length
         self._metadata.append(episode.metadata)
@@ -153,10 +159,10 @@ class DatasetWriter:
         if faults:
             raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")
 
-    def _blocks(self, name: str) -> Iterator[Array]:
-        column = next(column for column in self._stored if column.name == name)
-        for table in read_blocks(sorted(self._folder.glob("data/*/*.parquet")), [name]):
-            yield to_numpy(table.column(name), column.size, column.dtype)
+    def _blocks(self, names: list[str]) -> Iterator[dict[str, Array]]:
+        columns = [column for column in self._stored if column.name in names]
+        for table in read_blocks(sorted(self._folder.glob("data/*/*.parquet")), names):
+            yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
 
     def _write_json(self, path: str, content: Mapping[str, Any]) -> None:
         target = self._folder / path

@@ -17,6 +17,7 @@ from fake_dataset import COLUMNS, LENGTHS, write_fake
 from astra_data.columns import ACTION, REWARD, STATE
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
+from astra_data.dataset.frames import Frames
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -128,19 +129,17 @@ def test_lerobots_loader_sees_every_value(lerobot: SimpleNamespace, fake: Datase
     assert loaded.meta.features[STATE]["astra"]["role"] == ["position", "position", "heading"]
 
 
-def test_lerobots_windows_are_cut_from_our_columns(lerobot: SimpleNamespace, fake: Dataset) -> None:
-    offsets = np.array([-2, -1, 0, 1])
+@pytest.mark.parametrize("episodes", [None, [1, 2, 4]])
+def test_windows_are_lerobots(lerobot: SimpleNamespace, fake: Dataset, episodes: list[int] | None) -> None:
     names = (STATE, ACTION, REWARD)
-    deltas = {name: (offsets / 20).tolist() for name in names}
+    deltas = {name: [offset / 20 for offset in (-2, -1, 0, 1, 2, 3)] for name in names}
     loaded = lerobot.dataset.LeRobotDataset(
-        "a/b", root=fake.root, delta_timestamps=deltas, video_backend="pyav"
+        "a/b", root=fake.root, episodes=episodes, delta_timestamps=deltas, video_backend="pyav"
     )
-    ours = fake.columns(names)
-    for start, length in zip(fake.starts, fake.lengths, strict=True):
-        for frame in range(length):
-            item = loaded[int(start + frame)]
-            inside = (frame + offsets >= 0) & (frame + offsets < length)
-            rows = start + np.clip(frame + offsets, 0, length - 1)
-            for name in names:
-                np.testing.assert_array_equal(item[name].numpy(), ours[name][rows])
-                np.testing.assert_array_equal(item[f"{name}_is_pad"].numpy(), ~inside)
+    windows = Frames.load(fake, names, episodes=episodes).windows(6, padding="edge", past=2)
+    assert len(windows) == len(loaded)
+    for index in range(len(loaded)):
+        item, window = loaded[index], windows[index]
+        for name in names:
+            np.testing.assert_array_equal(window[name].numpy(), item[name].numpy())
+            np.testing.assert_array_equal(window["is_pad"].numpy(), item[f"{name}_is_pad"].numpy())

@@ -59,6 +59,28 @@ def test_files_cut_without_regard_for_episodes_read_the_same(tmp_path: Path, row
     assert again.verify() == []
     for found, expected in zip(again.episodes(), fake_episodes(), strict=True):
         np.testing.assert_array_equal(found.columns[STATE], expected.columns[STATE])
+    chosen = [*range(7, 8), *range(20, 50)]
+    np.testing.assert_array_equal(again.columns([STATE], [3, 1])[STATE], concatenated(STATE)[chosen])
+
+
+def test_only_the_row_groups_of_chosen_episodes_are_read(
+    fake: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = pq.ParquetFile.read_row_groups
+    groups: list[int] = []
+
+    def spy(file: pq.ParquetFile, row_groups: list[int], **options: object) -> object:
+        groups.extend(row_groups)
+        return read(file, row_groups, **options)
+
+    monkeypatch.setattr(pq.ParquetFile, "read_row_groups", spy)
+    columns = fake.columns([STATE, "mode"], episodes=[4, 0, 2])
+    assert groups == [0, 2, 4]
+    rows = [*range(7), *range(8, 20), *range(50, 55)]
+    for name, values in columns.items():
+        assert values.flags.c_contiguous
+        np.testing.assert_array_equal(values, concatenated(name)[rows])
+    assert fake.columns([]) == {}
 
 
 def test_what_the_writer_was_told_comes_back(fake: Dataset) -> None:

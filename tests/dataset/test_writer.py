@@ -61,6 +61,13 @@ def test_one_row_group_per_episode_in_encodings_that_suit_the_values(tmp_path: P
     assert {chunk.compression for chunk in chunks} == {"SNAPPY"}
 
 
+def test_another_compression_holds_the_same_values(tmp_path: Path) -> None:
+    snappy, zstd = write_fake(tmp_path / "snappy"), write_fake(tmp_path / "zstd", compression="zstd")
+    assert pq.read_metadata(zstd.paths[0]).row_group(0).column(0).compression == "ZSTD"
+    assert zstd.content_hash == snappy.content_hash
+    assert pq.read_table(zstd.paths[0]).equals(pq.read_table(snappy.paths[0]))
+
+
 def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = write_fake(tmp_path / "whole")
     monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
@@ -152,8 +159,11 @@ def test_a_dataset_needs_an_episode(tmp_path: Path) -> None:
 
 def test_arguments_are_checked_together(tmp_path: Path) -> None:
     columns = [*COLUMNS, Column("index", "int64"), COLUMNS[0]]
-    with pytest.raises(BadInputError, match=f"{STATE} is given twice; .*index is the writer's.*; fps 0"):
-        writer(tmp_path / "set", columns=columns, fps=0)
+    faults = (
+        f"{STATE} is given twice; .*index is the writer's.*; fps 0.*; compression 'gzip', expected snappy"
+    )
+    with pytest.raises(BadInputError, match=faults):
+        writer(tmp_path / "set", columns=columns, fps=0, compression="gzip")
     description = {"name": "a b", "versoin": "1", "parents": [{"name": "x"}], "config": {"x": float("inf")}}
     with pytest.raises(BadInputError) as caught:
         writer(tmp_path / "set", description=description)

@@ -1,0 +1,64 @@
+"""Columns too large for memory: raw files that the operating system maps in, page by page."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from astra_data.columns import Array
+from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.reader import Dataset
+from astra_data.errors import BadInputError, CorruptDatasetError
+
+
+def cache_folder() -> Path:
+    """Return where the raw files live: $ASTRA_DATA_CACHE, by default ~/.cache/astra-data."""
+    return Path(os.environ.get("ASTRA_DATA_CACHE", Path.home() / ".cache" / "astra-data"))
+
+
+def memory_bytes() -> int:
+    """Return the size of this machine's memory."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[str, Array]:
+    """Map whole columns, (N, size) or (N,), from raw files in `cache`, which are written where missing.
+
+    <cache>/<content hash>/<column>/values.npy; what is written to the arrays stays in this process.
+
+    Raises:
+        BadInputError: a column does not exist.
+        CorruptDatasetError: the dataset or a raw file cannot be read.
+    """
+    folders = {name: cache / dataset.content_hash / name for name in names}
+    for column in dataset.specs(names):
+        folder = folders[column.name]
+        if not folder.exists():
+            shape = (int(dataset.lengths.sum()), *([column.size] if column.size > 1 else []))
+            _write(dataset, column.name, column.dtype, shape, folder)
+    columns: dict[str, Array] = {}
+    for name, folder in folders.items():
+        try:
+            columns[name] = np.load(folder / "values.npy", mmap_mode="c")
+        except (OSError, ValueError) as error:
+            raise CorruptDatasetError(f"{folder} was altered ({error}); delete it and try again.") from error
+    return columns
+
+
+def _write(dataset: Dataset, name: str, dtype: str, shape: tuple[int, ...], folder: Path) -> None:
+    try:
+        with atomic_folder(folder) as unfinished:
+            path = unfinished / "values.npy"
+            values = np.lib.format.open_memmap(  # type: ignore[no-untyped-call]
+                path, mode="w+", dtype=np.dtype(dtype), shape=shape
+            )
+            row = 0
+            for block in dataset.blocks([name]):
+                values[row : row + len(block[name])] = block[name]
+                row += len(block[name])
+            values.flush()
+    except BadInputError:
+        # Another process was faster: what it wrote is the same.
+        if not folder.exists():
+            raise

@@ -1,0 +1,136 @@
+"""Columns of chosen episodes as tensors, ready to be drawn from."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.columns import Column
+from astra_data.dataset.column_files import cache_folder, mapped_columns, memory_bytes
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.windows import Padding, Transitions, Windows
+
+MEMORY_SHARE = 0.5
+"""Share of the machine's memory beyond which columns are mapped in from files."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Frames:
+    """The steps of E episodes.
+
+        frames = Frames.load(dataset, [STATE, ACTION], episodes=dataset.subset(100))
+        for batch in frames.windows(32).batches(256, seed=0):
+            batch["observation.state"]  # (256, 32, 29)
+
+    Attributes:
+        columns: name to (N, size), or (N,) where there is one value per step, on the device where they fit.
+        starts: first row of each episode, (E,), ascending.
+        lengths: its number of steps, (E,).
+        device: where batches go.
+    """
+
+    columns: dict[str, Tensor]
+    starts: Tensor
+    lengths: Tensor
+    device: torch.device
+
+    @classmethod
+    def load(
+        cls,
+        dataset: Dataset,
+        names: Sequence[str] | None = None,
+        *,
+        episodes: Collection[int] | None = None,
+        device: str = "cpu",
+        memory_share: float = MEMORY_SHARE,
+        cache: Path | None = None,
+    ) -> "Frames":
+        """Load columns, each in one piece.
+
+        Columns of more than `memory_share` of the machine's memory are not loaded but mapped in from raw
+        files. Columns that do not fit on a CUDA device stay in memory, and batches are moved there.
+
+        Args:
+            dataset: where they are.
+            names: of the columns, by default all that were handed to the writer.
+            episodes: indices of the episodes, by default all; they come in the dataset's order.
+            device: torch device of the batches.
+            memory_share: 0 maps always.
+            cache: folder of the raw files, by default `column_files.cache_folder()`.
+
+        Raises:
+            BadInputError: a column or an episode does not exist, or an episode is listed twice.
+            CorruptDatasetError: a file cannot be read.
+        """
+        names = [column.name for column in dataset.schema] if names is None else names
+        chosen = dataset.selected(episodes)
+        lengths = dataset.lengths[chosen]
+        step_bytes = sum(map(_step_bytes, dataset.specs(names)))
+        if step_bytes * int(lengths.sum()) > memory_share * memory_bytes():
+            arrays = mapped_columns(dataset, names, cache or cache_folder())
+            starts = dataset.starts[chosen]
+        else:
+            arrays = dataset.columns(names, episodes)
+            starts = np.cumsum(lengths) - lengths
+        columns = {name: torch.from_numpy(values) for name, values in arrays.items()}
+        target = torch.device(device)
+        place = target if _fits(columns, target) else torch.device("cpu")
+        return cls(
+            columns={name: values.to(place) for name, values in columns.items()},
+            starts=torch.from_numpy(starts).to(place),
+            lengths=torch.from_numpy(lengths).to(place),
+            device=target,
+        )
+
+    def __len__(self) -> int:
+        """Return the number of steps of all episodes."""
+        return int(self.lengths.sum())
+
+    def __repr__(self) -> str:
+        """Show sizes and columns."""
+        columns = ", ".join(f"{name} {tuple(values.shape[1:])}" for name, values in self.columns.items())
+        return f"Frames({len(self.lengths)} episodes, {len(self)} steps, {columns}, to {self.device})"
+
+    def windows(self, length: int, *, stride: int = 1, padding: Padding = "valid", past: int = 0) -> Windows:
+        """Return windows of L consecutive steps of one episode.
+
+        Args:
+            length: L.
+            stride: steps from one window to the next.
+            padding: "valid" for windows inside their episode; "edge" for a window at every step t (of a
+                stride), in which the first or the last step stands for those beyond, as in lerobot's
+                `delta_timestamps`.
+            past: with "edge", how many steps before t the window begins.
+
+        Raises:
+            BadInputError: an argument is out of range, or no episode is long enough; lists every fault.
+        """
+        return Windows(
+            *(self.columns, self.starts, self.lengths, self.device),
+            length=length,
+            stride=stride,
+            padding=padding,
+            past=past,
+        )
+
+    def transitions(self) -> Transitions:
+        """Return single steps; what comes after a step is in its columns `next.*`."""
+        steps = torch.arange(len(self), device=self.starts.device)
+        before = self.lengths.cumsum(0) - self.lengths
+        rows = steps + (self.starts - before).repeat_interleave(self.lengths)
+        return Transitions(self.columns, rows, self.device)
+
+
+def _step_bytes(column: Column) -> int:
+    return column.size * np.dtype(column.dtype).itemsize
+
+
+def _fits(columns: dict[str, Tensor], device: torch.device) -> bool:
+    """Return whether columns fit on `device`, with as much left for the rest as half of what is free."""
+    if device.type != "cuda":
+        return True
+    free, _ = torch.cuda.mem_get_info(device)
+    return sum(values.nbytes for values in columns.values()) <= free // 2

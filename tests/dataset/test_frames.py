@@ -1,0 +1,211 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fake_dataset import COLUMNS, LENGTHS, concatenated, write_fake
+from torch.utils.data import DataLoader
+
+from astra_data.columns import ACTION, INDEX, REWARD, STATE, TERMINATED
+from astra_data.dataset import Dataset
+from astra_data.dataset.frames import Frames
+from astra_data.dataset.samples import Batch, Samples
+from astra_data.dataset.windows import Padding
+from astra_data.errors import BadInputError, CorruptDatasetError
+
+NAMES = (STATE, ACTION, REWARD, TERMINATED, "mode", INDEX)
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_fake(tmp_path_factory.mktemp("frames") / "set")
+
+
+@pytest.fixture(scope="module")
+def frames(fake: Dataset) -> Frames:
+    return Frames.load(fake, NAMES)
+
+
+def everything(samples: Samples) -> Batch:
+    return samples.__getitems__(range(len(samples)))
+
+
+def assert_equal(found: Batch, expected: Batch) -> None:
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert torch.equal(found[name], values), name
+
+
+def test_columns_are_the_datasets(fake: Dataset) -> None:
+    frames = Frames.load(fake)
+    assert list(frames.columns) == [column.name for column in COLUMNS]
+    for name, values in frames.columns.items():
+        np.testing.assert_array_equal(values.numpy(), concatenated(name))
+    assert len(frames) == sum(LENGTHS)
+    assert repr(frames).startswith("Frames(5 episodes, 55 steps, observation.state (3,), action (2,), ")
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_valid_windows_are_all_that_lie_inside_an_episode(fake: Dataset, frames: Frames, stride: int) -> None:
+    expected = [
+        range(start + first, start + first + 6)
+        for start, length in zip(fake.starts.tolist(), LENGTHS, strict=True)
+        for first in range(0, length - 5, stride)
+    ]
+    windows = frames.windows(6, stride=stride)
+    batch = everything(windows)
+    assert batch[INDEX].tolist() == [list(rows) for rows in expected]
+    assert not batch["is_pad"].any()
+    for name in NAMES:
+        np.testing.assert_array_equal(batch[name].numpy(), fake.columns([name])[name][batch[INDEX].numpy()])
+
+
+@pytest.mark.parametrize(("length", "stride", "past"), [(6, 1, 0), (6, 4, 5), (40, 1, 20), (1, 2, 0)])
+def test_edge_windows_repeat_the_first_and_last_step(
+    fake: Dataset, frames: Frames, length: int, stride: int, past: int
+) -> None:
+    rows, is_pad = [], []
+    for start, steps in zip(fake.starts, LENGTHS, strict=True):
+        for step in range(0, steps, stride):
+            wanted = np.arange(step - past, step - past + length)
+            rows.append(start + np.clip(wanted, 0, steps - 1))
+            is_pad.append((wanted < 0) | (wanted >= steps))
+    batch = everything(frames.windows(length, stride=stride, padding="edge", past=past))
+    np.testing.assert_array_equal(batch[INDEX].numpy(), rows)
+    np.testing.assert_array_equal(batch["is_pad"].numpy(), is_pad)
+    np.testing.assert_array_equal(batch[STATE].numpy(), fake.columns([STATE])[STATE][np.array(rows)])
+
+
+def test_transitions_are_the_steps(fake: Dataset, frames: Frames) -> None:
+    batch = frames.transitions().__getitems__([7, 0, 54])
+    for name, values in fake.columns(NAMES).items():
+        np.testing.assert_array_equal(batch[name].numpy(), values[[7, 0, 54]])
+    assert len(frames.transitions()) == sum(LENGTHS)
+
+
+@pytest.mark.parametrize("memory_share", [0.0, 0.5])
+def test_chosen_episodes_only(fake: Dataset, tmp_path: Path, memory_share: float) -> None:
+    chosen = Frames.load(fake, [INDEX], episodes=[3, 0], memory_share=memory_share, cache=tmp_path)
+    expected = [*range(7), *range(20, 50)]
+    assert everything(chosen.transitions())[INDEX].tolist() == expected
+    if memory_share:
+        assert chosen.columns[INDEX].tolist() == expected
+    assert everything(chosen.windows(7))[INDEX][:, 0].tolist() == [0, *range(20, 44)]
+    padded = everything(chosen.windows(4, padding="edge", past=2))
+    assert padded[INDEX][:2].tolist() == [[0, 0, 0, 1], [0, 0, 1, 2]]
+    assert padded[INDEX][7].tolist() == [20, 20, 20, 21]
+
+
+def test_mapped_columns_equal_loaded_ones(
+    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_CACHE", str(tmp_path))
+    mapped = Frames.load(fake, NAMES, memory_share=0.0)
+    assert_equal(everything(mapped.windows(5)), everything(frames.windows(5)))
+    files = sorted(path.relative_to(tmp_path).parts for path in tmp_path.rglob("*") if path.is_file())
+    assert files == [(fake.content_hash, name, "values.npy") for name in sorted(NAMES)]
+    # The second time the raw files serve, and what is written to the tensors stays out of them.
+    monkeypatch.setattr(Dataset, "blocks", None)
+    mapped.columns[STATE].zero_()
+    again = Frames.load(fake, NAMES, memory_share=0.0)
+    assert torch.equal(again.columns[STATE], frames.columns[STATE])
+
+
+def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
+    Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    [path] = tmp_path.rglob("values.npy")
+    os.truncate(path, 200)
+    with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .*; delete it and try again"):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+
+
+def test_a_failure_leaves_no_raw_file(
+    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(np.lib.format, "open_memmap", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert not list(tmp_path.rglob("*.npy"))
+    again = Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert torch.equal(again.columns[STATE], frames.columns[STATE])
+
+
+def test_samples_come_one_by_one_too(frames: Frames) -> None:
+    windows = frames.windows(6, padding="edge")
+    batch = everything(windows)
+    assert_equal(windows[8], {name: values[8] for name, values in batch.items()})
+    assert_equal(windows[-1], {name: values[-1] for name, values in batch.items()})
+    with pytest.raises(IndexError, match="sample 55 of 55"):
+        windows[55]
+
+
+@pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])
+def test_a_data_loader_draws_the_same_batches(frames: Frames, workers: int, padding: Padding) -> None:
+    windows = frames.windows(6, padding=padding)
+    expected = list(windows.batches(8, seed=3))
+    order = windows.batches(8, seed=3).order
+    loader = DataLoader(windows, batch_sampler=order, collate_fn=windows.collate, num_workers=workers)  # type: ignore[arg-type]
+    found = list(loader)
+    assert len(found) == len(expected) == len(loader)
+    for ours, theirs in zip(expected, found, strict=True):
+        assert_equal(theirs, ours)
+
+
+def test_an_interrupted_epoch_goes_on_where_it_was_left(frames: Frames) -> None:
+    transitions = frames.transitions()
+    uninterrupted = transitions.batches(10, seed=5)
+    expected = [batch for _ in range(3) for batch in uninterrupted]
+    first = transitions.batches(10, seed=5)
+    found = list(first)
+    for batch in first:
+        found.append(batch)
+        state = first.state_dict()
+        if len(found) == 8:
+            break
+    second = transitions.batches(10, seed=5)
+    second.load_state_dict(state)
+    found += [*second, *second]
+    assert len(found) == len(expected) == 18
+    for ours, theirs in zip(found, expected, strict=True):
+        assert_equal(ours, theirs)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("fits", [True, False])
+def test_batches_come_to_the_device(
+    fake: Dataset, frames: Frames, monkeypatch: pytest.MonkeyPatch, fits: bool
+) -> None:
+    if not fits:
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (0, 0))
+    moved = Frames.load(fake, NAMES, device="cuda")
+    assert {values.is_cuda for values in moved.columns.values()} == {fits}
+    for padding in ("valid", "edge"):
+        batch = everything(moved.windows(6, padding=padding))
+        assert all(values.is_cuda for values in batch.values())
+        expected = everything(frames.windows(6, padding=padding))
+        assert_equal({name: values.cpu() for name, values in batch.items()}, expected)
+
+
+def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
+    with pytest.raises(BadInputError, match="length 0, expected at least 1; stride -1, expected at least 1"):
+        frames.windows(0, stride=-1)
+    with pytest.raises(
+        BadInputError, match=r"length 31, expected at most the longest episode's 30, or padding"
+    ):
+        frames.windows(31)
+    with pytest.raises(BadInputError, match=r"past 6, expected 0 to 5"):
+        frames.windows(6, past=6, padding="edge")
+    with pytest.raises(BadInputError, match=r"past 1, expected 0 without padding"):
+        frames.windows(6, past=1)
+    with pytest.raises(BadInputError, match=r"padding 'wrap', expected 'valid' or 'edge'"):
+        frames.windows(6, padding="wrap")  # type: ignore[arg-type]
+    faults = "has no episode -1, expected 0 to 4; has no episode 5, .*; episode 2 is listed twice"
+    with pytest.raises(BadInputError, match=faults):
+        Frames.load(fake, [STATE], episodes=[2, 5, 2, -1])
+    with pytest.raises(BadInputError, match="no episodes are listed"):
+        Frames.load(fake, [STATE], episodes=[])
+    with pytest.raises(BadInputError, match=r"has no column speed; it has observation\.state"):
+        Frames.load(fake, ["speed"])

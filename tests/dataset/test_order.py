@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+import torch
+
+from astra_data.dataset.order import Order
+from astra_data.errors import BadInputError
+
+
+def epoch(order: Order) -> list[int]:
+    return torch.cat(list(order)).tolist()
+
+
+def test_an_epoch_holds_every_sample_once_in_an_order_of_its_own() -> None:
+    order = Order(1000, 32, seed=1)
+    epochs = [epoch(order) for _ in range(3)]
+    assert all(sorted(indices) == list(range(1000)) for indices in epochs)
+    assert epochs[0] != epochs[1] != epochs[2] != epochs[0]
+    same, other = Order(1000, 7, seed=1), Order(1000, 32, seed=2)
+    assert epoch(same) == epochs[0]
+    assert epoch(other) != epochs[0]
+    assert abs(np.corrcoef(epochs[0], epochs[1])[0, 1]) < 0.2
+
+
+def test_without_shuffling_the_order_is_the_samples() -> None:
+    order = Order(10, 4, shuffle=False)
+    assert [batch.tolist() for batch in order] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    dropped = Order(10, 4, shuffle=False, drop_last=True)
+    assert [batch.tolist() for batch in dropped] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert (len(order), len(dropped)) == (3, 2)
+
+
+@pytest.mark.parametrize("seen", range(1, 9))
+def test_a_state_names_the_next_batch(seen: int) -> None:
+    reference = Order(20, 5, seed=4)
+    expected = [batch.tolist() for _ in range(3) for batch in reference]
+    order = Order(20, 5, seed=4)
+    found: list[list[int]] = []
+    while len(found) < seen:
+        for batch in order:
+            found.append(batch.tolist())
+            if len(found) == seen:
+                break
+    resumed = Order(20, 5, seed=4)
+    resumed.load_state_dict(order.state_dict())
+    while len(found) < len(expected):
+        found += [batch.tolist() for batch in resumed]
+    assert found == expected
+
+
+def test_a_state_of_another_order_is_refused() -> None:
+    state = Order(20, 5, seed=4).state_dict()
+    with pytest.raises(BadInputError, match="count is 20, expected 21; seed is 4, expected 0"):
+        Order(21, 5).load_state_dict(state)
+    with pytest.raises(BadInputError, match="drop_last is None, expected False; epoch is missing"):
+        Order(20, 5, seed=4).load_state_dict({"count": 20, "batch_size": 5, "seed": 4, "shuffle": True})
+
+
+@pytest.mark.parametrize(("count", "size", "drop_last"), [(10, 0, False), (0, 5, False), (10, 11, True)])
+def test_an_order_without_batches_is_refused(count: int, size: int, drop_last: bool) -> None:
+    with pytest.raises(BadInputError, match=f"batches of {size} out of {count} samples"):
+        Order(count, size, drop_last=drop_last)

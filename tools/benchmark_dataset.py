@@ -1,0 +1,395 @@
+"""Measure how fast datasets are written, loaded and drawn from, against LeRobot, Minari and plain HDF5.
+
+    uv run python tools/benchmark_dataset.py
+    uv run python tools/benchmark_dataset.py --json runs/dataset.json
+
+All figures come from one process on the same data, 200 episodes of 500 steps by default; the candidates take
+turns, so that the ratios hold even on a machine that does other work too. LeRobot's writer and loader are
+given fewer steps per turn, because they are slow; the table says how many.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from itertools import cycle
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import h5py
+import minari
+import numpy as np
+import torch
+import typer
+from minari.data_collector import EpisodeBuffer
+from rich.console import Console
+from rich.table import Table
+
+from astra_data.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.frames import Frames
+from astra_data.gymnasium_faces import SeededNavigationWorld, WorldEnv
+from astra_data.stages.pair import pair_steps
+from astra_data.tasks import TASKS
+
+COLUMNS = (
+    Column(STATE, size=29),
+    Column(ABSTRACT_STATE, size=4),
+    Column(ACTION, size=2),
+    Column(REWARD),
+    Column(DONE, "bool"),
+)
+DRAWN = (STATE, ABSTRACT_STATE, ACTION, REWARD)
+LENGTH = 32
+BATCH = 256
+FPS = 20
+TASK = "antmaze-umaze"
+
+Stretch = Callable[[], int]
+"""Do some work; return how many frames, windows or transitions that was."""
+Candidates = dict[str, Stretch]
+
+
+def main(
+    episodes: Annotated[int, typer.Option(help="Episodes.")] = 200,
+    steps: Annotated[int, typer.Option(help="Steps of each.")] = 500,
+    rounds: Annotated[int, typer.Option(help="Turns that each candidate takes.")] = 5,
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures there.")] = None,
+) -> None:
+    """Print rates, and ours over each of the others'."""
+    torch.set_num_threads(1)
+    figures: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory() as name, quiet_libraries(Path(name)) as lerobot:
+        data = random_walks(episodes, steps)
+        for title, candidates in measurements(Path(name), data, lerobot):
+            figures[title] = rate(candidates, rounds)
+    table = Table(
+        "", "per second", "ours is", title=f"{episodes} episodes of {steps} steps, one torch thread"
+    )
+    for title, rates in figures.items():
+        table.add_section()
+        table.add_row(f"[bold]{title}")
+        for candidate, figure in rates.items():
+            table.add_row(f"  {candidate}", f"{figure:,.0f}", f"{rates['ours'] / figure:,.1f} x")
+    Console().print(table)
+    if json_path is not None:
+        report = {"episodes": episodes, "steps": steps, "rounds": rounds, "per_second": figures}
+        json_path.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def measurements(root: Path, data: list[Episode], lerobot: Any) -> Iterator[tuple[str, Candidates]]:  # noqa: ANN401
+    """Yield what is measured: a title and the candidates; what one writes, the next ones read."""
+    ours, theirs = root / "ours", LeRobot(lerobot, root)
+    minari_set, hdf5 = Minari(root), Hdf5(root)
+    few = data[:2]
+    yield (
+        "frames written",
+        {
+            "ours": lambda: write(ours, data, "snappy"),
+            "ours, zstd": lambda: write(root / "zstd", data, "zstd"),
+            f"LeRobot, {frames_of(few)} frames": lambda: theirs.write(few),
+            "Minari, HDF5": lambda: minari_set.write(data),
+            "robomimic's HDF5": lambda: hdf5.write(data),
+        },
+    )
+    frames = Frames.load(Dataset.open(ours), DRAWN)
+    theirs.open(ours)
+    minari_set.open()
+    hdf5.open()
+    yield (
+        "frames loaded",
+        {
+            "ours": lambda: len(Frames.load(Dataset.open(ours), DRAWN)),
+            "LeRobot": theirs.load,
+            "Minari, HDF5": minari_set.load,
+            "robomimic's HDF5": hdf5.load,
+        },
+    )
+    windows, padded = frames.windows(LENGTH), frames.windows(LENGTH, padding="edge")
+    order: Any = windows.batches(BATCH).order
+    loader = torch.utils.data.DataLoader(windows, batch_sampler=order, collate_fn=windows.collate)
+    yield (
+        f"windows of {LENGTH} steps drawn",
+        {
+            "ours": drawing(windows.batches(BATCH), 100),
+            "ours, padded": drawing(padded.batches(BATCH), 100),
+            "ours in a DataLoader": drawing(loader, 50),
+            f"LeRobot in a DataLoader, {BATCH} windows": drawing(theirs.loader(LENGTH), 1),
+            "Minari, HDF5": minari_set.windows,
+            "robomimic's HDF5": hdf5.windows,
+        },
+    )
+    yield (
+        "transitions drawn",
+        {
+            "ours": drawing(frames.transitions().batches(BATCH), 100),
+            f"LeRobot in a DataLoader, {4 * BATCH} transitions": drawing(theirs.loader(1), 4),
+            "robomimic's HDF5": hdf5.transitions,
+        },
+    )
+    steps = len(data[0])
+    yield (
+        "transitions paired",
+        {"ours": pairs(steps, at_once=True), "Gymnasium loop": pairs(steps, at_once=False)},
+    )
+
+
+def random_walks(episodes: int, steps: int) -> list[Episode]:
+    """Make smooth random episodes."""
+    rng = np.random.default_rng(0)
+
+    def values(size: int) -> Array:
+        return (0.01 * rng.normal(size=(steps, size)).cumsum(0)).astype(np.float32)
+
+    last = np.arange(steps) == steps - 1
+    return [
+        Episode(
+            uid,
+            {
+                STATE: values(29),
+                ABSTRACT_STATE: values(4),
+                ACTION: values(2),
+                REWARD: values(1)[:, 0],
+                DONE: last,
+            },
+        )
+        for uid in range(episodes)
+    ]
+
+
+def frames_of(data: list[Episode]) -> int:
+    """Return the number of frames of all episodes."""
+    return sum(map(len, data))
+
+
+def write(root: Path, data: list[Episode], compression: str) -> int:
+    """Write our dataset, with its statistics, hash and validation."""
+    shutil.rmtree(root, ignore_errors=True)
+    settings: dict[str, Any] = {
+        "description": {"name": "walks", "stage": "import"},
+        "compression": compression,
+    }
+    with DatasetWriter(root, COLUMNS, fps=FPS, task="walk", **settings) as writer:
+        for episode in data:
+            writer.add(episode)
+    return frames_of(data)
+
+
+def drawing(batches: Any, count: int) -> Stretch:  # noqa: ANN401 - ours, or a DataLoader
+    """Draw `count` batches, epoch after epoch."""
+    endless = (batch for _ in cycle([None]) for batch in batches)
+
+    def stretch() -> int:
+        return sum(len(next(endless)[STATE]) for _ in range(count))
+
+    return stretch
+
+
+def stacked(samples: list[list[Array]]) -> list[torch.Tensor]:
+    """Make one batch out of samples."""
+    return [torch.from_numpy(np.stack(values)) for values in zip(*samples, strict=True)]
+
+
+class LeRobot:
+    """lerobot's own writer, its loader on our dataset, and its DataLoader."""
+
+    def __init__(self, modules: Any, root: Path) -> None:  # noqa: ANN401
+        """Write to `root`."""
+        self._modules = modules
+        self._written = root / "lerobot"
+
+    def write(self, data: list[Episode]) -> int:
+        """Write frame by frame, as lerobot does."""
+        shutil.rmtree(self._written, ignore_errors=True)
+        features = {column.name: column.feature() | {"shape": (column.size,)} for column in COLUMNS}
+        written = self._modules.LeRobotDataset.create(
+            "a/b", FPS, features, root=self._written, use_videos=False, video_backend="pyav"
+        )
+        for episode in data:
+            for frame in range(len(episode)):
+                values = {name: np.atleast_1d(column[frame]) for name, column in episode.columns.items()}
+                written.add_frame({**values, "task": "walk"})
+            written.save_episode()
+        written.finalize()
+        return frames_of(data)
+
+    def open(self, root: Path) -> None:
+        """Read the dataset in `root`."""
+        self._root = root
+        self._table = self._dataset().hf_dataset.with_format("numpy").select_columns(list(DRAWN))
+
+    def _dataset(self, **options: Any) -> Any:  # noqa: ANN401
+        return self._modules.LeRobotDataset("a/b", root=self._root, video_backend="pyav", **options)
+
+    def load(self) -> int:
+        """Load all columns as numpy arrays."""
+        return len(self._table[:][STATE])
+
+    def loader(self, length: int) -> Any:  # noqa: ANN401
+        """Return a DataLoader of windows, or of single frames."""
+        deltas = {name: [step / FPS for step in range(length)] for name in DRAWN} if length > 1 else None
+        dataset = self._dataset(delta_timestamps=deltas)
+        return torch.utils.data.DataLoader(dataset, batch_size=BATCH, shuffle=True)
+
+
+class Minari:
+    """Minari's HDF5, with both states in one observation."""
+
+    def __init__(self, root: Path) -> None:
+        """Write below `root`, where the environment variable points."""
+        self._folder = root / "minari" / "walks-v0"
+
+    def write(self, data: list[Episode]) -> int:
+        """Write all episodes."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+        box = gymnasium.spaces.Box
+        minari.create_dataset_from_buffers(
+            "walks-v0",
+            buffer=[_buffer(episode) for episode in data],
+            observation_space=box(-np.inf, np.inf, (33,), np.float32),
+            action_space=box(-np.inf, np.inf, (2,), np.float32),
+            data_format="hdf5",
+        )
+        return frames_of(data)
+
+    def open(self) -> None:
+        """Open what was written."""
+        self._dataset = minari.load_dataset("walks-v0")
+
+    def load(self) -> int:
+        """Iterate over the episodes."""
+        return sum(len(episode.actions) for episode in self._dataset.iterate_episodes())
+
+    def windows(self) -> int:
+        """Sample episodes, and cut a window out of each."""
+        rng = np.random.default_rng()
+        cut = []
+        for episode in self._dataset.sample_episodes(BATCH // 2):
+            first = rng.integers(len(episode.actions) - LENGTH)
+            cut.append(
+                [a[first : first + LENGTH] for a in (episode.observations, episode.actions, episode.rewards)]
+            )
+        return len(stacked(cut)[0])
+
+
+def _buffer(episode: Episode) -> EpisodeBuffer:
+    columns = episode.columns
+    observations = np.concatenate([columns[STATE], columns[ABSTRACT_STATE]], axis=1)
+    return EpisodeBuffer(
+        id=episode.uid,
+        observations=np.concatenate([observations, observations[-1:]]),
+        actions=columns[ACTION],
+        rewards=columns[REWARD],
+        terminations=columns[DONE],
+        truncations=columns[DONE],
+        infos={},
+    )
+
+
+class Hdf5:
+    """One group per episode, as robomimic lays it out; drawn from memory, as it does when it caches."""
+
+    def __init__(self, root: Path) -> None:
+        """Write below `root`."""
+        self._path = root / "robomimic.hdf5"
+
+    def write(self, data: list[Episode]) -> int:
+        """Write all episodes, uncompressed."""
+        with h5py.File(self._path, "w") as file:
+            for episode in data:
+                group = file.create_group(f"data/demo_{episode.uid}")
+                for name, values in episode.columns.items():
+                    group.create_dataset(name, data=values)
+        return frames_of(data)
+
+    def open(self) -> None:
+        """Keep all episodes in memory."""
+        self._episodes = self._read()
+
+    def _read(self) -> list[dict[str, Array]]:
+        with h5py.File(self._path) as file:
+            return [{name: group[name][:] for name in DRAWN} for group in file["data"].values()]
+
+    def load(self) -> int:
+        """Read all episodes."""
+        return sum(len(episode[STATE]) for episode in self._read())
+
+    def windows(self) -> int:
+        """Cut windows one by one and stack them."""
+        return sum(self._batch(LENGTH) for _ in range(10))
+
+    def transitions(self) -> int:
+        """Take steps one by one and stack them."""
+        return sum(self._batch(1) for _ in range(10))
+
+    def _batch(self, length: int) -> int:
+        rng = np.random.default_rng()
+        cut = []
+        for number in rng.integers(len(self._episodes), size=BATCH).tolist():
+            episode = self._episodes[number]
+            first = int(rng.integers(len(episode[STATE]) - length))
+            cut.append([values[first : first + length] for values in episode.values()])
+        return len(stacked(cut)[0])
+
+
+def pairs(count: int, *, at_once: bool) -> Stretch:
+    """Pair `count` transitions of the point mass: all at once, or in one environment of Gymnasium's."""
+    task = TASKS[TASK]
+    rng = np.random.default_rng(0)
+    centres = np.array(task.maze.free_centres(), dtype=np.float32)
+    size = next(column.size for column in task.state_columns if column.name == STATE)
+    state = rng.normal(size=(count, size)).astype(np.float32)
+    state[:, :2] = centres[rng.integers(len(centres), size=count)]
+    action = rng.uniform(-1, 1, size=(count, 2)).astype(np.float32)
+    simulator = task.simulator(1)
+    env = WorldEnv(SeededNavigationWorld(task.navigation, simulator))
+    env.reset(seed=0)
+    abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
+
+    def loop() -> int:
+        for row in range(count):
+            simulator.reset_to(abstract[row : row + 1])
+            env.step(action[row])
+        return count
+
+    def batch() -> int:
+        return len(pair_steps(task, state, action, state, tolerance=1e-6)[ABSTRACT_STATE])
+
+    return batch if at_once else loop
+
+
+@contextmanager
+def quiet_libraries(root: Path) -> Iterator[Any]:
+    """Point the libraries' caches below `root`, off the network, and yield lerobot's dataset module."""
+    os.environ |= {
+        "HF_DATASETS_CACHE": str(root / "cache"),
+        "HF_HUB_OFFLINE": "1",
+        "MINARI_DATASETS_PATH": str(root / "minari"),
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import_module("datasets").disable_progress_bars()
+        yield import_module("lerobot.datasets.lerobot_dataset")
+
+
+def rate(candidates: Candidates, rounds: int) -> dict[str, float]:
+    """Let the candidates take turns; return what each does per second, after one turn to warm up."""
+    done, seconds = dict.fromkeys(candidates, 0), dict.fromkeys(candidates, 0.0)
+    for turn in range(rounds + 1):
+        for name, stretch in candidates.items():
+            began = time.perf_counter()
+            count = stretch()
+            if turn > 0:
+                done[name] += count
+                seconds[name] += time.perf_counter() - began
+    return {name: done[name] / seconds[name] for name in candidates}
+
+
+if __name__ == "__main__":
+    typer.run(main)
