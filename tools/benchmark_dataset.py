@@ -24,17 +24,22 @@ from typing import Annotated, Any
 import gymnasium
 import h5py
 import minari
+import mujoco
 import numpy as np
 import torch
 import typer
 from minari.data_collector import EpisodeBuffer
+from mujoco.rollout import Rollout
 from rich.console import Console
 from rich.table import Table
 
 from astra_data.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
+from astra_data.cores import cores
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.frames import Frames
 from astra_data.gymnasium_faces import SeededNavigationWorld, WorldEnv
+from astra_data.pairing import Pairing, pairing_named
+from astra_data.sims.mujoco_model import MujocoModel
 from astra_data.stages.pair import pair_steps
 from astra_data.tasks import TASKS
 
@@ -48,6 +53,8 @@ COLUMNS = (
 DRAWN = (STATE, ABSTRACT_STATE, ACTION, REWARD)
 LENGTH = 32
 BATCH = 256
+PAIRED = 32_768
+BATCH_OF_PAIRS = 4096
 FPS = 20
 TASK = "antmaze-umaze"
 
@@ -76,7 +83,7 @@ def main(
         table.add_section()
         table.add_row(f"[bold]{title}")
         for candidate, figure in rates.items():
-            table.add_row(f"  {candidate}", f"{figure:,.0f}", f"{rates['ours'] / figure:,.1f} x")
+            table.add_row(f"  {candidate}", f"{figure:,.0f}", f"{rates['ours'] / figure:,.2f} x")
     Console().print(table)
     if json_path is not None:
         report = {"episodes": episodes, "steps": steps, "rounds": rounds, "per_second": figures}
@@ -133,11 +140,8 @@ def measurements(root: Path, data: list[Episode], lerobot: Any) -> Iterator[tupl
             "robomimic's HDF5": hdf5.transitions,
         },
     )
-    steps = len(data[0])
-    yield (
-        "transitions paired",
-        {"ours": pairs(steps, at_once=True), "Gymnasium loop": pairs(steps, at_once=False)},
-    )
+    yield "transitions paired, point mass", point_mass_pairs()
+    yield "transitions paired, planar walker in MuJoCo", walker_pairs()
 
 
 def random_walks(episodes: int, steps: int) -> list[Episode]:
@@ -338,30 +342,69 @@ class Hdf5:
         return len(stacked(cut)[0])
 
 
-def pairs(count: int, *, at_once: bool) -> Stretch:
-    """Pair `count` transitions of the point mass: all at once, or in one environment of Gymnasium's."""
+def point_mass_pairs() -> Candidates:
+    """Pair transitions of the point mass: all at once, or in one environment of Gymnasium's."""
     task = TASKS[TASK]
     rng = np.random.default_rng(0)
     centres = np.array(task.maze.free_centres(), dtype=np.float32)
     size = next(column.size for column in task.state_columns if column.name == STATE)
-    state = rng.normal(size=(count, size)).astype(np.float32)
-    state[:, :2] = centres[rng.integers(len(centres), size=count)]
-    action = rng.uniform(-1, 1, size=(count, 2)).astype(np.float32)
-    simulator = task.simulator(1)
+    state = rng.normal(size=(PAIRED, size)).astype(np.float32)
+    state[:, :2] = centres[rng.integers(len(centres), size=PAIRED)]
+    action = rng.uniform(-1, 1, size=(PAIRED, 2)).astype(np.float32)
+    pairing = pairing_named(TASK)
+    batch, simulator = pairing.simulator(BATCH_OF_PAIRS), task.simulator(1)
     env = WorldEnv(SeededNavigationWorld(task.navigation, simulator))
     env.reset(seed=0)
     abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
 
-    def loop() -> int:
+    def loop(count: int = 500) -> int:
         for row in range(count):
             simulator.reset_to(abstract[row : row + 1])
             env.step(action[row])
         return count
 
-    def batch() -> int:
-        return len(pair_steps(task, state, action, state, tolerance=1e-6)[ABSTRACT_STATE])
+    def ours() -> int:
+        columns, _ = pair_steps(pairing, batch, state, action, state, tolerance=1e-6)
+        return len(columns[ABSTRACT_STATE])
 
-    return batch if at_once else loop
+    return {"ours": ours, "Gymnasium loop": loop}
+
+
+def walker_pairs() -> Candidates:
+    """Pair transitions of Gymnasium's planar walker, whose whole state is the abstract state."""
+    env: Any = gymnasium.make("Walker2d-v5").unwrapped
+    env.reset(seed=0)
+    model, substeps = env.model, env.frame_skip
+    size = model.nq + model.nv
+    rng = np.random.default_rng(0)
+    state = np.tile(np.concatenate([env.init_qpos, env.init_qvel]), (BATCH_OF_PAIRS, 1))
+    state = (state + 0.1 * rng.normal(size=state.shape)).astype(np.float32)
+    action = rng.uniform(-1, 1, size=(BATCH_OF_PAIRS, model.nu)).astype(np.float32)
+    pairing = Pairing(
+        "walker2d",
+        Column(ABSTRACT_STATE, size=size),
+        lambda values: values,
+        lambda count: MujocoModel(model, count, substeps=substeps),
+    )
+    batch = pairing.simulator(BATCH_OF_PAIRS)
+    rollout, data = Rollout(nthread=cores()), [mujoco.MjData(model) for _ in range(cores())]
+    initial = np.concatenate([np.zeros((BATCH_OF_PAIRS, 1)), state], axis=1)
+    control = np.repeat(action[:, None].astype(np.float64), substeps, axis=1)
+
+    def limit() -> int:
+        return len(rollout.rollout(model, data, initial, control)[0])
+
+    def loop(count: int = 500) -> int:
+        for row in range(count):
+            env.set_state(state[row, : model.nq].astype(float), state[row, model.nq :].astype(float))
+            env.step(action[row])
+        return count
+
+    def ours() -> int:
+        columns, _ = pair_steps(pairing, batch, state, action, state, tolerance=1e-6)
+        return len(columns[ABSTRACT_STATE])
+
+    return {"ours": ours, "mujoco.rollout alone": limit, "Gymnasium loop": loop}
 
 
 @contextmanager

@@ -149,7 +149,7 @@ def drop_rows(root: Path) -> None:
         (lambda root: (root / "meta/stats.json").unlink(), ["meta/stats.json missing"]),
         (
             lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
-            ["meta/astra/episodes.parquet has no rows"],
+            ["meta/episodes has no rows"],
         ),
         (
             edit("meta/info.json", total_frames=54, total_episodes=4),
