@@ -140,7 +140,7 @@ def pair(
     config = validated(given, PairConfig, "pair")
     if simulator is None:
         raise BadInputError("pair: expected --simulator, a task or path.py:MySimulator")
-    with resumable(), shown("pair") as progress:
+    with shown("pair") as progress:
         folder = pair_dataset(simulator, config, dataset=locate(dataset), out=out, progress=progress)
     typer.echo(f"finished: {folder}")
 
