@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from astra_data.commands import sharing
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -188,6 +189,9 @@ def _run_stage(
             recipe, stage, method=method, seeds=seeds, root=root, jobs=jobs, device=device, publish=publish
         )
         typer.echo(f"finished: {folder}")
+
+
+app.add_typer(sharing.app)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from astra_data.progress import Progress as Advance
 from astra_data.schedule import Watcher
 
 SECONDS_OF_SPEED = 600
@@ -27,6 +28,21 @@ def display(total: int, console: Console) -> Iterator[Watcher]:
     )
     with Progress(*columns, console=console, speed_estimate_period=SECONDS_OF_SPEED) as progress:
         yield LiveDisplay(total, progress)
+
+
+@contextmanager
+def bar(name: str) -> Iterator[Advance]:
+    """Show one job getting on, on standard error and in a terminal only."""
+    columns = (
+        TextColumn(name),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
+        TextColumn("{task.description}"),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=1.0)
+        yield lambda fraction, note: progress.update(task, completed=fraction, description=note)
 
 
 class PlainDisplay:
