@@ -10,7 +10,7 @@ BLOCK_BYTES = 2**24
 """Asked for at once."""
 
 
-def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str, shared: str) -> None:
+def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str) -> None:
     """Fetch the file `path` into `folder`, on from where an earlier call stopped.
 
     Args:
@@ -18,7 +18,6 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str, shared: st
         path: relative to it and to `folder`, and known to stay inside.
         folder: what is fetched in part is kept in it as <path>.part.
         digest: the file's sha256.
-        shared: names the dataset in errors.
 
     Raises:
         SharingError: it cannot be read or written, or holds something else.
@@ -36,27 +35,15 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str, shared: st
             _append(remote, path, part)
     except Exception as error:
         raise SharingError(
-            f"{shared}: {path} cannot be fetched ({type(error).__name__}: {error}); "
+            f"{remote.name}: {path} cannot be fetched ({type(error).__name__}: {error}); "
             "run the same command again to go on from here."
         ) from error
     if file_digest(part) != digest:
         part.unlink()
-        raise SharingError(f"{shared}: {path} does not have the sha256 that it should; it was altered there.")
+        raise SharingError(
+            f"{remote.name}: {path} does not have the sha256 that it should; it was altered there."
+        )
     part.replace(target)
-
-
-def read_remote(remote: RemoteFolder, path: str, shared: str) -> str:
-    """Return the text of the small file `path`.
-
-    Raises:
-        SharingError: it cannot be read, or is not there.
-    """
-    try:
-        return str(remote.filesystem.cat_file(f"{remote.path}/{path}").decode())
-    except FileNotFoundError as error:
-        raise SharingError(f"{shared} has no {path}: it was not pushed by astra-data.") from error
-    except Exception as error:
-        raise SharingError(f"{shared}: {path} cannot be read ({type(error).__name__}: {error}).") from error
 
 
 def _append(remote: RemoteFolder, path: str, part: Path) -> None:

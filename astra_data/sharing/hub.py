@@ -46,7 +46,8 @@ class HubStore:
         from huggingface_hub import HfFileSystem  # noqa: PLC0415 - slow to import
 
         filesystem = HfFileSystem(skip_instance_cache=True)
-        return RemoteFolder(filesystem, f"datasets/{self._repo}@{self._commits()[version]}")
+        commit = self._commits()[version]
+        return RemoteFolder(filesystem, f"datasets/{self._repo}@{commit}", f"{self._repo}@{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
         """Add `dataset`: its files, then the card, then the tag "v3.0", then the tag that marks it as there.
@@ -58,12 +59,16 @@ class HubStore:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
 
         version = Version.parse(dataset.description["version"])
-        newer = [known for known in self.versions() if known > version]
-        if newer:
-            raise BadInputError(
-                f"{self._repo} has {newer[-1].tag} already, and its main branch shows the newest version: "
-                f"{version.tag} can no longer be added. Push it to another place."
-            )
+        known = self.versions()
+        if known:
+            name = self.folder(known[-1]).description().get("name")
+            if name != dataset.description["name"]:
+                raise BadInputError(f"{self._repo} holds the dataset {name!r}; choose another repository.")
+            if known[-1] > version:
+                raise BadInputError(
+                    f"{self._repo} has {known[-1].tag} already, and main shows the newest version: "
+                    f"{version.tag} can no longer be added. Push it to another place."
+                )
         files = dataset_files(dataset.root)
         with _told(self._repo) as api:
             there = api.list_repo_files(self._repo, repo_type=KIND)
@@ -113,7 +118,6 @@ class HubStore:
 @contextmanager
 def _told(repo: str) -> Iterator["HfApi"]:
     """Yield the Hub's interface, and turn what it raises into one line."""
-    import httpx  # noqa: PLC0415 - slow to import
     from huggingface_hub import HfApi  # noqa: PLC0415 - slow to import
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError  # noqa: PLC0415 - slow to import
 
@@ -125,9 +129,11 @@ def _told(repo: str) -> Iterator["HfApi"]:
         raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(error)}") from error
     except HFValidationError as error:
         raise BadInputError(f"{repo} is no name of a repository on the Hub: {error}") from error
-    except (httpx.HTTPError, OSError) as error:
+    except Exception as error:
+        # Uploads fail with whatever their transfer raises, wrapped or not.
+        cause = error.__cause__ or error
         raise SharingError(
-            f"the Hugging Face Hub cannot be reached ({type(error).__name__}: {error}); check the network."
+            f"the Hugging Face Hub cannot be reached ({type(cause).__name__}: {cause}); check the network."
         ) from error
 
 

@@ -1,6 +1,5 @@
 """Fetch a version of a dataset; what was interrupted goes on where it stopped."""
 
-import json
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -8,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.dataset import Dataset
-from astra_data.dataset import format as layout
 from astra_data.dataset.atomic import publish
 from astra_data.dataset.provenance import NAME
 from astra_data.dataset.versions import Version, place
@@ -16,7 +14,7 @@ from astra_data.errors import AstraDataError, BadInputError, SharingError
 from astra_data.lock import held
 from astra_data.progress import Progress, silent
 from astra_data.sharing.address import Hub, parse_source
-from astra_data.sharing.fetch import fetch, read_remote
+from astra_data.sharing.fetch import fetch
 from astra_data.sharing.hub import HubStore
 from astra_data.sharing.store import RemoteFolder, Store
 from astra_data.sharing.sums import SUMS_PATH, parse_sums
@@ -57,19 +55,17 @@ def pull(
         listed = ", ".join(one.tag for one in known)
         raise BadInputError(f"{where} has no version {asked.tag}; it has {listed}.")
     chosen = asked or known[-1]
-    shared = f"{where}@{chosen.tag}"
     remote = store.folder(chosen)
-    description = remote_description(remote, shared)
-    if not NAME.fullmatch(str(description.get("name"))) or description.get("version") != str(chosen):
-        raise SharingError(
-            f"{shared} calls itself {description.get('name')!r} {description.get('version')!r}."
-        )
+    description = remote.description()
+    name, called = description.get("name"), description.get("version")
+    if not isinstance(name, str) or not NAME.fullmatch(name) or called != str(chosen):
+        raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it is not to be trusted.")
     target = place(description) if out is None else out
     if target.exists():
         return _present(target, description)
-    sums = parse_sums(read_remote(remote, SUMS_PATH, shared), shared)
+    sums = parse_sums(remote.read_text(SUMS_PATH), remote.name)
     try:
-        _fetch_all(remote, sums, target, description, shared, progress)
+        _fetch_all(remote, sums, target, description, progress)
     except OSError as error:
         raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
     return Dataset.open(target)
@@ -80,7 +76,6 @@ def _fetch_all(
     sums: Mapping[str, str],
     target: Path,
     description: Mapping[str, Any],
-    shared: str,
     progress: Progress,
 ) -> None:
     partial = target.with_name(f".{target.name}.pull-{description['version']}")
@@ -90,25 +85,13 @@ def _fetch_all(
             raise BadInputError(f"{target} is being pulled right now; wait or choose another folder.")
         for number, (path, digest) in enumerate(sums.items()):
             progress(number / len(sums), path)
-            fetch(remote, path, partial, digest, shared)
+            fetch(remote, path, partial, digest)
         for file in [file for file in partial.rglob("*") if file.is_file()]:
             if file.relative_to(partial).as_posix() not in sums:
                 file.unlink()
-        _check(partial, sums, description, shared)
+        _check(partial, sums, description, remote.name)
         publish(partial, target)
     progress(1.0, f"{len(sums)} files")
-
-
-def remote_description(remote: RemoteFolder, shared: str) -> dict[str, Any]:
-    """Return meta/astra/dataset.json of a shared version.
-
-    Raises:
-        SharingError: it cannot be read.
-    """
-    try:
-        return dict(json.loads(read_remote(remote, layout.DATASET_PATH, shared)))
-    except (TypeError, ValueError) as error:
-        raise SharingError(f"{shared}: {layout.DATASET_PATH} is no JSON object ({error}).") from error
 
 
 def _present(target: Path, description: Mapping[str, Any]) -> Dataset:
@@ -122,7 +105,7 @@ def _present(target: Path, description: Mapping[str, Any]) -> Dataset:
     )
 
 
-def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], shared: str) -> None:
+def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], name: str) -> None:
     """Refuse what was fetched unless it is the whole dataset; what others wrote may be anything."""
     try:
         dataset = Dataset.open(folder)
@@ -132,8 +115,8 @@ def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any]
             faults.append("its description changed while it was fetched")
     except Exception as error:
         shutil.rmtree(folder)
-        raise SharingError(f"{shared} is no whole dataset: {error}") from error
+        raise SharingError(f"{name} is no whole dataset: {error}") from error
     faults += [f"{path} does not belong to it" for path in outside]
     if faults:
         shutil.rmtree(folder)
-        raise SharingError(f"{shared} is no whole dataset: {'; '.join(faults)}.")
+        raise SharingError(f"{name} is no whole dataset: {'; '.join(faults)}.")

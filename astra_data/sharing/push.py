@@ -11,7 +11,6 @@ from astra_data.sharing.address import Hub, Url, parse_place
 from astra_data.sharing.card import write_card
 from astra_data.sharing.hub import HubStore
 from astra_data.sharing.notes import Notes
-from astra_data.sharing.pull import remote_description
 from astra_data.sharing.store import Store
 from astra_data.sharing.sums import SUMS_PATH, make_sums
 from astra_data.sharing.urls import UrlStore
@@ -61,7 +60,7 @@ def push(
         place = Url(f"{place}/{local.description['name']}")
         store = UrlStore(place.url)
     if version in store.versions():
-        there = remote_description(store.folder(version), f"{place}@{version.tag}")
+        there = store.folder(version).description()
         if there.get("content_hash") != local.content_hash:
             raise BadInputError(
                 f"{place} has another {version.tag}: its content hash is {there.get('content_hash')}, not "

@@ -54,7 +54,7 @@ class UrlStore:
 
     def folder(self, version: Version) -> RemoteFolder:
         """Return where the files of `version` are read."""
-        return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}")
+        return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self._url}/{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
         """Add `dataset`: `layout.DATASET_PATH` is written last and marks it as whole."""

@@ -22,7 +22,9 @@ def test_places_and_versions(text: str, place: Hub | Url, version: str | None) -
     assert parse_source(text) == (place, Version.parse(version) if version else None)
 
 
-@pytest.mark.parametrize("text", ["ant", "a/b/c", "/tmp/ant", "../ant", "hf://models/me/it", "hf://me/it", "", "s3://"])
+@pytest.mark.parametrize(
+    "text", ["ant", "a/b/c", "/tmp/ant", "../ant", "hf://models/me/it", "hf://me/it", "", "s3://"]
+)
 def test_anything_else_is_told(text: str) -> None:
     with pytest.raises(BadInputError, match="expected user/name or hf://datasets/user/name"):
         parse_place(text)

@@ -39,7 +39,13 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
         *("# fake\n", "A sum.", "It walks.", "For tests.", "Nothing real.", "“run”", "20 Hz", "5 episodes"),
         *("mother@data-2.1.0", "ab" * 32, '"noise_m": 0.1', '"collect": 0', "Fake-v0", "point_mass"),
         *(dataset.content_hash, "| made by stage | collect |", dataset.description["packages"]["mujoco"]),
-        *("2 of 5 episodes (40%)", "1 to 30 steps; quartiles 5, 7, 12", "| steps | 55 |", "Deng", "x, y, yaw"),
+        *(
+            "2 of 5 episodes (40%)",
+            "1 to 30 steps; quartiles 5, 7, 12",
+            "| steps | 55 |",
+            "Deng",
+            "x, y, yaw",
+        ),
         f"| `{STATE}` | float32 | (3,) | m (2), rad | pose: x, y, yaw |",
     ]
     assert [words for words in told if words not in text] == []
@@ -127,7 +133,7 @@ def python_blocks(text: str) -> list[str]:
 
 def test_notes_with_faults_are_told(tmp_path: Path) -> None:
     (tmp_path / "notes.toml").write_text('limit = "none"\nlicense = 3\n')
-    with pytest.raises(RecipeError, match="(?s)2 faults.*did you mean 'limits'"):
+    with pytest.raises(RecipeError, match=r"(?s)2 faults.*did you mean 'limits'"):
         load_recipe(tmp_path / "notes.toml", Notes)
 
 

@@ -13,9 +13,13 @@ DIGEST = "0" * 64
 
 def test_sums_are_those_of_sha256sum(fake: Dataset, tmp_path: Path) -> None:
     (tmp_path / SUMS_PATH).write_text(make_sums(fake.root))
-    told = subprocess.run(["sha256sum", "-c", tmp_path / SUMS_PATH], cwd=fake.root, capture_output=True, text=True)
+    told = subprocess.run(
+        ["sha256sum", "-c", tmp_path / SUMS_PATH], cwd=fake.root, capture_output=True, text=True
+    )
     assert told.returncode == 0
-    assert told.stdout.count(": OK") == len(contents(fake.root)) == len(parse_sums(make_sums(fake.root), "it"))
+    assert (
+        told.stdout.count(": OK") == len(contents(fake.root)) == len(parse_sums(make_sums(fake.root), "it"))
+    )
 
 
 def test_other_files_in_the_folder_are_left_out(tmp_path: Path) -> None:
