@@ -115,7 +115,7 @@ class Handler(BaseHTTPRequestHandler):
                 if method != "GET" and name != "paths_info" and not self._known():
                     return self._answer({"error": "Invalid username or password."}, 401)
                 if "repo" in words:
-                    words["repo"] = repo  # type: ignore[assignment]
+                    words["repo"] = repo
                 getattr(self, name)(**{key: value for key, value in words.items() if value is not None})
                 return None
         return self._answer({"error": f"{self.command} {path} is not served"}, 501)
@@ -143,7 +143,10 @@ class Handler(BaseHTTPRequestHandler):
         return self._answer({"url": f"{self.server.url}/datasets/{name}", "id": name})
 
     def validate(self) -> None:
-        self._answer({"warnings": [], "errors": []})
+        if "license: none-such\n" in json.loads(self.body)["content"]:
+            fault = {"message": '"license" must be one of a list'}
+            return self._answer({"errors": [fault]}, 400, {"X-Error-Message": "Invalid metadata"})
+        return self._answer({"warnings": [], "errors": []})
 
     def refs(self, repo: Repository) -> None:
         tags = [

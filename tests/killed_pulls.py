@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import fsspec.implementations.local  # noqa: F401 - here, so that no child spends its life on it
 from shared_files import contents
 
 from astra_data.dataset import Dataset
@@ -39,6 +40,7 @@ def check(out: Path, truth: Path) -> None:
 
 
 def main(source: str, out: Path, truth: Path, kills: int) -> None:
+    assert not out.exists()
     began = time.perf_counter()
     assert forked(lambda: pull(source, out=out)) == 0
     longest = time.perf_counter() - began
@@ -46,7 +48,7 @@ def main(source: str, out: Path, truth: Path, kills: int) -> None:
     rng = random.Random(0)
     finished = resumed = 0
     for _ in range(kills):
-        forked(lambda: pull(source, out=out), rng.uniform(0, longest))
+        forked(lambda: pull(source, out=out), rng.uniform(0, 1.3 * longest))
         resumed += any(out.parent.glob(f".{out.name}.pull-*/*"))
         if out.exists():
             finished += 1

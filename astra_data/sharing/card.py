@@ -126,7 +126,7 @@ def _counts(dataset: Dataset) -> str:
     for key, values in sorted(facts.items()):
         if values and all(isinstance(value, bool) for value in values):
             share = sum(map(bool, values)) / len(values)
-            rows.append((key, f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.0%})"))
+            rows.append((key, f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})"))
         elif key == "return" and values:
             returns = np.array(values, dtype=np.float64)
             rows.append((key, f"mean {returns.mean():.2f}; {returns.min():.2f} to {returns.max():.2f}"))

@@ -129,11 +129,16 @@ def _told(repo: str) -> Iterator["HfApi"]:
         raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(error)}") from error
     except HFValidationError as error:
         raise BadInputError(f"{repo} is no name of a repository on the Hub: {error}") from error
+    except ValueError as error:
+        raise BadInputError(f"{repo}: the Hugging Face Hub does not take this: {error}") from error
     except Exception as error:
         # Uploads fail with whatever their transfer raises, wrapped or not.
         cause = error.__cause__ or error
+        if isinstance(cause, HfHubHTTPError):
+            raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(cause)}") from error
         raise SharingError(
-            f"the Hugging Face Hub cannot be reached ({type(cause).__name__}: {cause}); check the network."
+            f"{repo} on the Hugging Face Hub cannot be reached ({type(cause).__name__}: {cause}); "
+            "check the network, then run the same command again."
         ) from error
 
 

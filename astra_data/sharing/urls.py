@@ -29,8 +29,7 @@ class UrlStore:
 
         self._url = url
         protocol = url.partition("://")[0].lower()
-        # A local disk needs its folders made; object stores have none, and must not be given new buckets.
-        options = {"auto_mkdir": True} if protocol in ("file", "local") else {"use_listings_cache": False}
+        options = {"auto_mkdir": True} if protocol in ("file", "local") else {}
         with _told(url):
             try:
                 self._filesystem, self._path = fsspec.core.url_to_fs(url, **options)
@@ -44,6 +43,7 @@ class UrlStore:
     def versions(self) -> list[Version]:
         """Return the versions that are there whole, the oldest first."""
         with _told(self._url):
+            self._filesystem.invalidate_cache()
             try:
                 found = self._filesystem.ls(self._path, detail=False)
             except FileNotFoundError:

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, concatenated, fake_episodes, write_fake, writer
 from huggingface_hub import DatasetCard
+from matplotlib.figure import Figure
 
 from astra_data.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset import Dataset
 from astra_data.errors import BadInputError, RecipeError
+from astra_data.figures.coverage import coverage as draw
 from astra_data.recipe import load_recipe
-from astra_data.sharing import coverage
 from astra_data.sharing.card import render_card, write_card
+from astra_data.sharing.coverage import coverage_figure
 from astra_data.sharing.notes import Notes
 
 NOTES = Notes(
@@ -32,7 +34,8 @@ def test_the_front_matter_says_what_the_hub_reads(fake: Dataset, tmp_path: Path)
 
 def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
     parent = {"name": "mother", "version": "2.1.0", "hash": "ab" * 32}
-    description = DESCRIPTION | {"parents": [parent], "simulator": {"id": "point_mass", "radius_m": 0.1}}
+    simulator = {"id": "point_mass", "radius_m": 0.1}
+    description = {**DESCRIPTION, "parents": [parent], "simulator": simulator}
     dataset = write_fake(tmp_path / "fake", description=description)
     text = render_card(dataset, NOTES)
     told = [
@@ -40,7 +43,7 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
         *("mother@data-2.1.0", "ab" * 32, '"noise_m": 0.1', '"collect": 0', "Fake-v0", "point_mass"),
         *(dataset.content_hash, "| made by stage | collect |", dataset.description["packages"]["mujoco"]),
         *(
-            "2 of 5 episodes (40%)",
+            "2 of 5 episodes (40.0%)",
             "1 to 30 steps; quartiles 5, 7, 12",
             "| steps | 55 |",
             "Deng",
@@ -72,8 +75,12 @@ def test_the_figure_counts_every_position(
     fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Any] = []
-    draw = coverage.coverage
-    monkeypatch.setattr(coverage, "coverage", lambda *given: drawn.append(given) or draw(*given))
+
+    def watched(*given: Any) -> Figure:  # noqa: ANN401
+        drawn.append(given)
+        return draw(*given)
+
+    monkeypatch.setattr("astra_data.sharing.coverage.coverage", watched)
     card, figure = write_card(fake, tmp_path / "it.md", Notes())
     counts, (x, y), labels = drawn[0]
     state = concatenated(STATE).astype(np.float64)
@@ -92,7 +99,7 @@ def test_a_robot_that_stands_still_is_drawn(tmp_path: Path) -> None:
     pose = Column("pose", size=2, astra={"role": ["position", "position"]})
     with writer(tmp_path / "still", columns=[pose]) as out:
         out.add(Episode(0, {"pose": np.full((1, 2), 3.0, dtype=np.float32)}))
-    assert coverage.coverage_figure(Dataset.open(tmp_path / "still"))
+    assert coverage_figure(Dataset.open(tmp_path / "still"))
 
 
 def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:

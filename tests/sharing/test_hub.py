@@ -24,7 +24,7 @@ DATA = "data/chunk-000/file-000.parquet"
 
 
 def versioned(root: Path, version: str, **changes: object) -> Dataset:
-    return write_fake(root, description=DESCRIPTION | {"version": version}, **changes)
+    return write_fake(root, description={**DESCRIPTION, "version": version}, **changes)
 
 
 def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) -> None:
@@ -149,6 +149,22 @@ def test_no_network_is_told(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
         pull("me/it")
 
 
+def test_an_upload_that_breaks_off_is_told(hub: Hub, fake: Dataset) -> None:
+    hub.refuse = lambda method, path: 403 if method == "PUT" else None
+    with pytest.raises(SharingError, match="me/it on the Hugging Face Hub: no rights to do this"):
+        push(fake.root, "me/it")
+    assert hub.repos["me/it"].tags == {}
+
+
+def test_a_card_that_the_hub_refuses_is_told(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "notes.toml").write_text('license = "none-such"\n')
+    with pytest.raises(BadInputError, match=r'does not take this: (.|\n)*"license" must be one of a list'):
+        push(fake.root, "me/it", notes=tmp_path / "notes.toml")
+    assert hub.repos["me/it"].tags == {}
+    push(fake.root, "me/it")
+    assert set(hub.repos["me/it"].tags) == {"v3.0", "data-1.0.0"}
+
+
 def test_a_plain_lerobot_dataset_is_neither_pulled_nor_overwritten(hub: Hub, fake: Dataset) -> None:
     repo = hub.repos["me/it"] = Repository()
     repo.commit({"meta/info.json": b"{}", "data/chunk-000/file-000.parquet": b""}, "by lerobot")
@@ -167,7 +183,7 @@ def test_a_plain_lerobot_dataset_is_neither_pulled_nor_overwritten(hub: Hub, fak
 
 def test_another_dataset_is_not_mixed_with_the_one_there(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
     push(fake.root, "me/it")
-    other = write_fake(tmp_path / "other", description=DESCRIPTION | {"name": "other", "version": "2.0.0"})
+    other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other", "version": "2.0.0"})
     with pytest.raises(BadInputError, match="holds the dataset 'fake'"):
         push(other.root, "me/it")
 

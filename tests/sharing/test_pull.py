@@ -87,7 +87,7 @@ def test_killed_at_any_moment_a_pull_leaves_nothing_unreadable(
     fake: Dataset, shared: Path, tmp_path: Path
 ) -> None:
     script = Path(__file__).parents[1] / "killed_pulls.py"
-    command = [sys.executable, script, source(shared), tmp_path / "out", fake.root, "6"]
+    command = [sys.executable, str(script), source(shared), str(tmp_path / "out"), str(fake.root), "6"]
     told = subprocess.run(command, capture_output=True, text=True)
     assert told.returncode == 0, told.stderr
     assert told.stdout.splitlines()[-1] == "whole"

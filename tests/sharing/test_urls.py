@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
@@ -86,7 +86,7 @@ def test_the_newest_version_is_pulled_unless_another_is_named(
 ) -> None:
     push(fake.root, place)
     for version in ("1.10.0", "1.9.0"):
-        push(write_fake(tmp_path / version, description=DESCRIPTION | {"version": version}).root, place)
+        push(write_fake(tmp_path / version, description={**DESCRIPTION, "version": version}).root, place)
     assert pull(f"{place}/fake", out=tmp_path / "a").description["version"] == "1.10.0"
     assert pull(f"{place}/fake", out=tmp_path / "b", version="1.9.0").description["version"] == "1.9.0"
     assert pull(f"{place}/fake@data-1.0.0", out=tmp_path / "c").description["version"] == "1.0.0"
@@ -115,10 +115,13 @@ def test_an_upload_that_stopped_is_not_there_and_is_replaced(
 def test_the_mark_is_uploaded_last(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = UrlStore(f"file://{tmp_path}/fake")
     sent: list[str] = []
-    put: Callable[[str, str], None] = store._filesystem.put_file
-    monkeypatch.setattr(
-        store._filesystem, "put_file", lambda file, path: sent.append(path) or put(file, path)
-    )
+    put = store._filesystem.put_file
+
+    def watched(file: str, path: str) -> None:
+        sent.append(path)
+        put(file, path)
+
+    monkeypatch.setattr(store._filesystem, "put_file", watched)
     (tmp_path / "card").mkdir()
     (tmp_path / "card/README.md").touch()
     store.upload(fake, tmp_path / "card", lambda fraction, note: None)
