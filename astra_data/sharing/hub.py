@@ -56,57 +56,71 @@ class HubStore:
             BadInputError: the repository holds another dataset or a newer version.
             SharingError: the Hub refuses or cannot be reached.
         """
-        from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
-
         version = Version.parse(dataset.description["version"])
-        known = self.versions()
-        if known:
-            name = self.folder(known[-1]).description().get("name")
-            if name != dataset.description["name"]:
-                raise BadInputError(f"{self._repo} holds the dataset {name!r}; choose another repository.")
-            if known[-1] > version:
-                raise BadInputError(
-                    f"{self._repo} has {known[-1].tag} already, and main shows the newest version: "
-                    f"{version.tag} can no longer be added. Push it to another place."
-                )
-        files = dataset_files(dataset.root)
+        self._refuse_mixing(dataset, version)
         with _told(self._repo) as api:
-            there = api.list_repo_files(self._repo, repo_type=KIND)
-            if layout.INFO_PATH in there and SUMS_PATH not in there:
-                raise BadInputError(
-                    f"{self._repo} holds a dataset that astra-data did not push; choose another repository."
-                )
-            progress(0.0, f"{len(files)} files")
-            old = [path for path in there if path.startswith(("data/", "meta/")) and path not in files]
-            sums = CommitOperationAdd(SUMS_PATH, card / SUMS_PATH)
-            add = [CommitOperationAdd(path, dataset.root / path) for path in files]
-            remove = [CommitOperationDelete(path, is_folder=False) for path in old]
-            # A commit that somebody else adds in the meantime makes this one fail.
-            head = api.repo_info(self._repo, repo_type=KIND).sha
-            commit = api.create_commit(
-                self._repo,
-                [*add, *remove, sums],
-                repo_type=KIND,
-                parent_commit=head,
-                commit_message=f"Add {dataset.reference}",
-            )
+            progress(0.0, "files")
+            commit = self._commit_files(api, dataset, card)
             progress(0.9, "card")
-            pages = [path for path in sorted(card.iterdir()) if path.name != SUMS_PATH]
-            commit = api.create_commit(
-                self._repo,
-                [CommitOperationAdd(path.name, path) for path in pages],
-                repo_type=KIND,
-                parent_commit=commit.oid,
-                commit_message=f"Describe {dataset.reference}",
-            )
-            if any(
-                tag.name == layout.CODEBASE_VERSION
-                for tag in api.list_repo_refs(self._repo, repo_type=KIND).tags
-            ):
+            commit = self._commit_card(api, dataset, card, commit)
+            tags = api.list_repo_refs(self._repo, repo_type=KIND).tags
+            if layout.CODEBASE_VERSION in [tag.name for tag in tags]:
                 api.delete_tag(self._repo, tag=layout.CODEBASE_VERSION, repo_type=KIND)
             for tag in (layout.CODEBASE_VERSION, version.tag):
-                api.create_tag(self._repo, tag=tag, revision=commit.oid, repo_type=KIND)
-        progress(1.0, f"{len(files)} files")
+                api.create_tag(self._repo, tag=tag, revision=commit, repo_type=KIND)
+        progress(1.0, "tags")
+
+    def _refuse_mixing(self, dataset: Dataset, version: Version) -> None:
+        known = self.versions()
+        if not known:
+            return
+        name = self.folder(known[-1]).description().get("name")
+        if name != dataset.description["name"]:
+            raise BadInputError(f"{self._repo} holds the dataset {name!r}; choose another repository.")
+        if known[-1] > version:
+            raise BadInputError(
+                f"{self._repo} has {known[-1].tag} already, and main shows the newest version: "
+                f"{version.tag} can no longer be added. Push it to another place."
+            )
+
+    def _commit_files(self, api: "HfApi", dataset: Dataset, card: Path) -> str:
+        """Make data/ and meta/ those of `dataset`."""
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
+
+        # A commit that somebody else adds from here on makes this one fail.
+        head = api.repo_info(self._repo, repo_type=KIND).sha
+        there = api.list_repo_files(self._repo, revision=head, repo_type=KIND)
+        if layout.INFO_PATH in there and SUMS_PATH not in there:
+            raise BadInputError(
+                f"{self._repo} holds a dataset that astra-data did not push; choose another repository."
+            )
+        files = dataset_files(dataset.root)
+        old = [path for path in there if path.startswith(("data/", "meta/")) and path not in files]
+        commit = api.create_commit(
+            self._repo,
+            [
+                *(CommitOperationAdd(path, dataset.root / path) for path in files),
+                *(CommitOperationDelete(path, is_folder=False) for path in old),
+                CommitOperationAdd(SUMS_PATH, card / SUMS_PATH),
+            ],
+            repo_type=KIND,
+            parent_commit=head,
+            commit_message=f"Add {dataset.reference}",
+        )
+        return str(commit.oid)
+
+    def _commit_card(self, api: "HfApi", dataset: Dataset, card: Path, parent: str) -> str:
+        from huggingface_hub import CommitOperationAdd  # noqa: PLC0415 - slow to import
+
+        pages = [path for path in sorted(card.iterdir()) if path.name != SUMS_PATH]
+        commit = api.create_commit(
+            self._repo,
+            [CommitOperationAdd(path.name, path) for path in pages],
+            repo_type=KIND,
+            parent_commit=parent,
+            commit_message=f"Describe {dataset.reference}",
+        )
+        return str(commit.oid)
 
     def _commits(self) -> dict[Version, str]:
         with _told(self._repo) as api:
