@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands import augmenting, building, inspecting, recipes
+from astra_data.commands import augmenting, building, inspecting, recipes, sharing
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -49,6 +49,9 @@ for command in (
     recipes.align,
     recipes.evaluate,
     recipes.report,
+    sharing.card,
+    sharing.push,
+    sharing.pull,
 ):
     app.command()(command)
 

@@ -34,9 +34,9 @@ def display(total: int, console: Console) -> Iterator[Watcher]:
 
 @contextmanager
 def shown(key: str) -> Iterator[Notes]:
-    """Show one job of this process getting on; yield what it is to tell."""
+    """Show on standard error how one job of this process gets on; yield what it is to tell."""
     began = time.perf_counter()
-    with display(1, Console()) as watch:
+    with display(1, Console(stderr=True)) as watch:
         watch.started(key)
         yield partial(watch.progressed, key)
         watch.finished(key, time.perf_counter() - began)

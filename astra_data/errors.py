@@ -4,7 +4,8 @@ AstraDataError          anything the toolkit reports on purpose: one clear line,
 ├── BadInputError       a value, file or column is not what was expected
 ├── RecipeError         a recipe does not say what it should
 ├── MissingStageError   an earlier stage has not been run yet
-└── CorruptDatasetError a dataset on disk is incomplete or was altered
+├── CorruptDatasetError a dataset on disk is incomplete or was altered
+└── SharingError        a place where datasets are shared cannot be reached, refuses, or holds something else
 """
 
 
@@ -26,3 +27,7 @@ class MissingStageError(AstraDataError):
 
 class CorruptDatasetError(AstraDataError):
     """A dataset on disk is incomplete or was altered."""
+
+
+class SharingError(AstraDataError):
+    """A place where datasets are shared cannot be reached, refuses, or holds something else."""

@@ -109,6 +109,23 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     )
 
 
+def visited(dataset: Dataset) -> Map | None:
+    """Count where the robot was; None where the state's roles do not tell.
+
+    Raises:
+        CorruptDatasetError: a file cannot be read.
+    """
+    ranges = json.loads((dataset.root / STATS_PATH).read_text(encoding="utf-8"))
+    states = [column for column in dataset.schema if column.name == STATE]
+    found = _empty_map([_empty_spread(column, ranges[STATE]) for column in states], "position")
+    if found is None:
+        return None
+    planar, group = found
+    for episode in dataset.episodes([STATE]):
+        _visit(planar, episode.columns[STATE][:, group])
+    return planar
+
+
 def _empty_spread(column: Column, ranges: dict[str, list[float]]) -> Spread:
     low, high, mean = (np.array(ranges[key], dtype=np.float64) for key in ("min", "max", "mean"))
     return Spread(column, low, high, mean, np.zeros((column.size, BINS), dtype=np.int64))

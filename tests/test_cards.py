@@ -4,6 +4,8 @@ import pytest
 from huggingface_hub import DatasetCard
 
 from astra_data.columns import OUTCOME_COLUMNS
+from astra_data.recipe import load_recipe
+from astra_data.sharing.notes import Notes
 from astra_data.tasks import TASKS
 
 CARDS = sorted((Path(__file__).parents[1] / "dataset_cards").glob("*.md"))
@@ -18,3 +20,13 @@ def test_a_card_says_what_the_hub_reads_and_names_every_column(path: Path) -> No
     task = TASKS[path.stem.removesuffix("-random")]
     names = [column.name for column in (*task.state_columns, *OUTCOME_COLUMNS)]
     assert [name for name in names if f"`{name}`" not in card.text] == []
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
+    notes = load_recipe(path.with_suffix(".toml"), Notes)
+    text = path.read_text(encoding="utf-8")
+    assert [words for words in notes.model_dump().values() if words.strip() not in text] == []
+    figure = path.with_name(f"{path.stem}-coverage.png")
+    assert f"]({figure.name})" in text
+    assert figure.read_bytes().startswith(b"\x89PNG")

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from astra_data.columns import ACTION, STATE
 from astra_data.dataset import Dataset, DatasetWriter
-from astra_data.inspection import BINS, Inspection, Map, inspect_dataset
+from astra_data.inspection import BINS, Inspection, Map, inspect_dataset, visited
 from astra_data.inspection_page import inspection_page, shaded, sparkline
 
 
@@ -43,6 +43,14 @@ def test_the_map_counts_every_position_where_it_was(inspection: Inspection) -> N
     assert np.abs(places.counts - theirs).sum() <= 4
     assert places.counts.sum() == sum(LENGTHS)
     assert inspection.velocities is None  # no column tells one
+
+
+def test_positions_alone_give_the_same_map(tmp_path: Path, inspection: Inspection) -> None:
+    planar = visited(write_fake(tmp_path / "set"))
+    assert planar is not None
+    assert inspection.positions is not None
+    np.testing.assert_array_equal(planar.counts, inspection.positions.counts)
+    assert planar.extent == inspection.positions.extent
 
 
 def test_episodes_are_summed_up(inspection: Inspection) -> None:

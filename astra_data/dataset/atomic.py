@@ -31,13 +31,22 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     with held(folder):
         try:
             yield folder
-            for path in folder.rglob("*"):
-                sync(path)
-            _refuse(target)
-            os.replace(folder, target)
-            sync(target.parent)
+            publish(folder, target)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def publish(folder: Path, target: Path) -> None:
+    """Rename the finished `folder` to `target` beside it, once all of it is on the disk.
+
+    Raises:
+        BadInputError: `target` exists.
+    """
+    for path in folder.rglob("*"):
+        sync(path)
+    _refuse(target)
+    os.replace(folder, target)
+    sync(target.parent)
 
 
 def _refuse(target: Path) -> None:

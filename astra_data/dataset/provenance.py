@@ -24,6 +24,9 @@ PACKAGES = (
 )
 """Packages whose versions can move a result."""
 
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""What datasets may be called."""
+
 _DEFAULTS: dict[str, Any] = {
     "name": None,
     "version": "1.0.0",
@@ -48,7 +51,7 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     """
     full = _DEFAULTS | dict(description)
     faults = [f"unknown key {key!r}, expected {', '.join(_DEFAULTS)}" for key in full.keys() - _DEFAULTS]
-    if not isinstance(full["name"], str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", full["name"]):
+    if not isinstance(full["name"], str) or not NAME.fullmatch(full["name"]):
         faults.append(f"name {full['name']!r}, expected letters, digits, '.', '_' and '-'")
     if not isinstance(full["version"], str) or not re.fullmatch(r"\d+\.\d+\.\d+", full["version"]):
         faults.append(f"version {full['version']!r}, expected three numbers such as 1.0.0")

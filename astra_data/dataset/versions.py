@@ -43,6 +43,16 @@ class Version:
             raise BadInputError(f"version '{text}': expected three numbers such as 1.2.0")
         return cls(*map(int, text.split(".")))
 
+    @property
+    def tag(self) -> str:
+        """What folders and tags are called: "data-1.2.0"."""
+        return f"data-{self}"
+
+    @classmethod
+    def from_tag(cls, tag: str) -> "Version | None":
+        """Read "data-1.2.0"; None if it is no such tag."""
+        return cls.parse(tag[5:]) if re.fullmatch(r"data-\d+\.\d+\.\d+", tag) else None
+
     def __str__(self) -> str:
         """Write "1.2.0"."""
         return f"{self.major}.{self.minor}.{self.patch}"

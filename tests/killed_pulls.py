@@ -1,0 +1,65 @@
+"""Pull a dataset and be killed at random moments: killed_pulls.py SOURCE OUT TRUTH KILLS.
+
+After each kill, OUT is either absent or bit-identical to TRUTH. Prints how often it was which.
+"""
+
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import fsspec.implementations.local  # noqa: F401 - here, so that no child spends its life on it
+from shared_files import contents
+
+from astra_data.dataset import Dataset
+from astra_data.sharing import fetch
+from astra_data.sharing.pull import pull
+
+fetch.BLOCK_BYTES = 1024
+
+
+def forked(job: Callable[[], object], seconds: float | None = None) -> int:
+    """Run `job` in a child that is killed after `seconds`; its exit status, negative if it was killed."""
+    child = os.fork()
+    if child == 0:
+        job()
+        os._exit(0)
+    if seconds is not None:
+        time.sleep(seconds)
+        os.kill(child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def check(out: Path, truth: Path) -> None:
+    assert Dataset.open(out).verify() == []
+    assert contents(out) == contents(truth)
+
+
+def main(source: str, out: Path, truth: Path, kills: int) -> None:
+    assert not out.exists()
+    began = time.perf_counter()
+    assert forked(lambda: pull(source, out=out)) == 0
+    longest = time.perf_counter() - began
+    shutil.rmtree(out)
+    rng = random.Random(0)
+    finished = resumed = 0
+    for _ in range(kills):
+        forked(lambda: pull(source, out=out), rng.uniform(0, 1.3 * longest))
+        resumed += any(out.parent.glob(f".{out.name}.pull-*/*"))
+        if out.exists():
+            finished += 1
+            assert forked(lambda: check(out, truth)) == 0
+            shutil.rmtree(out)
+    assert forked(lambda: pull(source, out=out)) == 0
+    assert forked(lambda: check(out, truth)) == 0
+    assert [path.name for path in out.parent.iterdir() if path.name.startswith(".")] == []
+    print(f"{kills} kills: {resumed} left a part, {finished} a whole dataset, {longest:.2f} s a pull")
+    print("whole")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]))
