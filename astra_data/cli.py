@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from astra_data.commands import editing
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -197,6 +198,9 @@ def _resumable() -> Iterator[None]:
     except KeyboardInterrupt:
         typer.echo("stopped: run the same command again to go on from here", err=True)
         raise typer.Exit(130) from None
+
+
+app.add_typer(editing.app)
 
 
 def main() -> None:
