@@ -169,15 +169,12 @@ def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
     if isinstance(table, str):
         report.fault(METADATA_PATH, f"{METADATA_PATH} {table}")
     else:
-        known = [(row.get("episode_uid"), row.get("length")) for row in table.to_pylist()]
-        for episode, (told, found) in enumerate(
-            zip_longest(known, zip(checks.uids, checks.lengths, strict=True))
-        ):
-            if told != found:
-                report.fault(
-                    METADATA_PATH,
-                    f"{METADATA_PATH} has {told} as uid and length of episode {episode}, expected {found}",
-                )
+        told = [(row.get("episode_uid"), row.get("length")) for row in table.to_pylist()]
+        present = zip(checks.uids, checks.lengths, strict=True)
+        for episode, (said, is_) in enumerate(zip_longest(told, present)):
+            if said != is_:
+                fault = f"{said} as uid and length of episode {episode}, expected {is_}"
+                report.fault(METADATA_PATH, f"{METADATA_PATH} has {fault}")
     subsets = read_object(root / SUBSETS_PATH)
     if isinstance(subsets, str):
         report.fault(SUBSETS_PATH, f"{SUBSETS_PATH} {subsets}")

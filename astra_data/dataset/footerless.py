@@ -22,6 +22,10 @@ _DETAILS = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}
 """Field of a page's header that describes this kind of page."""
 _ENCODING = {_DATA: 2, _DICTIONARY: 2, _DATA_V2: 4}
 """Field therein that holds the encoding."""
+_FIXED_WIDTH = (0, 9)
+"""Encodings PLAIN and BYTE_STREAM_SPLIT."""
+_HEADER = 1000
+"""Bytes that a page's header, with the extremes of its values, does not exceed."""
 _SNAPPY, _ZSTD = 1, 6
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -38,6 +42,21 @@ class _Page:
     encoding: int
     is_zstd: bool
 
+    def fits(self, column: "_Leaf") -> bool:
+        """Tell whether it may belong to `column`: values of fixed width take that, and a few bits more."""
+        if self.kind == _DICTIONARY or self.encoding not in _FIXED_WIDTH:
+            return True
+        least = self.values * column.bits // 8
+        return least <= self.unpacked <= least + self.values // 2 + _HEADER
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """A column: values per row and bits per value."""
+
+    size: int
+    bits: int
+
 
 def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     """Rebuild the metadata of the parquet file at `path`, which then reads with `ParquetFile(metadata=...)`.
@@ -52,11 +71,11 @@ def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     Raises:
         CorruptDatasetError: there is no whole row group, or a column is of another kind.
     """
-    sizes = [_values_per_row(field) for field in schema]
+    leaves = [_leaf(field) for field in schema]
     pages = _pages(path)
     groups: list[list[list[_Page]]] = []
     first = 0
-    while group := _row_group(pages, first, sizes):
+    while group := _row_group(pages, first, leaves):
         groups.append(group)
         first += sum(map(len, group))
     if not groups:
@@ -64,17 +83,17 @@ def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     template = io.BytesIO()
     row = pa.table([pa.nulls(1, field.type) for field in schema], schema=schema)
     pq.write_table(row, template, compression="snappy")
-    footer = _footer(template.getvalue(), groups, sizes)
+    footer = _footer(template.getvalue(), groups, leaves)
     file = b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1"
     return pq.read_metadata(pa.BufferReader(file))
 
 
-def _values_per_row(field: pa.Field) -> int:
-    if pa.types.is_fixed_size_list(field.type):
-        return int(field.type.list_size)
-    if pa.types.is_nested(field.type) or isinstance(field.type, pa.BaseExtensionType):
+def _leaf(field: pa.Field) -> _Leaf:
+    is_list = pa.types.is_fixed_size_list(field.type)
+    value = field.type.value_type if is_list else field.type
+    if not pa.types.is_primitive(value):
         raise CorruptDatasetError(f"column {field.name} ({field.type}) cannot be read without a footer")
-    return 1
+    return _Leaf(field.type.list_size if is_list else 1, value.bit_width)
 
 
 def _pages(path: Path) -> list[_Page]:
@@ -98,13 +117,15 @@ def _pages(path: Path) -> list[_Page]:
                 if packed < 0 or reader.position > len(data):
                     break
                 size = unpacked + body - start
-                is_zstd = data[body : body + 4] == _ZSTD_MAGIC
+                # In pages of the second kind, levels come first, and are not compressed.
+                levels = sum(details[field][1] for field in (5, 6)) if kind == _DATA_V2 else 0
+                is_zstd = data[body + levels : body + levels + 4] == _ZSTD_MAGIC
                 pages.append(_Page(start, reader.position, size, kind, values, encoding, is_zstd))
             del reader
     return pages
 
 
-def _row_group(pages: Sequence[_Page], first: int, sizes: Sequence[int]) -> list[list[_Page]] | None:
+def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> list[list[_Page]] | None:
     """Cut the pages from `first` on into a chunk per column, of equally many rows; None if too few."""
     values = 0
     for number in range(first, len(pages)):
@@ -113,22 +134,25 @@ def _row_group(pages: Sequence[_Page], first: int, sizes: Sequence[int]) -> list
                 return None
             continue
         values += pages[number].values
-        if values % sizes[0] == 0 and (group := _chunks(pages, first, sizes, values // sizes[0])):
+        rows, rest = divmod(values, leaves[0].size)
+        if not rest and (group := _chunks(pages, first, leaves, rows)):
             return group
     return None
 
 
 def _chunks(
-    pages: Sequence[_Page], position: int, sizes: Sequence[int], rows: int
+    pages: Sequence[_Page], position: int, leaves: Sequence[_Leaf], rows: int
 ) -> list[list[_Page]] | None:
     chunks: list[list[_Page]] = []
-    for size in sizes:
+    for leaf in leaves:
         chunk: list[_Page] = []
-        missing = rows * size
+        missing = rows * leaf.size
         while missing > 0:
             if position == len(pages) or (chunk and pages[position].kind == _DICTIONARY):
                 return None
             page = pages[position]
+            if not page.fits(leaf):
+                return None
             chunk.append(page)
             missing -= 0 if page.kind == _DICTIONARY else page.values
             position += 1
@@ -138,12 +162,12 @@ def _chunks(
     return chunks
 
 
-def _footer(template: bytes, groups: list[list[list[_Page]]], sizes: Sequence[int]) -> bytes:
+def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_Leaf]) -> bytes:
     """Return parquet's FileMetaData: the schema of `template`, a file of one row group, and our groups."""
     length = int.from_bytes(template[-8:-4], "little")
     metadata = Reader(template[-8 - length : -8]).struct()
     columns = [column[3][1] for column in metadata[4][1][1][0][1][1][1]]
-    rows = [_values(group[0]) // sizes[0] for group in groups]
+    rows = [_values(group[0]) // leaves[0].size for group in groups]
     row_groups: list[Struct] = []
     for count, group in zip(rows, groups, strict=True):
         chunks = [_column_chunk(column, pages) for column, pages in zip(columns, group, strict=True)]

@@ -98,7 +98,7 @@ def _encoded(kind: int, value: Any) -> bytes:  # noqa: ANN401 - any thrift value
     if kind == DOUBLE:
         return struct.pack("<d", value)
     if kind == BINARY:
-        return _unsigned(len(value)) + value
+        return _unsigned(len(value)) + bytes(value)
     if kind in (LIST, SET):
         element, values = value
         header = bytes([len(values) << 4 | element]) if len(values) < 15 else bytes([15 << 4 | element])

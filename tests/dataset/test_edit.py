@@ -69,7 +69,7 @@ def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int
         for uid in (*range(0, 52, 2), *range(1, 19, 2)):
             open_writer.add(fake_episode(uid, 3))
     whole = Dataset.open(tmp_path / "set")
-    assert np.mean(whole.metadata["success"]) == pytest.approx(9 / 35)
+    assert whole.metadata["success"].count(True) == 9
     made = Dataset.open(subset(whole, episodes=count, stratify="success", out=tmp_path / "part"))
     assert abs(sum(map(bool, made.metadata["success"])) - count * 9 / 35) <= 1
     for fewer in range(1, count, 9):

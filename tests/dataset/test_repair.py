@@ -187,7 +187,7 @@ def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) 
     with pytest.raises(BadInputError, match="exists already"):
         repair(root, out=root)
     (root / DATA).write_bytes(b"PAR1 rubbish" * 50)
-    with pytest.raises(CorruptDatasetError, match="not one whole episode; .*no whole row group"):
+    with pytest.raises(CorruptDatasetError, match=r"not one whole episode; .*no whole row group"):
         repair(root, out=tmp_path / "saved")
     (root / "meta/info.json").write_text('{"fps": 20, "features": {}}')
     with pytest.raises(CorruptDatasetError, match="lacks the columns episode_index, frame_index"):
