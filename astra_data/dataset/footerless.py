@@ -183,7 +183,7 @@ def _column_chunk(column: Struct, pages: Sequence[_Page]) -> Struct:
         1: column[1],
         2: (LIST, (I32, sorted({page.encoding for page in pages}))),
         3: column[3],
-        4: (I32, _ZSTD if pages[0].is_zstd else _SNAPPY),
+        4: (I32, _ZSTD if any(page.is_zstd for page in pages) else _SNAPPY),
         5: (I64, _values(pages)),
         6: (I64, sum(page.unpacked for page in pages)),
         7: (I64, pages[-1].end - pages[0].start),
