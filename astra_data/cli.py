@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands import checking, editing, exporting
+from astra_data.commands import checking, comparing, editing, exporting
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -202,6 +202,7 @@ def _resumable() -> Iterator[None]:
 
 app.add_typer(editing.app)
 app.add_typer(checking.app)
+app.add_typer(comparing.app)
 app.add_typer(exporting.app)
 
 
