@@ -5,7 +5,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from astra_data.columns import Array, Column
@@ -20,7 +19,7 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
     TASKS_PATH,
 )
-from astra_data.dataset.parquet import first_line, read_blocks, to_numpy
+from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
 from astra_data.dataset.plain import (
     PlainColumn,
     data_files,
@@ -117,7 +116,7 @@ def _files_are_readable(
             try:
                 with pq.ParquetFile(path) as file:
                     schema = file.schema_arrow
-            except (OSError, pa.ArrowException) as error:
+            except UNREADABLE as error:
                 report.fault("files", f"{name} is truncated or no parquet file ({first_line(error)})")
                 continue
             if kind == "data":

@@ -102,27 +102,30 @@ def _pages(path: Path) -> list[_Page]:
         if file.read(4) != b"PAR1":
             return pages
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as data:
-            reader = Reader(data, 4)
-            while reader.position < len(data):
-                start = reader.position
-                try:
-                    header = reader.struct()
-                    kind, unpacked, packed = (header[field][1] for field in (1, 2, 3))
-                    details = header[_DETAILS[kind]][1]
-                    values, encoding = details[1][1], details[_ENCODING[kind]][1]
-                except (IndexError, KeyError, TypeError, ValueError):
-                    break
-                body = reader.position
-                reader.position += packed
-                if packed < 0 or reader.position > len(data):
-                    break
-                size = unpacked + body - start
-                # In pages of the second kind, levels come first, and are not compressed.
-                levels = sum(details[field][1] for field in (5, 6)) if kind == _DATA_V2 else 0
-                is_zstd = data[body + levels : body + levels + 4] == _ZSTD_MAGIC
-                pages.append(_Page(start, reader.position, size, kind, values, encoding, is_zstd))
-            del reader
+            end = 4
+            while page := _page(data, end):
+                pages.append(page)
+                end = page.end
     return pages
+
+
+def _page(data: memoryview, start: int) -> _Page | None:
+    """Read the header at `start`; None if there is none, or its page is not whole."""
+    reader = Reader(data, start)
+    try:
+        header = reader.struct()
+        kind, unpacked, packed = (header[field][1] for field in (1, 2, 3))
+        details = header[_DETAILS[kind]][1]
+        values, encoding = details[1][1], details[_ENCODING[kind]][1]
+        # In pages of the second kind, levels come first, and are not compressed.
+        levels = sum(details[field][1] for field in (5, 6)) if kind == _DATA_V2 else 0
+        body, end = reader.position + levels, reader.position + packed
+        if min(unpacked, packed, values, encoding, levels) < 0 or end > len(data):
+            return None
+    except (IndexError, KeyError, TypeError, ValueError):
+        return None
+    size = unpacked + reader.position - start
+    return _Page(start, end, size, kind, values, encoding, data[body : body + 4] == _ZSTD_MAGIC)
 
 
 def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> list[list[_Page]] | None:

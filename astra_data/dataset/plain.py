@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from astra_data import columns as names
 from astra_data.columns import Array
-from astra_data.dataset.parquet import first_line, read_blocks, to_numpy
+from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
 from astra_data.errors import CorruptDatasetError
 
 TIMESTAMP_TOLERANCE_S = 1e-4
@@ -88,7 +88,7 @@ def read_small_table(path: Path) -> pa.Table | str:
         return pq.read_table(path)
     except FileNotFoundError:
         return "is missing"
-    except (OSError, pa.ArrowException) as error:
+    except UNREADABLE as error:
         return f"cannot be read ({first_line(error)})"
 
 
@@ -110,7 +110,11 @@ def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
     """
     for path in episodes_files(root):
         for block in read_blocks([path]):
-            yield from block.to_pylist()
+            try:
+                rows = block.to_pylist()
+            except ValueError as error:
+                raise CorruptDatasetError(f"{path.name} cannot be read ({first_line(error)})") from error
+            yield from rows
 
 
 def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:

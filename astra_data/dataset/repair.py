@@ -13,8 +13,15 @@ import pyarrow.parquet as pq
 from astra_data import columns as names
 from astra_data.columns import Column, Episode, Scalar
 from astra_data.dataset.footerless import rebuilt_metadata
-from astra_data.dataset.format import DATASET_PATH, DEFAULT_COLUMNS, INFO_PATH, METADATA_PATH, TASKS_PATH
-from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.format import (
+    DATASET_PATH,
+    DEFAULT_COLUMNS,
+    INFO_PATH,
+    METADATA_PATH,
+    SUBSETS_PATH,
+    TASKS_PATH,
+)
+from astra_data.dataset.parquet import UNREADABLE, read_blocks
 from astra_data.dataset.plain import (
     PlainColumn,
     Run,
@@ -77,17 +84,17 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
     metadata = _metadata(folder, result.notes) if like is None else _facts(like.uids.tolist(), like.metadata)
     description = _description(folder, like)
     unknown = 0
-    with DatasetWriter(
-        out, specs, fps=fps, task=" / ".join(tasks) or "unknown", description=description
-    ) as writer:
+    task = " / ".join(tasks) or "unknown"
+    seed = _subset_seed(folder if like is None else like.root)
+    with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
         for episode, run in enumerate(_whole_runs(folder, info, columns, fps, result.notes)):
             values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
             uid = int(run.columns[names.EPISODE_UID][0]) if names.EPISODE_UID in run.columns else episode
             unknown += uid not in metadata
             facts = dict(metadata.get(uid, {}))
             if len(tasks) > 1:
-                task = int(run.columns[names.TASK_INDEX][0])
-                facts["task"] = tasks[task] if 0 <= task < len(tasks) else "unknown"
+                index = int(run.columns[names.TASK_INDEX][0])
+                facts["task"] = tasks[index] if 0 <= index < len(tasks) else "unknown"
             writer.add(Episode(uid, values, facts))
             result.episodes += 1
             result.frames += len(run)
@@ -190,6 +197,12 @@ def _description(folder: Path, like: Dataset | None) -> dict[str, Any]:
     return {**kept, **changed, "stage": "repair", "config": config}
 
 
+def _subset_seed(folder: Path) -> int:
+    subsets = read_object(folder / SUBSETS_PATH)
+    seed = 0 if isinstance(subsets, str) else subsets.get("seed")
+    return seed if isinstance(seed, int) else 0
+
+
 def _whole_runs(
     folder: Path, info: Mapping[str, Any], columns: Sequence[PlainColumn], fps: int, notes: list[str]
 ) -> Iterator[Run]:
@@ -238,29 +251,42 @@ def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
 def _file_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str]) -> Iterator[Run]:
     wanted = [column.name for column in columns]
     try:
-        with pq.ParquetFile(path):
-            pass
-    except (OSError, pa.ArrowException):
+        with pq.ParquetFile(path) as file:
+            file.schema_arrow  # noqa: B018 - raises where names are no text
+    except UNREADABLE:
         pass
     else:
         yield from runs(path, read_blocks([path], wanted), columns)
         return
     schema = pa.schema([(column.name, column.arrow_type) for column in columns])
     metadata = rebuilt_metadata(path, schema)
-    groups = metadata.num_row_groups
-    notes.append(f"{path.parent.name}/{path.name} has no footer: {groups} whole row groups were found in it")
-    last = metadata.row_group(groups - 1).num_rows
+    rows: list[int] = []
     held: Run | None = None
-    with pq.ParquetFile(path, metadata=metadata) as file:
-        tables = (file.read_row_group(group, columns=wanted) for group in range(groups))
-        for run in runs(path, tables, columns):
-            if held is not None:
-                yield held
-            held = run
+    for run in runs(path, _row_groups(path, metadata, wanted, rows), columns):
+        if held is not None:
+            yield held
+        held = run
+    notes.append(
+        f"{path.parent.name}/{path.name} has no footer: {len(rows)} whole row groups were found in it"
+    )
     # LeRobot writes one row group per episode. Where groups are cut otherwise, the last one may be.
-    if held is not None and len(held) == last:
+    if held is not None and len(held) == rows[-1]:
         yield held
     elif held is not None:
         notes.append(
             f"the last {len(held)} frames in {path.name} may be part of an episode and were left out"
         )
+
+
+def _row_groups(
+    path: Path, metadata: pq.FileMetaData, wanted: Sequence[str], rows: list[int]
+) -> Iterator[pa.Table]:
+    """Yield row groups up to the first that cannot be read, and append their numbers of rows to `rows`."""
+    with pq.ParquetFile(path, metadata=metadata) as file:
+        for group in range(metadata.num_row_groups):
+            try:
+                table = file.read_row_group(group, columns=wanted, use_threads=False)
+            except UNREADABLE:
+                return
+            rows.append(table.num_rows)
+            yield table

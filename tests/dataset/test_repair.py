@@ -1,4 +1,5 @@
 import os
+import random
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.check import check
 from astra_data.dataset.footerless import rebuilt_metadata
 from astra_data.dataset.repair import repair
-from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -180,6 +181,52 @@ def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
     assert joined.description["environment"] == {"id": "Fake-v0"}
     assert joined.description["parents"] == [original.identity]
     assert joined.reference == "fake@data-1.1.0"
+
+
+def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set", subset_seed=7).root
+    table = pq.read_table(root / DATA)
+    at = table.column_names.index("action")
+    lists = table.column("action").to_pylist()
+    pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
+    shutil.rmtree(root / "meta/astra")
+    assert check(root).faults == []
+    repair(root, out=tmp_path / "saved")
+    assert Dataset.open(tmp_path / "saved").content_hash == write_fake(tmp_path / "again").content_hash
+    lists[9] = [1.0, 2.0, 3.0]
+    lists[10] = [1.0]
+    pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
+    assert check(root).faults == ["action: expected 2 values in every row"]
+
+
+def test_the_order_of_nested_subsets_is_kept(tmp_path: Path) -> None:
+    whole = write_fake(tmp_path / "set", subset_seed=7)
+    repair(whole.root, out=tmp_path / "saved")
+    assert Dataset.open(tmp_path / "saved").order == whole.order
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_damage_never_ends_in_a_traceback(killed: Path, tmp_path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    root = tmp_path / "set"
+    if seed % 2:
+        write_fake(root)
+    else:
+        shutil.copytree(killed / rng.choice(["whole", "saved", "resumed"]), root)
+    path = rng.choice(sorted(path for path in root.rglob("*") if path.is_file()))
+    content = bytearray(path.read_bytes())
+    if seed % 3 == 0:
+        del content[rng.randrange(len(content)) :]
+    for _ in range(min(len(content), rng.choice([1, 20]))):
+        content[rng.randrange(len(content))] = rng.randrange(256)
+    path.write_bytes(content)
+    check(root)
+    try:
+        repair(root, out=tmp_path / "saved")
+    except AstraDataError:
+        assert not (tmp_path / "saved").exists()
+    else:
+        assert check(tmp_path / "saved").faults == []
 
 
 def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) -> None:
