@@ -88,3 +88,11 @@ def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> No
     with pytest.raises(BadInputError) as caught:
         Episode(0, columns)
     assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change", [{"astra": {"unit": 5}}, {"names": 3}, {"shape": []}, {"astra": "m"}, {"shape": "x"}]
+)
+def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
+    with pytest.raises(BadInputError, match="Column 'x'"):
+        Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)

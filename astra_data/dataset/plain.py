@@ -85,7 +85,9 @@ def read_object(path: Path) -> dict[str, Any] | str:
 def read_small_table(path: Path) -> pa.Table | str:
     """Return the parquet file at `path`, or what is wrong with it."""
     try:
-        return pq.read_table(path)
+        table = pq.read_table(path)
+        table.validate(full=True)
+        return table.select(table.column_names)  # raises where names are no text
     except FileNotFoundError:
         return "is missing"
     except UNREADABLE as error:
