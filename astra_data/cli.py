@@ -5,12 +5,23 @@ There imports stand inside functions, so that `astra-data --help` answers at onc
 
 import os
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Annotated
 
 import typer
 
-from astra_data.commands import augmenting, building, inspecting, recipes, sharing
+from astra_data.commands import (
+    augmenting,
+    building,
+    checking,
+    comparing,
+    editing,
+    exporting,
+    inspecting,
+    recipes,
+    sharing,
+)
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -37,23 +48,39 @@ def _options(
     """Options before any command."""
 
 
-for command in (
-    recipes.run,
-    recipes.check,
-    building.collect,
-    augmenting.augment,
-    building.pair,
-    inspecting.inspect,
-    recipes.ground,
-    recipes.train,
-    recipes.align,
-    recipes.evaluate,
-    recipes.report,
-    sharing.card,
-    sharing.push,
-    sharing.pull,
-):
-    app.command()(command)
+PANELS: dict[str, dict[str, Callable[..., None]]] = {
+    "Recipes": {
+        "run": recipes.run,
+        "check": recipes.check,
+        "ground": recipes.ground,
+        "train": recipes.train,
+        "align": recipes.align,
+        "evaluate": recipes.evaluate,
+        "report": recipes.report,
+    },
+    "Recipes or datasets": {"collect": building.collect, "pair": building.pair},
+    "Datasets": {
+        "augment": augmenting.augment,
+        "subset": editing.subset,
+        "merge": editing.merge,
+        "delete": editing.delete,
+        "filter": editing.filter_,
+        "inspect": inspecting.inspect,
+        "validate": checking.validate,
+        "repair": checking.repair,
+        "log": comparing.log,
+        "diff": comparing.diff,
+    },
+    "Exchange": {
+        "export": exporting.export,
+        "card": sharing.card,
+        "push": sharing.push,
+        "pull": sharing.pull,
+    },
+}
+for panel, commands in PANELS.items():
+    for name, command in commands.items():
+        app.command(name, rich_help_panel=panel)(command)
 
 
 def main() -> None:

@@ -171,18 +171,25 @@ class Column:
 
     @classmethod
     def from_feature(cls, name: str, feature: Mapping[str, Any]) -> "Column":
-        """Rebuild a column from its entry in LeRobot's `features`."""
-        astra = dict(feature.get("astra") or {})
-        meaning = astra.pop("meaning", "")
-        names = feature.get("names")
-        return cls(
-            name=name,
-            dtype=feature["dtype"],
-            size=feature["shape"][0],
-            names=None if names is None else tuple(names),
-            meaning=meaning,
-            astra=astra or None,
-        )
+        """Rebuild a column from its entry in LeRobot's `features`.
+
+        Raises:
+            BadInputError: the entry is not what was expected.
+        """
+        try:
+            astra = dict(feature.get("astra") or {})
+            meaning = astra.pop("meaning", "")
+            names = feature.get("names")
+            return cls(
+                name=name,
+                dtype=feature["dtype"],
+                size=feature["shape"][0],
+                names=None if names is None else tuple(names),
+                meaning=meaning,
+                astra=astra or None,
+            )
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise BadInputError(f"Column {name!r}: {feature!r} is no entry of features ({error}).") from error
 
     def faults(self, values: Array) -> list[str]:
         """List how the dtype and shape of `values` differ from what the column expects; empty if they fit."""

@@ -113,3 +113,11 @@ def test_a_mirror_image_is_a_swap_with_signs() -> None:
     assert told.mirror == ([0, 2, 1], [1, -1, -1])
     assert Column("pose", size=3, astra={"role": role}).mirror is None
     assert Column("pose", size=3, astra={"role": ["heading"] * 3}).mirror == ([0, 1, 2], [1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    "change", [{"astra": {"unit": 5}}, {"names": 3}, {"shape": []}, {"astra": "m"}, {"shape": "x"}]
+)
+def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
+    with pytest.raises(BadInputError, match="Column 'x'"):
+        Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)

@@ -1,4 +1,4 @@
-"""Folders that appear finished or not at all."""
+"""Folders and files that appear finished or not at all."""
 
 import os
 import shutil
@@ -34,6 +34,28 @@ def atomic_folder(target: Path) -> Iterator[Path]:
             publish(folder, target)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def atomic_file(target: Path) -> Iterator[Path]:
+    """Yield the path of a hidden file beside `target`, which is renamed to `target` when the block ends.
+
+    After an exception it is removed; after a kill it stays, hidden.
+
+    Raises:
+        BadInputError: `target` exists.
+    """
+    _refuse(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    path = target.with_name(f".{target.name}.tmp-{os.getpid()}")
+    try:
+        yield path
+        sync(path)
+        _refuse(target)
+        os.replace(path, target)
+        sync(target.parent)
+    finally:
+        path.unlink(missing_ok=True)
 
 
 def publish(folder: Path, target: Path) -> None:

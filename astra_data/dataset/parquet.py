@@ -13,6 +13,8 @@ from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_M
 from astra_data.errors import CorruptDatasetError
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
+UNREADABLE = (OSError, ValueError, pa.ArrowException)
+"""What pyarrow raises for damaged files; a ValueError where names are no text."""
 BLOCK_ROWS = 2**16
 """Rows that are read at once, rounded up to whole row groups."""
 
@@ -78,7 +80,7 @@ def read_blocks(
                         table = file.read_row_groups(groups, columns=names, use_threads=False)
                         yield table if all(mask.all() for mask in masks) else table.filter(np.hstack(masks))
                         groups, masks, rows = [], [], 0
-        except (OSError, pa.ArrowException) as error:
+        except UNREADABLE as error:
             name = f"{path.parent.name}/{path.name}"
             raise CorruptDatasetError(f"{name} cannot be read ({first_line(error)})") from error
 

@@ -17,8 +17,8 @@ import pyarrow as pa
 
 from astra_data.columns import Column, Episode, Scalar
 from astra_data.dataset import format as layout
+from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import sync
-from astra_data.dataset.episode_checks import EpisodeChecks
 from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError, CorruptDatasetError
@@ -85,7 +85,7 @@ class StagedWriter:
         }
         self._resume = resume
         self._fsync = fsync
-        self._checks = EpisodeChecks(columns)
+        self._admission = Admission(columns)
         self._exit = ExitStack()
 
     def __enter__(self) -> "StagedWriter":
@@ -109,7 +109,7 @@ class StagedWriter:
             self._agree_on_the_plan()
             for path in sorted(self._folder.glob("*.arrow")):
                 episode = self._load(path)
-                self._checks.accept(episode)
+                self._admission.admit(episode)
                 self.staged[int(path.stem)] = episode.metadata
             self._exit = stack.pop_all()
         return self
@@ -142,7 +142,7 @@ class StagedWriter:
         place = max(self.staged, default=-1) + 1 if position is None else position
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
-        self._checks.accept(episode)
+        self._admission.admit(episode)
         told = json.dumps({"uid": episode.uid, "metadata": dict(episode.metadata)})
         schema = self._schema.with_metadata({"episode": told})
         arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]

@@ -4,14 +4,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from astra_data import columns as names
 from astra_data.columns import Array, Column
 from astra_data.dataset.format import arrow_type
-from astra_data.dataset.parquet import first_line, read_blocks, to_numpy
+from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
 from astra_data.dataset.provenance import ContentHash
 
 Ints = NDArray[np.int64]
@@ -35,7 +34,7 @@ def file_faults(root: Path, columns: Sequence[Column], rows: dict[Path, int]) ->
         except FileNotFoundError:
             yield f"{name} is missing"
             continue
-        except (OSError, pa.ArrowException) as error:
+        except UNREADABLE as error:
             yield f"{name} is truncated or no parquet file ({first_line(error)})"
             continue
         if found != expected:

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 from astra_data import columns as names
 from astra_data.columns import Array, Column, Episode, Scalar
 from astra_data.dataset import format as layout
+from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import atomic_folder
-from astra_data.dataset.episode_checks import EpisodeChecks
 from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
 from astra_data.dataset.provenance import ContentHash, complete_description, permutation
@@ -89,7 +89,7 @@ class DatasetWriter:
         self._frames = 0
         self._lengths: dict[int, int] = {}
         self._metadata: list[Mapping[str, Scalar]] = []
-        self._checks = EpisodeChecks(columns)
+        self._admission = Admission(columns)
         self._exit = ExitStack()
 
     def __enter__(self) -> "DatasetWriter":
@@ -111,7 +111,7 @@ class DatasetWriter:
 
     def add(self, episode: Episode) -> None:
         """Append `episode`; one that is refused leaves the dataset as it was."""
-        self._checks.accept(episode)
+        self._admission.admit(episode)
         length = len(episode)
         frames = np.arange(length)
         values = {name: episode.columns[name] for name in self._columns} | {
@@ -152,7 +152,7 @@ class DatasetWriter:
         self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
         metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}
-        for key, kind_ in sorted(self._checks.metadata_types.items()):
+        for key, kind_ in sorted(self._admission.metadata_types.items()):
             metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
         faults = Dataset.open(self._folder).verify()

@@ -11,7 +11,6 @@ import numpy as np
 from astra_data.columns import RESERVED, SUCCESS, Column
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
-from astra_data.dataset.parquet import read_blocks
 from astra_data.errors import BadInputError
 from astra_data.figures.coverage import coverage
 from astra_data.figures.style import png
@@ -98,15 +97,9 @@ def render_card(
 
 
 def _opening(dataset: Dataset) -> str:
-    tasks = [
-        task
-        for table in read_blocks([dataset.root / layout.TASKS_PATH], ["task"])
-        for task in table.column("task").to_pylist()
-    ]
-    told = "; ".join(f"“{task}”" for task in tasks)
     return (
         f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
-        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. Task: {told}. "
+        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. Task: “{dataset.task}”. "
         f"The format is LeRobot {layout.CODEBASE_VERSION}."
     )
 

@@ -7,7 +7,7 @@ from astra_data.dataset.format import METADATA_KEYS
 from astra_data.errors import BadInputError
 
 
-class EpisodeChecks:
+class Admission:
     """Checks one episode after another against the dataset's columns and against the earlier ones.
 
     Attributes:
@@ -19,7 +19,7 @@ class EpisodeChecks:
         self._uids: set[int] = set()
         self.metadata_types: dict[str, type] = {}
 
-    def accept(self, episode: Episode) -> None:
+    def admit(self, episode: Episode) -> None:
         """Remember `episode`, or refuse it.
 
         Raises:

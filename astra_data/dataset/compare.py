@@ -1,0 +1,87 @@
+"""What differs between two datasets: columns, episodes, origin."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from astra_data.columns import Column
+from astra_data.dataset.reader import Dataset
+
+_DESCRIBED = ("name", "version", "stage", "config", "seeds", "environment", "simulator", "parents")
+
+
+@dataclass(frozen=True)
+class Differences:
+    """How a dataset B differs from a dataset A.
+
+    Attributes:
+        schema: one sentence per difference in columns, fps and task.
+        only_in_a: uids of episodes that B lacks, ascending.
+        only_in_b: uids of episodes that A lacks, ascending.
+        changed: uids of episodes of both whose values or metadata differ, ascending.
+        description: one sentence per difference in origin, such as "config.noise_m: 0.1, then 0.2".
+    """
+
+    schema: list[str]
+    only_in_a: list[int]
+    only_in_b: list[int]
+    changed: list[int]
+    description: list[str]
+
+
+def differences(a: Dataset, b: Dataset) -> Differences:
+    """Compare two datasets; episodes are compared in the columns that both have."""
+    shared = sorted({column.name for column in a.schema} & {column.name for column in b.schema})
+    prints_a, prints_b = _fingerprints(a, shared), _fingerprints(b, shared)
+    both = prints_a.keys() & prints_b.keys()
+    return Differences(
+        schema=schema_differences(a, b),
+        only_in_a=sorted(prints_a.keys() - both),
+        only_in_b=sorted(prints_b.keys() - both),
+        changed=sorted(uid for uid in both if prints_a[uid] != prints_b[uid]),
+        description=list(_value_differences(_described(a), _described(b))),
+    )
+
+
+def schema_differences(a: Dataset, b: Dataset) -> list[str]:
+    """List how the columns, the fps and the task of `b` differ from those of `a`; the order is no matter."""
+    ours, theirs = ({column.name: column for column in dataset.schema} for dataset in (a, b))
+    told = [f"column {name}: only in {a.reference}" for name in ours if name not in theirs]
+    told += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
+    for name in (name for name in ours if name in theirs):
+        told += _value_differences(_facts(ours[name]), _facts(theirs[name]), f"column {name}: ")
+    told += _value_differences({"fps": a.info["fps"], "task": a.task}, {"fps": b.info["fps"], "task": b.task})
+    return told
+
+
+def _facts(column: Column) -> dict[str, Any]:
+    return {**vars(column), "astra": column.astra or {}}
+
+
+def _described(dataset: Dataset) -> dict[str, Any]:
+    return {key: dataset.description[key] for key in _DESCRIBED}
+
+
+def _value_differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key in [*a, *(key for key in b if key not in a)]:
+        before, after = a.get(key), b.get(key)
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            yield from _value_differences(before, after, f"{prefix}{key}.")
+        elif before != after:
+            yield f"{prefix}{key}: {_told(before)}, then {_told(after)}"
+
+
+def _told(value: object) -> str:
+    return "nothing" if value is None else repr(value)
+
+
+def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, bytes]:
+    prints = {}
+    for episode in dataset.episodes(names or None):
+        print_ = hashlib.sha256(repr(sorted(episode.metadata.items())).encode())
+        for name in names:
+            values = episode.columns[name]
+            print_.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
+        prints[episode.uid] = print_.digest()
+    return prints

@@ -1,0 +1,259 @@
+"""New versions of a dataset with other episodes: a subset, several merged, some deleted, some kept.
+
+Nothing is edited in place; every function streams the episodes that stay into a new dataset and returns its
+folder. Only `out` says where; without it the new version goes to its place at home.
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from astra_data.columns import Scalar
+from astra_data.dataset.compare import schema_differences
+from astra_data.dataset.provenance import permutation
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import successor
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.errors import BadInputError
+from astra_data.recipe import did_you_mean
+
+MOST_UIDS = 8
+"""Uids that a message lists."""
+
+
+def subset(
+    source: Dataset,
+    *,
+    episodes: int | None = None,
+    percent: int | None = None,
+    of: int | None = None,
+    seed: int | None = None,
+    stratify: str | None = None,
+    out: Path | None = None,
+) -> Path:
+    """Write a random subset; with one seed, smaller ones lie inside larger ones, also through several steps.
+
+    Args:
+        source: the dataset.
+        episodes: how many; or
+        percent: how many per cent of `of` episodes, which may be more than 100.
+        of: what 100 per cent are, by default all episodes of `source`.
+        seed: of the permutation whose first episodes are taken, by default the one stored in `source`.
+        stratify: a key of the episodes' metadata; each of its values keeps its share.
+        out: folder of the new dataset.
+
+    Raises:
+        BadInputError: not exactly one of `episodes` and `percent`, or more episodes than there are.
+    """
+    if (episodes is None) == (percent is None) or (of is not None and percent is None):
+        raise BadInputError("a subset takes either a number of episodes, or a percentage (and of how many)")
+    count = episodes if percent is None else (percent * (of or len(source)) + 50) // 100
+    assert count is not None
+    if not 1 <= count <= len(source):
+        asked = f"{count} episodes" if percent is None else f"{percent} % of {of or len(source)} = {count}"
+        raise BadInputError(
+            f"{source.reference} has {len(source)} episodes, a subset of {asked} was asked for: expected 1 "
+            f"to {len(source)}. Episodes are never repeated: collect or augment more, or name a smaller --of."
+        )
+    chosen = source.subset_seed if seed is None else seed
+    strata = _strata(source, stratify, chosen) if stratify else {}
+    order = _stratified(source, stratify, strata, chosen) if stratify else permutation(_uids(source), chosen)
+    config = {"episodes": count, "percent": percent, "of": of, "seed": chosen} | (
+        {"stratify": stratify, "strata": strata} if stratify else {}
+    )
+    return _write(source, set(order[:count]), stage="subset", config=config, out=out, seed=chosen)
+
+
+def delete(source: Dataset, uids: Sequence[int], *, out: Path | None = None) -> Path:
+    """Write `source` without the episodes `uids`.
+
+    Raises:
+        BadInputError: one of them is not in `source`, or none would be left.
+    """
+    known = set(_uids(source))
+    unknown = sorted(set(uids) - known)
+    if unknown or not uids:
+        raise BadInputError(
+            f"{source.reference} has no episode {_listed(unknown) or '(none was named)'}; its {len(source)} "
+            f"uids lie between {min(known)} and {max(known)}: {_listed(sorted(known))}"
+        )
+    config = {"episodes": sorted(set(uids))}
+    return _write(source, known - set(uids), stage="delete", config=config, out=out)
+
+
+def filter_episodes(
+    source: Dataset,
+    *,
+    success: bool | None = None,
+    min_return: float | None = None,
+    max_return: float | None = None,
+    min_length: int | None = None,
+    max_length: int | None = None,
+    out: Path | None = None,
+) -> Path:
+    """Write the episodes of `source` that meet every given condition; both bounds belong to a range.
+
+    Success and return are those of the episodes' metadata; an episode without them does not meet a
+    condition on them.
+
+    Raises:
+        BadInputError: no condition is given, no episode has such metadata, or none meets the conditions.
+    """
+    ranges: dict[str, tuple[float | None, float | None]] = {
+        "success": (success, success),
+        "return": (min_return, max_return),
+        "length": (min_length, max_length),
+    }
+    ranges = {key: bounds for key, bounds in ranges.items() if bounds != (None, None)}
+    if not ranges:
+        raise BadInputError("a filter needs a condition: on success, return or length")
+    met = [
+        {
+            uid
+            for uid, value in zip(_uids(source), _facts(source, key), strict=True)
+            if isinstance(value, int | float)
+            and (low is None or value >= low)
+            and (high is None or value <= high)
+        }
+        for key, (low, high) in ranges.items()
+    ]
+    config = {
+        "success": success,
+        "min_return": min_return,
+        "max_return": max_return,
+        "min_length": min_length,
+        "max_length": max_length,
+    }
+    config = {key: value for key, value in config.items() if value is not None}
+    return _write(source, set.intersection(*met), stage="filter", config=config, out=out)
+
+
+def merge(sources: Sequence[Dataset], *, new_uids: bool = False, out: Path | None = None) -> Path:
+    """Write the episodes of all `sources` one after another; the first gives name, version and seeds.
+
+    Args:
+        sources: two datasets at least, with equal columns, fps and task.
+        new_uids: whether an episode whose uid an earlier one has gets a new one, the same in every run;
+            its old one is kept as "source_episode". Otherwise that is refused.
+        out: folder of the new dataset.
+
+    Raises:
+        BadInputError: the datasets do not fit together; lists every difference.
+    """
+    if len(sources) < 2:
+        raise BadInputError("expected two datasets or more to merge")
+    first, *others = sources
+    faults = [fault for other in others for fault in schema_differences(first, other)]
+    if faults:
+        raise BadInputError("the datasets do not fit together:\n  " + "\n  ".join(faults))
+    names = list(_merged_uids(sources, new_uids))
+    config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
+    description, folder = successor(
+        first, "episodes", stage="merge", config=config, out=out, parents=tuple(others)
+    )
+    with _writer(first, folder, description, first.subset_seed) as writer:
+        episodes = (episode for source in sources for episode in source.episodes())
+        for uid, episode in zip(names, episodes, strict=True):
+            origin = {} if uid == episode.uid else {"source_episode": episode.uid}
+            writer.add(replace(episode, uid=uid, metadata=origin | dict(episode.metadata)))
+    return folder
+
+
+def _write(
+    source: Dataset,
+    kept: set[int],
+    *,
+    stage: str,
+    config: Mapping[str, Any],
+    out: Path | None,
+    seed: int | None = None,
+) -> Path:
+    if not kept:
+        raise BadInputError(f"{source.reference}: no episode would be left of its {len(source)}")
+    description, folder = successor(source, "episodes", stage=stage, config=config, out=out)
+    with _writer(source, folder, description, source.subset_seed if seed is None else seed) as writer:
+        for episode in source.episodes():
+            if episode.uid in kept:
+                writer.add(episode)
+    return folder
+
+
+def _writer(source: Dataset, folder: Path, description: Mapping[str, Any], seed: int) -> DatasetWriter:
+    return DatasetWriter(
+        folder,
+        source.schema,
+        fps=source.info["fps"],
+        task=source.task,
+        description=description,
+        subset_seed=seed,
+    )
+
+
+def _uids(source: Dataset) -> list[int]:
+    uids: list[int] = source.uids.tolist()
+    return uids
+
+
+def _facts(source: Dataset, key: str) -> list[Scalar | None]:
+    if key == "length":
+        lengths: list[Scalar | None] = source.lengths.tolist()
+        return lengths
+    if key not in source.metadata:
+        known = ["length", *source.metadata]
+        raise BadInputError(f"the episodes of {source.reference} have no {key!r}{did_you_mean(key, known)}")
+    return source.metadata[key]
+
+
+def _strata(source: Dataset, key: str, seed: int) -> dict[str, int]:
+    """Count the episodes per value of `key`.
+
+    A subset that was stratified in the same way hands its own counts on: with the rounded shares of the
+    subset instead, a subset of it would not be the prefix that a subset of the whole is.
+    """
+    config = source.description["config"]
+    if (config.get("stratify"), config.get("seed")) == (key, seed):
+        return dict(config["strata"])
+    values = [str(value) for value in _facts(source, key)]
+    return {value: values.count(value) for value in sorted(set(values))}
+
+
+def _stratified(source: Dataset, key: str, strata: Mapping[str, int], seed: int) -> list[int]:
+    """Order the uids so that every prefix has its share of each stratum, in the permutation's order."""
+    stratum = dict(zip(_uids(source), map(str, _facts(source, key)), strict=True))
+    ranks = dict.fromkeys(strata, 0)
+    place = {}
+    for uid in permutation(_uids(source), seed):
+        place[uid] = (ranks[stratum[uid]] + 0.5) / strata[stratum[uid]]
+        ranks[stratum[uid]] += 1
+    return sorted(place, key=lambda uid: place[uid])
+
+
+def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> Iterator[int]:
+    everything = [(source, uid) for source in sources for uid in _uids(source)]
+    known = {uid for _, uid in everything}
+    repeated: list[int] = []
+    taken: set[int] = set()
+    names = []
+    for source, uid in everything:
+        name = uid
+        if uid in taken:
+            repeated.append(uid)
+            while name in known:
+                digest = hashlib.sha256(f"{source.content_hash} {name}".encode()).digest()
+                name = int.from_bytes(digest[:8]) >> 1
+            known.add(name)
+        taken.add(name)
+        names.append(name)
+    if repeated and not new_uids:
+        raise BadInputError(
+            f"{len(repeated)} episodes have the uid of an earlier one ({_listed(sorted(repeated))}): leave "
+            "them out, or give them new ones with --new-uids"
+        )
+    yield from names
+
+
+def _listed(uids: Sequence[int]) -> str:
+    more = f" and {len(uids) - MOST_UIDS} more" if len(uids) > MOST_UIDS else ""
+    return ", ".join(map(str, uids[:MOST_UIDS])) + more

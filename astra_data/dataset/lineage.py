@@ -1,0 +1,97 @@
+"""Where a dataset comes from: its parents, theirs, and so on."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.plain import read_object
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import place
+
+
+@dataclass(frozen=True)
+class Ancestor:
+    """A dataset in the tree.
+
+    Attributes:
+        reference: name and version.
+        content_hash: its hash.
+        stage: what made it, "" where its folder was not found.
+        config: how, empty where its folder was not found.
+        parents: what it was made of.
+        folder: where it lies; None where it was not found.
+    """
+
+    reference: str
+    content_hash: str
+    stage: str
+    config: Mapping[str, Any]
+    parents: tuple["Ancestor", ...]
+    folder: Path | None
+
+
+def lineage(dataset: Dataset) -> Ancestor:
+    """Return `dataset` with all its ancestors, looked up at home and in the folders beside it.
+
+    An ancestor counts as found if its content hash is the one that its descendant names.
+    """
+    return _ancestor(dataset.identity, dataset.root, dataset.root.resolve().parent)
+
+
+def tree_lines(ancestor: Ancestor) -> Iterator[str]:
+    """Yield the tree, one dataset per line, each under what was made of it."""
+    yield _line(ancestor)
+    for number, parent in enumerate(ancestor.parents, 1):
+        is_last = number == len(ancestor.parents)
+        first, *rest = tree_lines(parent)
+        yield ("└── " if is_last else "├── ") + first
+        for line in rest:
+            yield ("    " if is_last else "│   ") + line
+
+
+def _ancestor(identity: Mapping[str, str], folder: Path | None, beside: Path) -> Ancestor:
+    description = read_object(folder / DATASET_PATH) if folder else {}
+    assert isinstance(description, dict)
+    parents = description.get("parents", [])
+    return Ancestor(
+        reference=f"{identity['name']}@data-{identity['version']}",
+        content_hash=identity["hash"],
+        stage=description.get("stage", ""),
+        config=description.get("config", {}),
+        parents=tuple(_ancestor(parent, _found(parent, beside), beside) for parent in parents),
+        folder=folder,
+    )
+
+
+def _found(identity: Mapping[str, str], beside: Path) -> Path | None:
+    neighbours = sorted(path.parents[2] for path in beside.glob(f"*/{DATASET_PATH}"))
+    for folder in (place(identity), *neighbours):
+        found = read_object(folder / DATASET_PATH)
+        if isinstance(found, str):
+            continue
+        # A dataset may hold the same values under another name or version.
+        if (found.get("name"), found.get("version"), found.get("content_hash")) == (
+            identity["name"],
+            identity["version"],
+            identity["hash"],
+        ):
+            return folder
+    return None
+
+
+def _line(ancestor: Ancestor) -> str:
+    if ancestor.folder is None:
+        return f"{ancestor.reference}  {ancestor.content_hash[:8]}  (not found here)"
+    settings = ", ".join(
+        f"{key} {_brief(value)}" for key, value in ancestor.config.items() if value is not None
+    )
+    return f"{ancestor.reference}  {ancestor.content_hash[:8]}  {ancestor.stage}" + (
+        f": {settings}" if settings else ""
+    )
+
+
+def _brief(value: object, limit: int = 40) -> str:
+    text = str(value)
+    return text if len(text) <= limit else f"{text[:limit]}…"

@@ -1,0 +1,190 @@
+"""A LeRobot dataset as it lies on disk: ours or another's, whole or not, read without believing it."""
+
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from astra_data import columns as names
+from astra_data.columns import Array
+from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
+from astra_data.errors import CorruptDatasetError
+
+TIMESTAMP_TOLERANCE_S = 1e-4
+"""As LeRobot's own."""
+
+
+@dataclass(frozen=True)
+class PlainColumn:
+    """A column of numbers: any numpy `dtype`, `size` values per step."""
+
+    name: str
+    dtype: str
+    size: int
+
+    @property
+    def arrow_type(self) -> pa.DataType:
+        """The type of one step: a scalar, or a list of fixed size."""
+        value = pa.from_numpy_dtype(np.dtype(self.dtype))
+        return value if self.size == 1 else pa.list_(value, self.size)
+
+    def fits(self, kind: pa.DataType) -> bool:
+        """Tell whether a file may store it as `kind`; LeRobot's merge writes lists without their size."""
+        return bool(
+            kind == self.arrow_type or (self.size > 1 and kind == pa.list_(self.arrow_type.value_type))
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """Consecutive rows of one file that are one episode, if all is well.
+
+    Attributes:
+        path: the file.
+        columns: name to (T,) or (T, size).
+    """
+
+    path: Path
+    columns: Mapping[str, Array]
+
+    def __len__(self) -> int:
+        """Return T."""
+        return len(self.columns[names.EPISODE_INDEX])
+
+
+def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[str]]:
+    """Return the columns of `features` that are rows of numbers, and the names of all others."""
+    columns, others = [], []
+    for name, feature in features.items():
+        try:
+            [size] = feature["shape"]
+            if np.dtype(feature["dtype"]).kind not in "fiub" or int(size) < 1:
+                raise TypeError
+            columns.append(PlainColumn(name, str(feature["dtype"]), int(size)))
+        except (KeyError, TypeError, ValueError):
+            others.append(name)
+    return columns, others
+
+
+def read_object(path: Path) -> dict[str, Any] | str:
+    """Return the JSON object in the file at `path`, or what is wrong with it."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return "is missing"
+    except (OSError, TypeError, ValueError) as error:
+        return f"is no JSON object ({error})"
+
+
+def read_small_table(path: Path) -> pa.Table | str:
+    """Return the parquet file at `path`, or what is wrong with it."""
+    try:
+        table = pq.read_table(path)
+        table.validate(full=True)
+        return table.select(table.column_names)  # raises where names are no text
+    except FileNotFoundError:
+        return "is missing"
+    except UNREADABLE as error:
+        return f"cannot be read ({first_line(error)})"
+
+
+def data_files(root: Path) -> list[Path]:
+    """Return the data files in order."""
+    return sorted((root / "data").glob("*/*.parquet"))
+
+
+def episodes_files(root: Path) -> list[Path]:
+    """Return the files of meta/episodes in order."""
+    return sorted((root / "meta/episodes").glob("*/*.parquet"))
+
+
+def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of meta/episodes.
+
+    Raises:
+        CorruptDatasetError: a file cannot be read.
+    """
+    for path in episodes_files(root):
+        for block in read_blocks([path]):
+            try:
+                rows = block.to_pylist()
+            except ValueError as error:
+                raise CorruptDatasetError(f"{path.name} cannot be read ({first_line(error)})") from error
+            yield from rows
+
+
+def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:
+    """Cut the rows of one file where episode_index changes and frame_index is 0.
+
+    A single wrong value of either is then found within an episode. Memory holds the longest run and a block.
+
+    Raises:
+        CorruptDatasetError: the file cannot be read, or values are missing.
+    """
+    rest: dict[str, Array] = {}
+    for table in tables:
+        if faults := schema_faults(table.schema, columns):
+            raise CorruptDatasetError(f"{path.parent.name}/{path.name}: {'; '.join(faults)}")
+        block = {c.name: _values(table.column(c.name), c) for c in columns}
+        rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
+        changes = np.diff(rest[names.EPISODE_INDEX]) != 0
+        starts = [0, *(np.flatnonzero(changes & (rest[names.FRAME_INDEX][1:] == 0)) + 1).tolist()]
+        for first, last in itertools.pairwise(starts):
+            yield Run(path, {name: values[first:last] for name, values in rest.items()})
+        rest = {name: values[starts[-1] :] for name, values in rest.items()}
+    if rest and len(rest[names.EPISODE_INDEX]):
+        yield Run(path, rest)
+
+
+def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str]:
+    """List the columns that `schema` lacks or has as another type."""
+    faults = [f"lacks column {column.name}" for column in columns if column.name not in schema.names]
+    present = [column for column in columns if column.name in schema.names]
+    for column in present:
+        kind = schema.field(column.name).type
+        if not column.fits(kind):
+            faults.append(f"has {column.name} as {kind}, expected {column.arrow_type}")
+    return faults
+
+
+def _values(stored: pa.ChunkedArray, column: PlainColumn) -> Array:
+    if pa.types.is_list(stored.type):
+        # Raises where a row has more or fewer values.
+        try:
+            stored = stored.cast(column.arrow_type)
+        except pa.ArrowInvalid as error:
+            raise CorruptDatasetError(f"{column.name}: expected {column.size} values in every row") from error
+    return to_numpy(stored, column.size, column.dtype)
+
+
+def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple[str, str]]:
+    """Yield (column, sentence) for each column of episode `number` with wrong values; `row` is its first."""
+    frame = np.arange(len(run))
+    expected: dict[str, Array] = {
+        names.INDEX: row + frame,
+        names.EPISODE_INDEX: np.full(len(run), number),
+        names.FRAME_INDEX: frame,
+        names.TIMESTAMP: frame / fps,
+    }
+    if names.EPISODE_UID in run.columns:
+        expected[names.EPISODE_UID] = np.full(len(run), run.columns[names.EPISODE_UID][0])
+    if {names.DONE, names.TERMINATED, names.TRUNCATED} <= run.columns.keys():
+        expected[names.DONE] = run.columns[names.TERMINATED] | run.columns[names.TRUNCATED]
+    for name, values in run.columns.items():
+        wrong = ~np.isfinite(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
+        if name == names.TIMESTAMP:
+            wrong |= np.abs(values - expected[name]) > TIMESTAMP_TOLERANCE_S
+        elif name in expected:
+            wrong |= values != expected[name]
+        if wrong.any():
+            at = tuple(int(index) for index in np.argwhere(wrong)[0])
+            where = f"episode {number} frame {at[0]}" + (f" index {at[1]}" if len(at) > 1 else "")
+            wanted = f", expected {expected[name][at]}" if name in expected else ", expected a finite number"
+            more = f" ({int(wrong.sum())} values are wrong)" if wrong.sum() > 1 else ""
+            yield name, f"{name} is {values[at]} in {where}{wanted}{more}"

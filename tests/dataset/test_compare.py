@@ -1,0 +1,34 @@
+from pathlib import Path
+
+from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write_fake, writer
+
+from astra_data.columns import STATE, Column, Episode
+from astra_data.dataset import Dataset
+from astra_data.dataset.compare import Differences, differences
+
+
+def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:
+    found = differences(write_fake(tmp_path / "a"), write_fake(tmp_path / "b"))
+    assert found == Differences(schema=[], only_in_a=[], only_in_b=[], changed=[], description=[])
+
+
+def test_every_kind_of_difference_is_told(tmp_path: Path) -> None:
+    a = write_fake(tmp_path / "a")
+    columns = [*COLUMNS[:-1], Column("other", "int64")]
+    changed = dict(DESCRIPTION) | {"config": {"episodes": 5, "noise_m": 0.2}, "version": "1.1.0"}
+    with writer(tmp_path / "b", columns=columns, fps=10, description=changed) as open_writer:
+        for uid, length in ((13, 7), (4, 1), (6, 30), (99, 3)):
+            values = dict(fake_columns(length, seed=uid))
+            values["other"] = values.pop("mode")
+            if uid == 6:
+                values[STATE] = values[STATE] + 1
+            metadata = dict(fake_episode(uid, length).metadata) | ({"return": 9.0} if uid == 4 else {})
+            open_writer.add(Episode(uid, values, metadata))
+    found = differences(a, Dataset.open(tmp_path / "b"))
+    assert found.schema == [
+        "column mode: only in fake@data-1.0.0",
+        "column other: only in fake@data-1.1.0",
+        "fps: 20, then 10",
+    ]
+    assert (found.only_in_a, found.only_in_b, found.changed) == ([0, 2**53 + 1], [99], [4, 6])
+    assert found.description == ["version: '1.0.0', then '1.1.0'", "config.noise_m: 0.1, then 0.2"]

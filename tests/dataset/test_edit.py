@@ -1,0 +1,183 @@
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import COLUMNS, fake_episode, write_fake, writer
+
+from astra_data.columns import STATE, Column
+from astra_data.dataset import Dataset
+from astra_data.dataset.edit import delete, filter_episodes, merge, subset
+from astra_data.errors import BadInputError
+
+
+def write(root: Path, uids: range) -> Dataset:
+    with writer(root) as open_writer:
+        for uid in uids:
+            open_writer.add(fake_episode(uid, 2 + uid % 5))
+    return Dataset.open(root)
+
+
+@pytest.fixture(scope="module")
+def forty(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write(tmp_path_factory.mktemp("edit") / "forty", range(40))
+
+
+def uids(root: Path) -> set[int]:
+    return set(Dataset.open(root).uids.tolist())
+
+
+def assert_taken_over(source: Dataset, root: Path) -> None:
+    """The new dataset is whole, and its episodes are those of `source`, in the same order."""
+    made = Dataset.open(root)
+    assert made.verify() == []
+    episodes = {episode.uid: episode for episode in source.episodes()}
+    assert [uid for uid in source.uids.tolist() if uid in uids(root)] == made.uids.tolist()
+    for episode in made.episodes():
+        assert episode.metadata == episodes[episode.uid].metadata
+        for name, values in episode.columns.items():
+            np.testing.assert_array_equal(values, episodes[episode.uid].columns[name])
+
+
+def test_subsets_are_nested_and_described(forty: Dataset, tmp_path: Path) -> None:
+    folders = [
+        subset(forty, percent=percent, out=tmp_path / f"{percent}", seed=3) for percent in (25, 50, 100)
+    ]
+    assert [len(Dataset.open(folder)) for folder in folders] == [10, 20, 40]
+    assert all(uids(small) < uids(large) for small, large in itertools.pairwise(folders))
+    for folder in folders:
+        assert_taken_over(forty, folder)
+    made = Dataset.open(folders[0])
+    assert made.reference == "fake@data-1.1.0"
+    assert made.description["stage"] == "subset"
+    assert made.description["config"] == {"episodes": 10, "percent": 25, "of": None, "seed": 3}
+    assert made.description["parents"] == [forty.identity]
+    assert made.subset_seed == 3
+
+
+def test_a_subset_of_a_subset_is_the_subset(forty: Dataset, tmp_path: Path) -> None:
+    half = Dataset.open(subset(forty, episodes=20, seed=3, out=tmp_path / "half"))
+    assert uids(subset(half, episodes=7, out=tmp_path / "a")) == uids(
+        subset(forty, episodes=7, seed=3, out=tmp_path / "b")
+    )
+    assert uids(tmp_path / "a") != uids(subset(forty, episodes=7, out=tmp_path / "c"))
+
+
+@pytest.mark.parametrize("count", [1, 5, 14, 30])
+def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for uid in (*range(0, 52, 2), *range(1, 19, 2)):
+            open_writer.add(fake_episode(uid, 3))
+    whole = Dataset.open(tmp_path / "set")
+    assert whole.metadata["success"].count(True) == 9
+    made = Dataset.open(subset(whole, episodes=count, stratify="success", out=tmp_path / "part"))
+    assert abs(sum(map(bool, made.metadata["success"])) - count * 9 / 35) <= 1
+    for fewer in range(1, count, 9):
+        direct = subset(whole, episodes=fewer, stratify="success", out=tmp_path / f"direct{fewer}")
+        stepwise = subset(made, episodes=fewer, stratify="success", out=tmp_path / f"step{fewer}")
+        assert uids(direct) == uids(stepwise) < uids(made.root)
+
+
+def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tmp_path: Path) -> None:
+    made = subset(forty, percent=150, of=20, out=tmp_path / "more")
+    assert len(Dataset.open(made)) == 30
+    with pytest.raises(BadInputError, match=r"150 % of 40 = 60 .*never repeated: collect or augment more"):
+        subset(forty, percent=150, out=tmp_path / "too-many")
+    with pytest.raises(BadInputError, match="a subset of 0 episodes"):
+        subset(forty, episodes=0, out=tmp_path / "none")
+    with pytest.raises(BadInputError, match=r"have no 'sucess': did you mean 'success'"):
+        subset(forty, episodes=3, stratify="sucess", out=tmp_path / "typo")
+    with pytest.raises(BadInputError, match="either a number of episodes, or a percentage"):
+        subset(forty, episodes=3, percent=3, out=tmp_path / "both")
+    assert [path.name for path in tmp_path.iterdir()] == ["more"]
+
+
+def test_delete_leaves_the_others(forty: Dataset, tmp_path: Path) -> None:
+    folder = delete(forty, [3, 39], out=tmp_path / "set")
+    assert uids(folder) == set(range(40)) - {3, 39}
+    assert_taken_over(forty, folder)
+    assert Dataset.open(folder).description["config"] == {"episodes": [3, 39]}
+
+
+def test_an_unknown_episode_deletes_nothing(forty: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(
+        BadInputError, match=r"no episode 40, 99; its 40 uids lie between 0 and 39: 0, 1, .* and 32 more"
+    ):
+        delete(forty, [3, 99, 40], out=tmp_path / "set")
+    with pytest.raises(BadInputError, match="no episode would be left"):
+        delete(forty, list(range(40)), out=tmp_path / "set")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_filters_meet_every_condition(forty: Dataset, tmp_path: Path) -> None:
+    folder = filter_episodes(
+        forty, success=True, min_return=2.5, max_return=9.5, max_length=4, out=tmp_path / "set"
+    )
+    assert uids(folder) == {uid for uid in range(5, 20) if uid % 2 and 2 + uid % 5 <= 4}
+    assert_taken_over(forty, folder)
+    assert Dataset.open(folder).description["config"] == {
+        "success": True,
+        "min_return": 2.5,
+        "max_return": 9.5,
+        "max_length": 4,
+    }
+    failed = filter_episodes(forty, success=False, min_length=6, out=tmp_path / "failed")
+    assert uids(failed) == {4, 14, 24, 34}
+
+
+def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="needs a condition"):
+        filter_episodes(forty, out=tmp_path / "set")
+    with pytest.raises(BadInputError, match="no episode would be left of its 40"):
+        filter_episodes(forty, min_length=100, out=tmp_path / "set")
+    with writer(tmp_path / "bare") as open_writer:
+        open_writer.add(fake_episode(1, 3).__class__(1, fake_episode(1, 3).columns))
+    with pytest.raises(BadInputError, match="have no 'return'"):
+        filter_episodes(Dataset.open(tmp_path / "bare"), min_return=0, out=tmp_path / "set")
+
+
+def test_merge_puts_one_after_the_other(tmp_path: Path) -> None:
+    parts = [write(tmp_path / f"{first}", range(first, first + 5)) for first in (10, 0, 5)]
+    made = Dataset.open(merge(parts, out=tmp_path / "all"))
+    assert made.verify() == []
+    assert made.uids.tolist() == [*range(10, 15), *range(5), *range(5, 10)]
+    assert made.description["parents"] == [part.identity for part in parts]
+    for found, part in zip(
+        made.episodes(), itertools.chain(*(part.episodes() for part in parts)), strict=True
+    ):
+        assert found.metadata == part.metadata
+        np.testing.assert_array_equal(found.columns[STATE], part.columns[STATE])
+
+
+def test_repeated_uids_are_refused_or_replaced(tmp_path: Path) -> None:
+    a, b = write(tmp_path / "a", range(5)), write(tmp_path / "b", range(4, 7))
+    with pytest.raises(BadInputError, match=r"1 episodes have the uid .*\(4\).*--new-uids"):
+        merge([a, b], out=tmp_path / "all")
+    made = Dataset.open(merge([a, b, b], new_uids=True, out=tmp_path / "all"))
+    assert made.uids[:5].tolist() == [0, 1, 2, 3, 4]
+    assert len(set(made.uids.tolist())) == 11
+    assert made.metadata["source_episode"][5] == 4
+    again = Dataset.open(merge([a, b, b], new_uids=True, out=tmp_path / "again"))
+    assert again.content_hash == made.content_hash
+
+
+def test_datasets_that_differ_are_told_apart(tmp_path: Path) -> None:
+    a = write_fake(tmp_path / "a")
+    columns = [*COLUMNS[:-1], Column("other", "int64")]
+    with writer(tmp_path / "b", columns=columns, fps=10, task="walk") as open_writer:
+        episode = fake_episode(1, 4)
+        values = dict(episode.columns)
+        values["other"] = values.pop("mode")
+        open_writer.add(episode.__class__(1, values))
+    with pytest.raises(BadInputError) as caught:
+        merge([a, Dataset.open(tmp_path / "b")], out=tmp_path / "all")
+    for part in (
+        "column mode: only in",
+        "column other: only in",
+        "fps: 20, then 10",
+        "task: 'run', then 'walk'",
+    ):
+        assert part in str(caught.value)
+    with pytest.raises(BadInputError, match="two datasets or more"):
+        merge([a], out=tmp_path / "all")
+    assert not (tmp_path / "all").exists()

@@ -1,0 +1,35 @@
+from pathlib import Path
+
+import pytest
+from fake_dataset import write_fake
+
+from astra_data.dataset import Dataset
+from astra_data.dataset.edit import delete, merge, subset
+from astra_data.dataset.lineage import lineage, tree_lines
+
+
+def test_ancestors_are_found_at_home_and_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    first = write_fake(tmp_path / "home/fake/data-1.0.0")
+    left = Dataset.open(delete(first, [13], out=tmp_path / "left"))
+    right = Dataset.open(subset(left, episodes=2, seed=4, out=tmp_path / "right"))
+    both = Dataset.open(merge([left, right], new_uids=True, out=tmp_path / "both"))
+    prints = [dataset.content_hash[:8] for dataset in (both, left, first, right)]
+    assert list(tree_lines(lineage(both))) == [
+        f"fake@data-1.2.0  {prints[0]}  merge: "
+        "datasets ['fake@data-1.1.0', 'fake@data-1.2.0'], new_uids True",
+        f"├── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
+        f"│   └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
+        f"└── fake@data-1.2.0  {prints[3]}  subset: episodes 2, seed 4",
+        f"    └── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
+        f"        └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
+    ]
+
+
+def test_an_ancestor_is_known_by_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    first = write_fake(tmp_path / "elsewhere/first")
+    made = Dataset.open(delete(first, [13, 4], out=tmp_path / "made"))
+    delete(made, [0], out=tmp_path / "home/fake/data-1.0.0")
+    [line] = list(tree_lines(lineage(made)))[1:]
+    assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
