@@ -4,7 +4,9 @@ The house, from the ground up; a file uses only what is below it or beside it, n
 
 words       errors  columns  seeding  recipe  rows  batched  simulator  progress  statistics  lock  cores
 knowledge   mazes  free_space  navigation  ant  physics  abstraction  checkpoint  models/
+            recording  import_mapping  conversion
 data        dataset/  grounding_file  target_encoder_file  figures/  results/
+            importers/ (one file per format of other people's logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
 learning    tasks  world  training_world  method  policy_file  deployment  gap  mismatch  gymnasium_faces
             learners/

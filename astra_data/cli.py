@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from astra_data.commands.import_ import import_
 from astra_data.errors import AstraDataError
 
 app = typer.Typer(
@@ -168,6 +169,9 @@ def evaluate(
 def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, root: Root = RUNS) -> None:
     """Write the recipe's tables and figures."""
     _run_stage(recipe, "report", seeds=seeds or (), publish=publish, root=root)
+
+
+app.command("import")(import_)
 
 
 def _run_stage(

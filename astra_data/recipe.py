@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -47,13 +47,22 @@ def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RecipeError(_syntax_fault(path, text, str(error))) from None
+    return validated(tables, model, str(path))
+
+
+def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: str) -> M:
+    """Read `tables`, which come from `origin`, into `model`; lists become tuples.
+
+    Raises:
+        RecipeError: `model` refuses them; one message holds every fault.
+    """
     try:
-        return model.model_validate(_with_tuples(tables))
+        return model.model_validate(_with_tuples(dict(tables)))
     except ValidationError as error:
         faults = [_fault(details, model) for details in error.errors(include_url=False)]
     if len(faults) == 1:
-        raise RecipeError(f"{path}: {faults[0]}")
-    raise RecipeError("\n  ".join([f"{path} has {len(faults)} faults:", *faults]))
+        raise RecipeError(f"{origin}: {faults[0]}")
+    raise RecipeError("\n  ".join([f"{origin} has {len(faults)} faults:", *faults]))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
