@@ -108,9 +108,8 @@ def _transformed(values: Array, spec: ColumnMapping) -> Array:
     """Apply `take`, `scale`, `offset` and `clip` to `values` (n, width)."""
     if spec.take:
         if max(spec.take) >= values.shape[1]:
-            raise BadInputError(
-                f"take {list(spec.take)} of {values.shape[1]} values in {', '.join(spec.fields)}"
-            )
+            told = f"{', '.join(spec.fields)} hold {values.shape[1]} values, counted from 0"
+            raise BadInputError(f"take {list(spec.take)}: {told}")
         values = values[:, list(spec.take)]
     for key, numbers in (("scale", spec.scale), ("offset", spec.offset)):
         if len(numbers) not in (0, 1, values.shape[1]):

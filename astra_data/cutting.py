@@ -139,7 +139,7 @@ class Cutter:
         split, n = self._mapping.split, len(block)
         masks: dict[str, Mask] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
-        now = {f"end {name}": fields[name] for name in split.ends}
+        now: dict[str, Array] = {f"end {name}": fields[name] for name in split.ends}
         if split.field:
             now["field"] = fields[split.field]
         if self._mapping.time:

@@ -18,7 +18,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import AstraDataError, BadInputError
 from astra_data.import_mapping import ImportMapping
 from astra_data.importers import csv, hdf5, json, mcap, minari, npz
-from astra_data.recipe import load_recipe, validated
+from astra_data.recipe import did_you_mean, load_recipe, validated
 from astra_data.recording import Block, Source, find_sources, is_archive
 
 FORMATS: Mapping[str, ModuleType] = {
@@ -92,6 +92,8 @@ def import_dataset(
         RecipeError: the mapping is not what was expected.
     """
     began = time.perf_counter()
+    if file_format is not None and file_format not in FORMATS:
+        raise BadInputError(f"no format '{file_format}'{did_you_mean(file_format, FORMATS)}")
     given = {"name": name, "fps": fps, "task": task, "format": file_format}
     options = {key: value for key, value in given.items() if value is not None}
     settings = None

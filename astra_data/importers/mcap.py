@@ -150,7 +150,8 @@ def _values(content: Any, topic: str, fields: list[str], origin: str) -> dict[st
         part = content
         for key in field.removeprefix(f"{topic}:").split("."):
             part = _part(part, key)
-        value = np.array(list(part) if hasattr(part, "__len__") and not isinstance(part, str) else part)
+        is_list = hasattr(part, "__len__") and not isinstance(part, str | Mapping)
+        value = np.array(list(part) if is_list else part)
         if value.dtype.kind not in "biufU":
             faults.append(f"'{field}' is no number, nor a list of them")
         values[field] = value
