@@ -146,14 +146,15 @@ class Cutter:
             now["gap"] = fields[self._mapping.time][:, :1].astype(np.float64) * self._mapping.time_scale
         continues = not (is_apart or block.starts)
         for key, values in now.items():
-            before = self._before[key] if continues else values[:1]
-            previous = np.concatenate([before, values[:-1]])
+            series = np.concatenate([self._before[key] if continues else values[:1], values])
             if key == "field":
-                masks[key] = (previous != values).any(axis=1)
+                masks[key] = (series[:-1] != values).any(axis=1)
             elif key == "gap":
-                masks[key] = self._gaps(values[:, 0] - previous[:, 0])
+                times = _held(series)
+                masks[key] = self._gaps(np.diff(times[:, 0]))
+                now[key] = times[1:]
             else:
-                masks["end"] |= (previous != 0).any(axis=1)
+                masks["end"] |= (series[:-1] != 0).any(axis=1)
         if not continues:
             masks["end"][0] = False
         masks["file"][0], masks["source"][0] = is_apart, block.starts
@@ -194,3 +195,10 @@ class Cutter:
         begins[0] |= self._kept_before is None
         self._kept_before = counters[:, -1:], None if where is None else where[-1:]
         return begins
+
+
+def _held(times: Array) -> Array:
+    """Replace what is not finite in `times` (n, 1) by what was before, so that no gap hides behind it."""
+    rows = np.where(np.isfinite(times[:, 0]), np.arange(len(times)), 0)
+    held: Array = times[np.maximum.accumulate(rows)]
+    return held

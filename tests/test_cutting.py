@@ -72,6 +72,14 @@ def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
     cutting.check_rate()
 
 
+@BLOCKS
+def test_no_gap_hides_behind_a_time_that_is_not_finite(block_rows: int) -> None:
+    cutting = cutter(time="t", split={"gap_s": 0.5}, not_finite="drop")
+    episodes = cut(cutting, block_rows, x=np.zeros(7), t=[0, 0.1, np.nan, 0.3, np.nan, 3.0, 3.1])
+    assert rows(episodes) == [[0, 1], [5]]
+    assert cutting.tally.split_points == {"gap": 1}
+
+
 def test_a_rate_that_is_not_fps_is_told() -> None:
     cutting = cutter(time="t", time_scale=0.001)
     cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)

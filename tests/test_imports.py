@@ -1,5 +1,6 @@
 import tarfile
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from astra_data import cli
 from astra_data.columns import STATE
 from astra_data.dataset import Dataset
 from astra_data.errors import BadInputError
+from astra_data.import_mapping import Format
+from astra_data.imports import FORMATS
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE + "files = false\n"
@@ -25,6 +28,10 @@ def parts(folder: Path) -> list[Path]:
         )
         for trial in range(len(LENGTHS))
     ]
+
+
+def test_mappings_know_every_format() -> None:
+    assert set(get_args(Format)) == set(FORMATS)
 
 
 def test_each_file_is_an_episode(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """HDF5: one dataset per field; the layouts of D4RL and robomimic are known. Read block by block."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -21,6 +21,8 @@ D4RL = {
     NEXT_STATE: "next_observations",
     GOAL: "infos/goal",
 }
+MOST_COMPRESSED = 10_000
+"""No filter makes this many bytes of one; beyond, values were never written."""
 ROBOMIMIC = {ACTION: "actions", REWARD: "rewards", TERMINATED: "dones"}
 
 
@@ -38,11 +40,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             shapes = {name: d.shape[::-1] if mapping.transposed else d.shape for name, d in datasets.items()}
             n = row_count(origin, mapping.all_fields, shapes)
             used = {field: datasets[field] for field in mapping.all_fields}
-            outside = [field for field, d in used.items() if d.external or d.is_virtual]
-            if outside:
-                raise BadInputError(
-                    f"{origin}: {', '.join(outside)} lies in another file; copy it into this one"
-                )
+            _check_storage(used, origin)
             for first in range(0, n, BLOCK_ROWS):
                 rows = slice(first, min(first + BLOCK_ROWS, n))
                 values = {
@@ -83,7 +81,7 @@ def layout(source: Source) -> dict[str, Any]:
         keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
         fps = env_args.get("env_kwargs", {}).get("control_freq")
-        return keys | ({"fps": int(fps)} if fps else {})
+        return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
 
 
 def _groups(file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
@@ -95,6 +93,17 @@ def _groups(file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: 
     if not found:
         raise BadInputError(f"{origin}: no groups '{pattern}'; it has {', '.join(list(file)[:10])}")
     return [parent[name] for name in found]
+
+
+def _check_storage(datasets: Mapping[str, Any], origin: str) -> None:
+    faults = []
+    for field, dataset in datasets.items():
+        if dataset.external or dataset.is_virtual:
+            faults.append(f"field '{field}' lies in another file; copy it into this one")
+        elif dataset.nbytes > MOST_COMPRESSED * (dataset.id.get_storage_size() + 2**10):
+            faults.append(f"field '{field}' claims the shape {dataset.shape}, but the file does not hold it")
+    if faults:
+        raise BadInputError(f"{origin}: {'; '.join(faults)}")
 
 
 def _datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py

@@ -142,3 +142,11 @@ def test_values_in_other_files_are_not_read(tmp_path: Path, kind: str) -> None:
             file.create_dataset("x", (20,), float, external=[(str(tmp_path / "raw"), 0, 160)])
     with pytest.raises(BadInputError, match=r"no field 'x'|lies in another file"):
         imported(tmp_path, tmp_path / "log.h5")
+
+
+def test_a_shape_that_the_file_does_not_hold_is_told(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name in rows():
+            file.create_dataset(name, (2**50,), float, chunks=(2**10,))
+    with pytest.raises(BadInputError, match=r"field 'x' claims the shape .*; field 'y' claims"):
+        imported(tmp_path, tmp_path / "log.h5")
