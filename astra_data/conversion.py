@@ -92,7 +92,7 @@ def _complete(converted: dict[str, Column]) -> tuple[Column, ...]:
         Column(TRUNCATED, "bool", meaning="the recording of the episode ends"),
         Column(DONE, "bool", meaning="terminated or truncated"),
     )
-    return tuple(({column.name: column for column in derived} | columns).values())
+    return (*columns.values(), *(column for column in derived if column.name not in columns))
 
 
 def _as_rows(name: str, values: Array, faults: list[str]) -> Array:

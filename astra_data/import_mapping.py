@@ -87,7 +87,8 @@ class ImportMapping(Config):
     task: str
     """What the episodes do, a sentence or a name."""
     fps: Count
-    """Steps per second. MCAP is resampled to it; of other formats, rows are steps."""
+    """Steps per second. MCAP is resampled to it, by holding each value until the next; of other formats, each
+    row is a step."""
     columns: Annotated[dict[str, ColumnMapping], Field(min_length=1)]
     """By name. next.observation.state is derived where it is left out: each episode then loses its last row,
     whose next state nobody recorded. next.done is always derived."""
