@@ -5,13 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.columns import DONE, NEXT_STATE, STATE, SUCCESS, TERMINATED, TRUNCATED, Array, Column
+from astra_data.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Column
 from astra_data.errors import BadInputError
-from astra_data.import_mapping import ColumnMapping, ImportMapping
+from astra_data.import_mapping import FLAGS, ColumnMapping, ImportMapping
 from astra_data.recording import Block
 
 Mask = NDArray[np.bool_]
-_FLAGS = (TERMINATED, TRUNCATED, DONE, SUCCESS)
 
 
 class Converter:
@@ -55,18 +54,25 @@ class Converter:
             columns[name] = cast[:, 0] if column.size == 1 else cast
             finite &= ok
         if not faults:
-            faults += self._jump_faults()
+            faults += self._size_faults()
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
         self.columns = self.columns or _complete(self._converted)
         return columns, finite
 
-    def _jump_faults(self) -> list[str]:
+    def _size_faults(self) -> list[str]:
+        sizes = {name: column.size for name, column in self._converted.items()}
+        faults = []
+        if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
+            faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
+        for name in (REWARD, *FLAGS):
+            if sizes.get(name, 1) > 1:
+                faults.append(f"{name}: {sizes[name]} values, expected 1")
         jump = self._mapping.split.jump
-        size = self._converted[jump.column].size if jump else 0
-        if jump and max(jump.values) >= size:
-            return [f"split.jump.values {list(jump.values)}: {jump.column} has {size} values"]
-        return []
+        if jump and max(jump.values) >= sizes[jump.column]:
+            told = f"{jump.column} has {sizes[jump.column]} values, counted from 0"
+            faults.append(f"split.jump.values {list(jump.values)}: {told}")
+        return faults
 
 
 def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
@@ -77,7 +83,7 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
     """
     lists: dict[str, Sequence[str]] = {"unit": spec.unit, "frame": spec.frame, "role": spec.role}
     astra = {key: list(words) * (size if len(words) == 1 else 1) for key, words in lists.items() if words}
-    dtype = spec.dtype or ("bool" if name in _FLAGS else "float32")
+    dtype = spec.dtype or ("bool" if name in FLAGS else "float32")
     return Column(name, dtype, size, spec.names or None, spec.meaning, astra or None)
 
 

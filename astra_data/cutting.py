@@ -155,8 +155,6 @@ class Cutter:
                 now[key] = times[1:]
             else:
                 masks["end"] |= (series[:-1] != 0).any(axis=1)
-        if not continues:
-            masks["end"][0] = False
         masks["file"][0], masks["source"][0] = is_apart, block.starts
         self._before = {key: values[-1:] for key, values in now.items()}
         if self._mapping.not_finite == "split":

@@ -4,10 +4,24 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from astra_data.columns import DONE, RESERVED, ROLES
+from astra_data.columns import (
+    ACTION,
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    RESERVED,
+    REWARD,
+    ROLES,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+)
 from astra_data.recipe import Config, Count, Positive
 
 Index = Annotated[int, Field(ge=0)]
+FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
+FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
 Format = Literal["csv", "hdf5", "json", "mcap", "minari", "npz"]
 
 
@@ -115,7 +129,10 @@ class ImportMapping(Config):
     @model_validator(mode="after")
     def _check(self) -> Self:
         faults = []
-        for name in self.columns:
+        for name, column in self.columns.items():
+            expected = "bool" if name in FLAGS else "float32" if name in FLOATS else column.dtype
+            if column.dtype not in (None, expected):
+                faults.append(f"column {name} has dtype {column.dtype}, expected {expected}")
             if name in (*RESERVED, DONE):
                 faults.append(f"column {name} is filled in, leave it out")
             if not name or "/" in name:

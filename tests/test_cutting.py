@@ -1,12 +1,13 @@
 """What the cutter makes of rows whose outcome is known."""
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from astra_data.columns import ACTION, DONE, NEXT_STATE, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
 from astra_data.cutting import Cutter
 from astra_data.errors import BadInputError
 from astra_data.import_mapping import ImportMapping
@@ -94,8 +95,8 @@ def test_jumps_are_longer_than_their_bound(block_rows: int) -> None:
         columns={STATE: position, ACTION: {"fields": ("a",)}},
         split={"jump": {"column": STATE, "values": (0, 1), "above": 0.5}},
     )
-    # 0.499 m, then 0.51 m, and 10 in a value that does not count.
-    x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [810, 399, 9], [810, 399, 1e4]])
+    # 0.499 m, then 0.51 m in both directions together, and 10 in a value that does not count.
+    x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [660, 760, 9], [660, 760, 1e4]])
     assert rows(cut(cutting, block_rows, x=x)) == [[0, 1], [3]]
     assert cutting.tally.split_points == {"jump": 1}
 
@@ -160,9 +161,17 @@ def test_scale_offset_take_and_types() -> None:
     ],
 )
 def test_columns_that_do_not_fit_are_told(spec: dict[str, Any], told: str) -> None:
-    columns = {STATE: {"fields": ("x",)} | spec, ACTION: {"fields": ("a",), "take": (7,)}}
+    columns = {"pose": {"fields": ("x",)} | spec, ACTION: {"fields": ("a",), "take": (7,)}}
     with pytest.raises(BadInputError, match=f"log: .*{told}.*; take"):
         cut(cutter(columns=columns), x=[[1, 3], [5, 7]])
+
+
+def test_sizes_that_the_contract_does_not_know_are_told() -> None:
+    two = {"fields": ("x",)}
+    columns = {STATE: two, NEXT_STATE: {"fields": ("a",)}, TERMINATED: two, REWARD: two}
+    told = "next.observation.state has 1 values, observation.state 2; next.reward: 2 values, expected 1; "
+    with pytest.raises(BadInputError, match=re.escape(f"log: {told}next.terminated: 2 values, expected 1")):
+        cut(cutter(columns=columns), x=[[0, 1], [1, 1]])
 
 
 def test_a_jump_in_a_value_that_is_not_there_is_told() -> None:

@@ -190,11 +190,10 @@ def test_csv_of_any_form(table: list[list[str]]) -> None:
 contents = st.dictionaries(st.sampled_from(["position", "joints", "turn"]), values)
 
 
-@given(
-    messages=st.lists(
-        st.tuples(st.sampled_from(["/pose", "/command"]), st.floats(0, 1e9), contents), max_size=6
-    )
-)
+messages = st.tuples(st.sampled_from(["/pose", "/command"]), st.floats(0, 1e9), contents)
+
+
+@given(more=st.lists(messages, max_size=6))
 @fuzzed
 def test_messages_of_any_form(more: list[Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:

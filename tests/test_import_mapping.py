@@ -21,6 +21,10 @@ from astra_data.recipe import load_recipe
         (('columns."next.reward"', 'columns."next/reward"'), "expected a name without '/'"),
         (('fields = ["reward"]', "fields = []"), "columns.next.reward.fields: "),
         (('field = "trial"', 'jump = {column = "pose", values = [0], above = 1}'), "jump.column 'pose'"),
+        (
+            ('fields = ["fell"]', 'fields = ["fell"]\ndtype = "int64"'),
+            "terminated has dtype int64, expected bool",
+        ),
         (('"int64"', '"float64"'), "gait.dtype: expected 'float32', 'int64' or 'bool'"),
     ],
 )
