@@ -56,6 +56,7 @@ def test_members_are_read_without_unpacking(tmp_path: Path) -> None:
         (member("log.json", tarfile.SYMTYPE, "/etc/passwd"), "log.json is a link"),
         (member("log.json", tarfile.LNKTYPE, "../secret"), "log.json is a link"),
         (member("log.json", tarfile.CHRTYPE), "log.json is a link, a device"),
+        (member("log.json", tarfile.GNUTYPE_SPARSE), "log.json is a link, a device or sparse"),
         (member("log.json", tarfile.FIFOTYPE), "log.json is a link, a device"),
     ],
 )
