@@ -187,9 +187,9 @@ def _episodes(
     recording = None
     for source in sources:
         is_apart = mapping.split.files or source.recording != recording
-        recording = source.recording
         origin, row = "", 0
         for block in _blocks(source, file_format, mapping):
+            recording = source.recording
             row = row if block.origin == origin else 0
             yield from cutter.feed(block, row, is_apart=is_apart)
             is_apart, origin, row = False, block.origin, row + len(block)

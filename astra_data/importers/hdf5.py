@@ -37,7 +37,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         for group in _groups(file, mapping.episodes, str(source)):
             origin = f"{source}{group.name}".rstrip("/")
             datasets = _datasets(h5py, group)
-            shapes = {name: d.shape[::-1] if mapping.transposed else d.shape for name, d in datasets.items()}
+            order = slice(None, None, -1 if mapping.transposed else 1)
+            shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
             n = row_count(origin, mapping.all_fields, shapes)
             used = {field: datasets[field] for field in mapping.all_fields}
             _check_storage(used, origin)

@@ -102,6 +102,7 @@ def test_transposed_files_are_those_of_matlab(tmp_path: Path) -> None:
     joints = np.random.default_rng(3).normal(size=(5, 40))
     with h5py.File(tmp_path / "walking.mat", "w") as file:
         file["estimator/joints"] = joints
+        file["names"] = h5py.Empty("f8")
     mapping = """
 name = "icub"
 task = "walk"
