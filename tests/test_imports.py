@@ -56,6 +56,14 @@ def test_the_files_of_a_folder_or_archive_continue_one_another(tmp_path: Path) -
     assert report.tally.split_points == {"file": 1}
 
 
+def test_a_first_file_without_rows_changes_nothing(tmp_path: Path) -> None:
+    folder = parts(tmp_path / "logs")[0].parent
+    write_table(folder / "part_0.csv", {name: values[:0] for name, values in rows().items()})
+    dataset, report = imported(tmp_path, folder, MAPPING + "files = false\n")
+    assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
+    assert report.tally.split_points == {"field": 2}
+
+
 def test_options_override_the_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
     path = write_table(tmp_path / "log.data.csv", rows()).rename(tmp_path / "log.data")
