@@ -4,8 +4,9 @@ The house, from the ground up; a file uses only what is below it or beside it, n
 
 words       errors  columns  seeding  recipe  rows  batched  simulator  progress  statistics  lock  cores
 knowledge   geometry  mazes  free_space  navigation  ant  physics  abstraction  checkpoint  models/
+            recording  import_mapping  conversion
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
-exchange    exporters/ (datasets in other libraries' formats)
+exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
 learning    tasks  world  target_world  training_world  method  policy_file  deployment  behaviors  gap
             mismatch  gymnasium_faces  pairing  relocation  learners/

@@ -18,6 +18,7 @@ from astra_data.commands import (
     comparing,
     editing,
     exporting,
+    importing,
     inspecting,
     recipes,
     sharing,
@@ -72,6 +73,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "diff": comparing.diff,
     },
     "Exchange": {
+        "import": importing.import_,
         "export": exporting.export,
         "card": sharing.card,
         "push": sharing.push,

@@ -10,7 +10,7 @@ import astra_data
 
 HOUSE = Path(__file__).parents[1] / "astra_data"
 
-NO_NEIGHBOURS = {"envs", "exporters", "sims", "methods", "stages"}
+NO_NEIGHBOURS = {"envs", "exporters", "importers", "sims", "methods", "stages"}
 """Rooms whose files do not import each other; their `__init__` may import them all."""
 
 
