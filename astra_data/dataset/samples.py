@@ -94,9 +94,7 @@ class Batches:
 
 def take(values: Tensor, rows: Tensor) -> Tensor:
     """Return the rows `rows` (n,) of `values` (N, ...)."""
-    if values.is_cuda:
+    if values.is_cuda or not values.is_contiguous():
         return values.index_select(0, rows)
-    # numpy is faster, and does not wait for threads where other processes use the cores. Its `take` is the
-    # fastest for many short rows, but would first copy all of an array that is not contiguous.
-    array, index = values.numpy(), rows.numpy()
-    return torch.from_numpy(array.take(index, axis=0) if values.is_contiguous() else array[index])
+    # For many short rows numpy is faster; of an array that is not contiguous it would first copy all.
+    return torch.from_numpy(values.numpy().take(rows.numpy(), axis=0))
