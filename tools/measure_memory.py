@@ -1,10 +1,10 @@
-"""Measure how much memory it takes to write and to validate a large dataset.
+"""Measure how much memory it takes to write, augment, pair and validate a large dataset.
 
     uv run python tools/measure_memory.py
-    uv run python tools/measure_memory.py --episodes 4000 --steps 250
+    uv run python tools/measure_memory.py --episodes 2000 --steps 250
 
-Episodes are made one by one, so that what is held in memory is the toolkit's own. Each part runs in a process
-of its own; its figure is the largest resident size above that of the imports.
+Episodes are made one by one, so that what is held in memory is the toolkit's own; augmenting doubles them.
+Each part runs in a process of its own; its figure is the largest resident size above that of the imports.
 """
 
 import multiprocessing
@@ -19,92 +19,108 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from astra_data.columns import (
-    ABSTRACT_NEXT_STATE,
-    ABSTRACT_STATE,
-    ACTION,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    Column,
-    Episode,
-)
+from astra_data.columns import ACTION, GOAL, NEXT_STATE, OUTCOME_COLUMNS, REWARD, STATE, Array, Episode
 from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.check import check
+from astra_data.progress import silent
+from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.tasks import TASKS
 
-COLUMNS = [
-    Column(STATE, size=29),
-    Column(NEXT_STATE, size=29),
-    Column(ACTION, size=2),
-    Column(ABSTRACT_STATE, size=4),
-    Column(ABSTRACT_NEXT_STATE, size=4),
-    *OUTCOME_COLUMNS,
-]
-Work = Callable[[Path, int, int], None]
-"""Do something with the dataset in a folder, which has so many episodes of so many steps."""
+TASK = TASKS["antmaze-umaze"]
+AMBLE_M = 0.4
+"""How far the robots go from the centre of their cell."""
+
+Work = Callable[[Path, int, int], int]
+"""Do something in a folder, with so many episodes of so many steps; return how many steps it was."""
 
 
 def main(
-    episodes: Annotated[int, typer.Option(help="Episodes.")] = 40_000,
+    episodes: Annotated[int, typer.Option(help="Episodes, before they are doubled.")] = 20_000,
     steps: Annotated[int, typer.Option(help="Steps of each.")] = 250,
     limit_mb: Annotated[int, typer.Option(help="Exit with 1 above this many MiB.")] = 1500,
     folder: Annotated[Path | None, typer.Option(help="Where the dataset goes for a while.")] = None,
 ) -> None:
-    """Print peak memory and frames per second of writing and of validating once more."""
-    table = Table("", "peak MiB", "frames/s", title=f"{episodes:,} episodes of {steps} steps")
+    """Print peak memory and frames per second of each part."""
+    table = Table("", "frames", "peak MiB", "frames/s")
     peaks = []
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        root = Path(scratch) / "set"
-        for work in (write, validate):
-            peak, seconds = apart(work, root, episodes, steps)
-            table.add_row(work.__name__, f"{peak:,.0f}", f"{episodes * steps / seconds:,.0f}")
+        for work in (write, double, pair_all, validate):
+            frames, peak, seconds = apart(work, Path(scratch), episodes, steps)
+            table.add_row(work.__name__, f"{frames:,}", f"{peak:,.0f}", f"{frames / seconds:,.0f}")
             peaks.append(peak)
     Console().print(table)
     if max(peaks) > limit_mb:
         raise typer.Exit(1)
 
 
-def write(root: Path, episodes: int, steps: int) -> None:
-    """Write the dataset."""
-    description = {"name": "large", "stage": "import"}
-    with DatasetWriter(root, COLUMNS, fps=20, task="walk", description=description) as writer:
-        for episode in random_walks(episodes, steps):
+def write(root: Path, episodes: int, steps: int) -> int:
+    """Write ants that amble about the free cells of the maze."""
+    columns = [*TASK.state_columns, *OUTCOME_COLUMNS]
+    description = {"name": "large", "stage": "collect", "environment": {"id": TASK.name}}
+    with DatasetWriter(
+        root / "written", columns, fps=TASK.fps, task=TASK.instruction, description=description
+    ) as writer:
+        for episode in ambles(episodes, steps):
             writer.add(episode)
+    return episodes * steps
 
 
-def validate(root: Path, episodes: int, steps: int) -> None:
-    """Open the dataset and read every value."""
-    dataset = Dataset.open(root)
-    assert (len(dataset), dataset.lengths.sum()) == (episodes, episodes * steps)
-    assert dataset.verify() == []
+def double(root: Path, episodes: int, steps: int) -> int:
+    """Augment them with one copy of each; those that reach their goal are shorter."""
+    config = AugmentConfig(copies=1, held_out_share=0.0)
+    out = root / "doubled"
+    augment(None, config, dataset=root / "written", seed=0, out=out, progress=silent)
+    return int(Dataset.open(out).lengths.sum())
 
 
-def random_walks(episodes: int, steps: int) -> Iterator[Episode]:
-    """Yield episodes of smooth random values; their metadata is what collected ones have."""
+def pair_all(root: Path, episodes: int, steps: int) -> int:
+    """Pair originals and copies with the point mass."""
+    out = root / "paired"
+    pair(TASK.name, PairConfig(), dataset=root / "doubled", out=out, progress=silent)
+    return int(Dataset.open(out).lengths.sum())
+
+
+def validate(root: Path, episodes: int, steps: int) -> int:
+    """Check every value and all statistics."""
+    report = check(root / "paired")
+    assert not report.faults
+    return report.frames
+
+
+def ambles(episodes: int, steps: int) -> Iterator[Episode]:
+    """Yield episodes of ants that go around in their cell; the rest of the state is noise."""
     rng = np.random.default_rng(0)
+    centres = TASK.maze.free_centres()
     for uid in range(episodes):
-        columns = {}
-        for column in COLUMNS:
-            shape = (steps, column.size) if column.size > 1 else (steps,)
-            if column.dtype == "bool":
-                columns[column.name] = np.arange(steps) == steps - 1
-            else:
-                columns[column.name] = rng.standard_normal(shape, dtype=np.float32).cumsum(0)
-        facts = {"success": True, "return": float(columns[REWARD].sum()), "seed": uid}
-        yield Episode(uid, columns, facts)
+        states = rng.standard_normal((steps + 1, 29), dtype=np.float32)
+        angle = 0.05 * np.arange(steps + 1) + rng.uniform(-np.pi, np.pi)
+        around = AMBLE_M * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        states[:, :2] = centres[uid % len(centres)] + around
+        states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
+        last = np.arange(steps) == steps - 1
+        columns: dict[str, Array] = {column.name: last for column in OUTCOME_COLUMNS}
+        columns |= {
+            STATE: states[:-1],
+            NEXT_STATE: states[1:],
+            ACTION: rng.uniform(-0.5, 0.5, (steps, 2)).astype(np.float32),
+            GOAL: np.zeros((steps, 2), dtype=np.float32),
+            REWARD: rng.standard_normal(steps, dtype=np.float32),
+        }
+        yield Episode(uid, columns, {"success": True, "return": float(columns[REWARD].sum()), "seed": uid})
 
 
-def apart(work: Work, root: Path, episodes: int, steps: int) -> tuple[float, float]:
-    """Run `work` in a process of its own; return its peak in MiB above the imports, and its seconds."""
+def apart(work: Work, root: Path, episodes: int, steps: int) -> tuple[int, float, float]:
+    """Run `work` in its own process; return its steps, its peak in MiB above the imports, its seconds."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(_measured, (work, root, episodes, steps))
 
 
-def _measured(work: Work, root: Path, episodes: int, steps: int) -> tuple[float, float]:
+def _measured(work: Work, root: Path, episodes: int, steps: int) -> tuple[int, float, float]:
     before = _peak_mb()
     began = time.perf_counter()
-    work(root, episodes, steps)
-    return _peak_mb() - before, time.perf_counter() - began
+    frames = work(root, episodes, steps)
+    return frames, _peak_mb() - before, time.perf_counter() - began
 
 
 def _peak_mb() -> float:
