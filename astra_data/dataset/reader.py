@@ -43,7 +43,7 @@ class Dataset(Contents):
 
     @property
     def reference(self) -> str:
-        """Name and version, such as "antmaze-long-random@data-1.0.0"."""
+        """Name and version, such as "antmaze-long-random-seed0@data-1.0.0"."""
         return f"{self.description['name']}@data-{self.description['version']}"
 
     @property
