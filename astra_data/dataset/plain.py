@@ -13,11 +13,13 @@ import pyarrow.parquet as pq
 
 from astra_data import columns as names
 from astra_data.columns import Array
-from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
+from astra_data.dataset.parquet import UNREADABLE, first_line, to_numpy
 from astra_data.errors import CorruptDatasetError
 
 TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own."""
+EPISODES_AT_ONCE = 100
+"""Rows of meta/episodes that are held in memory."""
 
 
 @dataclass(frozen=True)
@@ -111,12 +113,13 @@ def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
         CorruptDatasetError: a file cannot be read.
     """
     for path in episodes_files(root):
-        for block in read_blocks([path]):
-            try:
-                rows = block.to_pylist()
-            except ValueError as error:
-                raise CorruptDatasetError(f"{path.name} cannot be read ({first_line(error)})") from error
-            yield from rows
+        try:
+            with pq.ParquetFile(path) as file:
+                # As Python objects, the statistics of an episode take tens of kilobytes.
+                for batch in file.iter_batches(EPISODES_AT_ONCE):
+                    yield from batch.to_pylist()
+        except UNREADABLE as error:
+            raise CorruptDatasetError(f"{path.name} cannot be read ({first_line(error)})") from error
 
 
 def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:
