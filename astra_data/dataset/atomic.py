@@ -1,9 +1,11 @@
 """Folders and files that appear finished or not at all."""
 
+import glob
+import itertools
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from astra_data.errors import BadInputError
@@ -21,14 +23,9 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         BadInputError: `target` exists, or another process is writing it.
     """
     _refuse(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
+    _make_parent(target)
     _sweep(target)
-    folder = target.with_name(f".{target.name}.tmp-{os.getpid()}")
-    try:
-        folder.mkdir()
-    except FileExistsError:
-        raise BadInputError(f"{target} is being written right now; wait or choose another folder.") from None
-    with held(folder):
+    with _own_folder(target) as folder:
         try:
             yield folder
             publish(folder, target)
@@ -46,7 +43,7 @@ def atomic_file(target: Path) -> Iterator[Path]:
         BadInputError: `target` exists.
     """
     _refuse(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
+    _make_parent(target)
     path = target.with_name(f".{target.name}.tmp-{os.getpid()}")
     try:
         yield path
@@ -67,7 +64,12 @@ def publish(folder: Path, target: Path) -> None:
     for path in folder.rglob("*"):
         sync(path)
     _refuse(target)
-    os.replace(folder, target)
+    try:
+        os.replace(folder, target)
+    except OSError:
+        # Another process may have been faster by a hair.
+        _refuse(target)
+        raise
     sync(target.parent)
 
 
@@ -76,12 +78,45 @@ def _refuse(target: Path) -> None:
         raise BadInputError(f"{target} exists already; delete it or choose another folder.")
 
 
+def _make_parent(target: Path) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(f"{target} cannot be written: {error.strerror}; choose another place.") from None
+
+
+@contextmanager
+def _own_folder(target: Path) -> Iterator[Path]:
+    """Make a hidden folder beside `target` and hold its lock."""
+    for attempt in itertools.count():
+        folder = target.with_name(f".{target.name}.tmp-{os.getpid()}{f'-{attempt}' if attempt else ''}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            raise BadInputError(
+                f"{target} is being written right now; wait or choose another folder."
+            ) from None
+        except OSError as error:
+            raise BadInputError(
+                f"{target} cannot be written: {error.strerror}; choose another place."
+            ) from None
+        with ExitStack() as stack:
+            # A process that sweeps may have come between: it holds the new folder, or has removed it.
+            try:
+                ours = stack.enter_context(held(folder))
+            except FileNotFoundError:
+                continue
+            if ours and folder.exists():
+                yield folder
+                return
+
+
 def _sweep(target: Path) -> None:
-    for folder in target.parent.iterdir():
-        if folder.name.startswith(f".{target.name}.tmp-") and folder.is_dir():
-            with held(folder) as ours:
-                if ours:
-                    shutil.rmtree(folder, ignore_errors=True)
+    """Remove what killed processes left of earlier attempts at `target`."""
+    for folder in target.parent.glob(f".{glob.escape(target.name)}.tmp-*"):
+        with suppress(FileNotFoundError, NotADirectoryError), held(folder) as ours:
+            if ours:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def sync(path: Path) -> None:

@@ -20,8 +20,9 @@ from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import sync
 from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.lock import held
 
 
@@ -80,7 +81,7 @@ class StagedWriter:
             "columns": {column.name: column.feature() for column in columns},
             "fps": fps,
             "task": task,
-            "description": dict(description),
+            "description": json.loads(json.dumps(dict(description))),
             "subset_seed": subset_seed,
         }
         self._resume = resume
@@ -94,7 +95,7 @@ class StagedWriter:
         if waiting and not self._resume and not self.root.exists():
             raise BadInputError(
                 f"{self.root}: an interrupted recording left {waiting} episodes; "
-                f"resume it, or delete {self._folder} to start anew."
+                f"resume it (--resume), or delete {self._folder} to start anew."
             )
         self._folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
@@ -103,9 +104,7 @@ class StagedWriter:
                     f"{self.root} is being recorded right now; wait or choose another folder."
                 )
             if self.root.exists():
-                # What is still staged is in the dataset: the process was killed before it could clean up.
-                shutil.rmtree(self._folder)
-                raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
+                self._refuse_root()
             self._agree_on_the_plan()
             for path in sorted(self._folder.glob("*.arrow")):
                 episode = self._load(path)
@@ -125,8 +124,9 @@ class StagedWriter:
                     with self._writer:
                         for position in sorted(self.staged):
                             self._writer.add(self._load(self._path(position)))
+                    self.staged.clear()
             finally:
-                if self.root.exists() or not self.staged:
+                if not self.staged:
                     shutil.rmtree(self._folder)
 
     def add(self, episode: Episode, position: int | None = None) -> None:
@@ -156,6 +156,29 @@ class StagedWriter:
         if self._fsync:
             sync(self._folder)
         self.staged[place] = episode.metadata
+
+    def _refuse_root(self) -> None:
+        """Say that `root` exists, and clear what is staged only if it is the same recording, finished."""
+        staged = {
+            episode.uid: len(episode) for episode in map(self._load, sorted(self._folder.glob("*.arrow")))
+        }
+        if not staged or self._is_finished(staged):
+            shutil.rmtree(self._folder)
+            raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
+        raise BadInputError(
+            f"{self.root} exists already and is another dataset than the interrupted recording of "
+            f"{len(staged)} episodes in {self._folder}: move one of the two away."
+        )
+
+    def _is_finished(self, staged: Mapping[int, int]) -> bool:
+        """Tell whether the episodes `staged`, uid to length, are in the dataset at `root`."""
+        try:
+            dataset = Dataset.open(self.root)
+        except AstraDataError:
+            return False
+        stored = dict(zip(dataset.uids.tolist(), dataset.lengths.tolist(), strict=True))
+        same = all(dataset.description.get(key) == value for key, value in self._plan["description"].items())
+        return same and stored == staged
 
     def _path(self, position: int) -> Path:
         return self._folder / f"{position:06d}.arrow"

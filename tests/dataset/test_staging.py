@@ -113,13 +113,49 @@ def test_a_damaged_episode_is_told(tmp_path: Path) -> None:
         pass
 
 
+def interrupted(root: Path, episodes: list[Episode]) -> None:
+    with pytest.raises(RuntimeError), staged_writer(root) as writer:
+        for episode in episodes:
+            writer.add(episode)
+        raise RuntimeError
+
+
 def test_what_a_kill_after_the_end_left_is_cleared(tmp_path: Path) -> None:
+    interrupted(tmp_path / "set", fake_episodes())
     write_fake(tmp_path / "set")
-    (tmp_path / ".set.staged").mkdir()
-    (tmp_path / ".set.staged/000000.arrow").touch()
-    with pytest.raises(BadInputError, match="exists already"), staged_writer(tmp_path / "set"):
+    with pytest.raises(BadInputError, match="exists already; delete it"), staged_writer(tmp_path / "set"):
         pass
     assert leftovers(tmp_path) == []
+
+
+def test_another_dataset_in_its_place_does_not_cost_the_recording(tmp_path: Path) -> None:
+    interrupted(tmp_path / "set", fake_episodes()[:3])
+    write_fake(tmp_path / "set")
+    again = staged_writer(tmp_path / "set", resume=True)
+    with pytest.raises(BadInputError, match="another dataset than the interrupted recording of 3"), again:
+        pass
+    assert len(list((tmp_path / ".set.staged").glob("*.arrow"))) == 3
+
+
+def test_a_dataset_that_comes_between_does_not_cost_the_recording(tmp_path: Path) -> None:
+    with (
+        pytest.raises(BadInputError, match="exists already"),
+        staged_writer(tmp_path / "set") as writer,
+    ):
+        writer.add(fake_episode(1, 4))
+        (tmp_path / "set").mkdir()
+    assert len(list((tmp_path / ".set.staged").glob("*.arrow"))) == 1
+
+
+def test_an_episode_is_on_the_disk_itself_before_it_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr("astra_data.dataset.staging.sync", lambda path: synced.append(path.name))
+    with staged_writer(tmp_path / "set") as writer:
+        synced.clear()
+        writer.add(fake_episode(1, 4))
+        assert synced == ["000000.partial", ".set.staged"]
 
 
 def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
