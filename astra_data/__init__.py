@@ -8,8 +8,8 @@ knowledge   geometry  mazes  free_space  navigation  ant  physics  abstraction  
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
 exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
-learning    tasks  world  target_world  training_world  method  policy_file  deployment  behaviors  gap
-            mismatch  gymnasium_faces  pairing  relocation  learners/
+learning    tasks  world  target_world  training_world  method  policy_file  deployment  behaviors
+            suboptimal  gap  mismatch  gymnasium_faces  pairing  relocation  learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
 roof        plan  schedule  display  inspection_page  run  commands/  cli

@@ -7,15 +7,7 @@ import torch
 from torch import Tensor
 
 from astra_data.deployment import DeployedPolicy
-from astra_data.learners.ppo import Ppo, PpoConfig
-from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.progress import Progress
 from astra_data.seeding import derive, generator
-from astra_data.target_world import TargetWorld
-from astra_data.tasks import Task
-
-_ENVS = 128
-"""Targets that the suboptimal policy is trained in."""
 
 
 class Behavior(Protocol):
@@ -66,19 +58,3 @@ class PolicyBehavior:
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
         return self._deployed.act(state, goal)
-
-
-def suboptimal_policy(
-    task: Task, *, steps: int, seed: int, num_threads: int | None, progress: Progress
-) -> DeployedPolicy:
-    """Train a policy without memory by PPO in the target, and stop after `steps` environment steps."""
-    torch.manual_seed(derive(seed, "suboptimal policy"))
-    world = TargetWorld(task, _ENVS, seed=derive(seed, "suboptimal world"), num_threads=num_threads)
-    policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
-    config = PpoConfig(total_steps=steps)
-    ppo = Ppo(world, policy, config, horizon=task.navigation.horizon, seed=seed)
-    while not ppo.done:
-        metrics = ppo.iterate()
-        note = f"training the behaviour: reward per step {metrics['reward']:.3f}"
-        progress(min(1.0, ppo.steps / steps), note)
-    return DeployedPolicy(task, policy.requires_grad_(False))

@@ -1,7 +1,9 @@
 """What pairing needs of an abstract simulator: those of the tasks, and your own."""
 
+import hashlib
 import importlib.util
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 
 from astra_data.columns import ABSTRACT_STATE, Array, Column
 from astra_data.errors import BadInputError
+from astra_data.mazes import Maze
 from astra_data.simulator import AbstractSimulator
 from astra_data.tasks import TASKS, task_named
 
@@ -21,12 +24,16 @@ class Pairing:
 
     Attributes:
         id: names the simulator in the dataset.
+        origin: where it comes from: the task that it belongs to, or the sha256 of the file.
+        maze: the one that it has, if it belongs to a task.
         abstract_state: the column of abstract states, with names, units, frames and roles.
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
         simulator: builds B simulators.
     """
 
     id: str
+    origin: Mapping[str, str]
+    maze: Maze | None
     abstract_state: Column
     abstraction: Callable[[Array], Array]
     simulator: Callable[[int], AbstractSimulator]
@@ -45,7 +52,10 @@ def pairing_named(name: str) -> Pairing:
         if name not in TASKS and name.endswith(".py"):
             raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
         task = task_named(name)
-        return Pairing(task.simulator_id, task.abstract_state, task.abstraction, task.simulator)
+        origin = {"task": task.name}
+        return Pairing(
+            task.simulator_id, origin, task.maze, task.abstract_state, task.abstraction, task.simulator
+        )
     path, _, kind = name.rpartition(":")
     made = _load_class(Path(path), kind)
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
@@ -55,16 +65,18 @@ def pairing_named(name: str) -> Pairing:
     column = made.abstract_state
     if not isinstance(column, Column):
         raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
-    return Pairing(kind, replace(column, name=ABSTRACT_STATE), made.abstraction, made)
+    origin = {"file_sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
+    return Pairing(kind, origin, None, replace(column, name=ABSTRACT_STATE), made.abstraction, made)
 
 
 def _load_class(path: Path, kind: str) -> Any:  # noqa: ANN401 - any class
     if not path.is_file():
         raise BadInputError(f"{path} does not exist: expected a Python file with the simulator's class")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(f"simulator_of_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for it
     with explained(f"{path}, imported,"):
         spec.loader.exec_module(module)
     if not hasattr(module, kind):
@@ -86,6 +98,24 @@ def explained(what: str) -> Iterator[None]:
         raise BadInputError(
             f"{what} fails with {type(error).__name__}: {error}; ASTRA_DATA_DEBUG=1 shows where"
         ) from error
+
+
+def built(pairing: Pairing, count: int) -> AbstractSimulator:
+    """Build `count` simulators.
+
+    Raises:
+        BadInputError: that fails, or they lack what an `AbstractSimulator` has.
+    """
+    with explained(f"{pairing.id}({count})"):
+        batch = pairing.simulator(count)
+        parameters, shape = dict(batch.parameters), tuple(batch.state.shape)
+    expected = (count, pairing.abstract_state.size)
+    if shape != expected:
+        raise BadInputError(f"{pairing.id}({count}).state has shape {shape}, expected {expected}")
+    faults = [key for key, value in parameters.items() if not isinstance(value, int | float | str)]
+    if faults:
+        raise BadInputError(f"{pairing.id}.parameters: expected numbers or texts for {', '.join(faults)}")
+    return batch
 
 
 def checked_abstraction(pairing: Pairing, state: Array) -> Array:

@@ -1,5 +1,9 @@
 """A simulator as a user would write one: the target's planar position, moved by the command."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -65,3 +69,29 @@ class Clumsy(Glider):
 class Lazy(Glider):
     def step(self, action: Tensor) -> Tensor:
         raise NotImplementedError
+
+
+class Stateless(Glider):
+    def __init__(self, num_envs: int) -> None:
+        pass
+
+
+class Narrow(Glider):
+    def __init__(self, num_envs: int) -> None:
+        self.state = torch.zeros(num_envs, 1)
+
+
+class Bare(Glider):
+    parameters = {"maze": None}  # type: ignore[dict-item] # noqa: RUF012
+
+
+class Squeezing(Glider):
+    def step(self, action: Tensor) -> Tensor:
+        return super().step(action)[:, :1]
+
+
+@dataclass
+class Settings:
+    """Dataclasses look for their module."""
+
+    timestep_s: float = 0.05

@@ -382,6 +382,8 @@ def walker_pairs() -> Candidates:
     action = rng.uniform(-1, 1, size=(BATCH_OF_PAIRS, model.nu)).astype(np.float32)
     pairing = Pairing(
         "walker2d",
+        {},
+        None,
         Column(ABSTRACT_STATE, size=size),
         lambda values: values,
         lambda count: MujocoModel(model, count, substeps=substeps),

@@ -98,7 +98,8 @@ def collect(
     seed = seeds[0] if seeds else 0
     # Idle threads of the networks would slow down the physics.
     torch.set_num_threads(1)
-    with resumable(), shown("collect") as progress:
+    how = "the same command with --resume goes on from here"
+    with resumable(how), shown("collect") as progress:
         folder = collect_dataset(
             task, config, seed=seed, out=out, name=name, resume=resume, progress=progress
         )

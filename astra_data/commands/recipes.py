@@ -144,10 +144,10 @@ def run_stage(
 
 
 @contextmanager
-def resumable() -> Iterator[None]:
-    """At Ctrl-C, say that the command goes on from there, and leave with exit code 130."""
+def resumable(how: str = "run the same command again to go on from here") -> Iterator[None]:
+    """At Ctrl-C, say how to go on, and leave with exit code 130."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo("stopped: run the same command again to go on from here", err=True)
+        typer.echo(f"stopped: {how}", err=True)
         raise typer.Exit(130) from None

@@ -7,6 +7,7 @@ from mujoco.rollout import Rollout
 from torch import Tensor
 
 from astra_data.cores import cores
+from astra_data.errors import BadInputError
 
 
 class MujocoModel:
@@ -29,7 +30,12 @@ class MujocoModel:
             num_envs: B.
             substeps: physics steps per step.
             num_threads: by default one per core.
+
+        Raises:
+            BadInputError: the model's motors have states of their own, which (qpos, qvel) does not hold.
         """
+        if model.na:
+            raise BadInputError(f"the model has {model.na} actuator states; expected motors without")
         self.model = model
         self.substeps = substeps
         self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]

@@ -2,13 +2,14 @@
 
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
+from pydantic import model_validator
 from torch import Tensor
 
-from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands, suboptimal_policy
+from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands
 from astra_data.checkpoint import file_hash
 from astra_data.columns import (
     ACTION,
@@ -67,6 +68,17 @@ class CollectConfig(Config):
     target_encoder: str | None = None
     """Folder of the aligned target encoder; by default the grounding's own encoder is used."""
 
+    @model_validator(mode="after")
+    def _fits_the_behavior(self) -> Self:
+        if self.behavior == "policy" and self.policy is None:
+            raise ValueError('behavior "policy": expected the folder of a trained policy as policy, got none')
+        given = [
+            name for name in ("policy", "grounding", "target_encoder") if getattr(self, name) is not None
+        ]
+        if self.behavior != "policy" and given:
+            raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
+        return self
+
 
 def collect(
     task: str,
@@ -98,11 +110,14 @@ def collect(
     """
     world = task_named(task)
     began = time.perf_counter()
+    saved = {
+        f"{kind}_sha256": file_hash(path) for kind, path in _saved_files(config).items() if path.is_file()
+    }
     description = {
         "name": name or f"{task}-{config.behavior}-seed{seed}".replace("_", "-"),
         "version": "1.0.0",
         "stage": "collect",
-        "config": config.model_dump(mode="json"),
+        "config": config.model_dump(mode="json") | saved,
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
         "environment": {"id": task, "integrator": "RK4", "timestep_s": world.timestep_s, "leg_scale": 1.0},
     }
@@ -149,26 +164,33 @@ def _behavior(
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
         return RandomCommands((fewest, most)), {}
     if config.behavior == "suboptimal_ppo":
+        from astra_data.suboptimal import suboptimal_policy  # noqa: PLC0415 - TorchRL is slow to import
+
         deployed = suboptimal_policy(
             task, steps=config.ppo_steps, seed=seed, num_threads=num_threads, progress=progress
         )
         return PolicyBehavior(deployed), {"trained_steps": config.ppo_steps}
-    if config.policy is None:
-        raise BadInputError('behaviour "policy": expected the folder of a trained policy as policy, got none')
-    path = Path(config.policy) / "policy.safetensors"
-    trained = PolicyFile.load(path)
-    model = load_grounding(Path(config.grounding) / "grounding.safetensors") if config.grounding else None
-    encoder = None
-    if config.target_encoder:
-        encoder = load_target_encoder(Path(config.target_encoder) / "target_encoder.safetensors")
+    files = _saved_files(config)
+    trained = PolicyFile.load(files["policy"])
+    model = load_grounding(files["grounding"]) if "grounding" in files else None
+    encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
     deployed = DeployedPolicy(task, trained.policy, model, encoder, trained.world.command_limit_m_s)
     if deployed.observation_size != trained.policy.shape.observation_size:
         raise BadInputError(
-            f"{path} sees {trained.policy.shape.observation_size} values, the task shows "
+            f"{files['policy']} sees {trained.policy.shape.observation_size} values, the task shows "
             f"{deployed.observation_size}: expected a policy of {task.name} and, if it was trained in a "
             "grounded simulator, its grounding"
         )
-    return PolicyBehavior(deployed), {"policy_dataset": trained.dataset, "policy_sha256": file_hash(path)}
+    return PolicyBehavior(deployed), {"policy_dataset": trained.dataset}
+
+
+def _saved_files(config: CollectConfig) -> dict[str, Path]:
+    folders = {
+        "policy": config.policy,
+        "grounding": config.grounding,
+        "target_encoder": config.target_encoder,
+    }
+    return {kind: Path(folder) / f"{kind}.safetensors" for kind, folder in folders.items() if folder}
 
 
 def _record(

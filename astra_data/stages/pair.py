@@ -22,11 +22,12 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError
-from astra_data.pairing import Pairing, checked_abstraction, explained, pairing_named
+from astra_data.pairing import Pairing, built, checked_abstraction, explained, pairing_named
 from astra_data.progress import Progress
 from astra_data.recipe import Config, NotNegative
 from astra_data.results.provenance import machine
 from astra_data.simulator import AbstractSimulator
+from astra_data.tasks import TASKS
 
 BATCH = 4096
 """Simulators that are reset and stepped side by side."""
@@ -59,17 +60,16 @@ def pair(
     """
     pairing = pairing_named(simulator)
     source = Dataset.open(dataset)
-    _check_columns(source)
+    _check(source, pairing)
     began = time.perf_counter()
-    with explained(f"{pairing.id}({BATCH})"):
-        batch = pairing.simulator(BATCH)
+    batch = built(pairing, BATCH)
     description, out = successor(
         source,
         "columns",
         stage="pair",
         config=config.model_dump(mode="json"),
         out=out,
-        simulator={"id": pairing.id, **batch.parameters},
+        simulator={"id": pairing.id, **pairing.origin, **batch.parameters},
     )
     meanings = {
         ABSTRACT_STATE: "abstract state of the target before the action",
@@ -93,7 +93,7 @@ def pair(
                 for name in (STATE, ACTION, NEXT_STATE)
             )
             paired, error = pair_steps(
-                pairing, batch, state, action, next_state, tolerance=config.reset_tolerance
+                pairing, batch, state, action, next_state, tolerance=config.reset_tolerance, first_step=steps
             )
             simulating += time.perf_counter() - before
             reset_error = max(reset_error, error)
@@ -124,6 +124,7 @@ def pair_steps(
     next_state: Array,
     *,
     tolerance: float,
+    first_step: int = 0,
 ) -> tuple[dict[str, Array], float]:
     """Reset `batch` to φ of each of N target steps and give it the step's action.
 
@@ -134,6 +135,7 @@ def pair_steps(
         action: (N, A), or (N,).
         next_state: (N, S).
         tolerance: see `PairConfig`.
+        first_step: number of the first of these steps in the dataset, for messages.
 
     Returns:
         the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
@@ -154,17 +156,23 @@ def pair_steps(
         if not float(difference.max()) <= tolerance:
             row, entry = divmod(int(difference.argmax()), wanted.shape[1])
             raise BadInputError(
-                f"the simulator, reset to φ(s) of step {rows[row]}, shows {_name(pairing, entry)} = "
+                f"the simulator, reset to φ(s) of step {first_step + rows[row]}, shows "
+                f"{_name(pairing, entry)} = "
                 f"{float(batch.state[row, entry]):.6g} and not {float(wanted[row, entry]):.6g} "
                 f"(tolerance {tolerance:g}): check its reset_to and the abstraction"
             )
         largest = max(largest, float(difference.max()))
         with explained(f"step of {pairing.id}"):
             reached = batch.step(torch.from_numpy(action[rows].reshape(size, -1))).numpy()
+        if reached.shape != wanted.shape:
+            raise BadInputError(
+                f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}"
+            )
         if not np.isfinite(reached).all():
             row, entry = np.argwhere(~np.isfinite(reached))[0]
             raise BadInputError(
-                f"the simulator, stepped from φ(s) of step {rows[row]}, gives {_name(pairing, entry)} = "
+                f"the simulator, stepped from φ(s) of step {first_step + rows[row]}, gives "
+                f"{_name(pairing, entry)} = "
                 f"{reached[row, entry]}: expected finite states from its step"
             )
         landed[first : first + size] = reached[: len(state) - first]
@@ -181,7 +189,13 @@ def _name(pairing: Pairing, entry: int) -> str:
     return names[entry] if names else f"value {entry}"
 
 
-def _check_columns(source: Dataset) -> None:
+def _check(source: Dataset, pairing: Pairing) -> None:
+    task = source.description["environment"].get("id")
+    if pairing.maze is not None and task in TASKS and TASKS[task].maze != pairing.maze:
+        raise BadInputError(
+            f"{source.reference} was collected for {task}, which has another maze than "
+            f"{pairing.origin['task']}: give --simulator {task}"
+        )
     faults = [f"no column {name}" for name in (STATE, ACTION, NEXT_STATE) if name not in source.features]
     if ABSTRACT_STATE in source.features:
         faults.append(f"{ABSTRACT_STATE} already: it has been paired")
@@ -191,10 +205,12 @@ def _check_columns(source: Dataset) -> None:
 
 def _blocks(source: Dataset) -> Iterator[list[Episode]]:
     block: list[Episode] = []
+    steps = 0
     for episode in source.episodes():
         block.append(episode)
-        if sum(map(len, block)) >= _BLOCK:
+        steps += len(episode)
+        if steps >= _BLOCK:
             yield block
-            block = []
+            block, steps = [], 0
     if block:
         yield block

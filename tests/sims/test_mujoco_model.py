@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch
 
+from astra_data.errors import BadInputError
 from astra_data.sims.mujoco_model import MujocoModel
 
 PENDULUM = """
@@ -52,3 +53,9 @@ def test_some_rows_are_reset_and_earlier_states_stay(model: mujoco.MjModel) -> N
 
 def test_parameters_name_the_step(model: mujoco.MjModel) -> None:
     assert MujocoModel(model, 1, substeps=4).parameters == {"timestep_s": 0.01, "substeps": 4}
+
+
+def test_motors_with_states_of_their_own_are_refused() -> None:
+    slow = PENDULUM.replace('<motor joint="hinge"', '<general dyntype="filter" dynprm="0.1" joint="hinge"')
+    with pytest.raises(BadInputError, match="1 actuator states"):
+        MujocoModel(mujoco.MjModel.from_xml_string(slow), 1, substeps=1)

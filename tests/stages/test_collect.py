@@ -143,8 +143,11 @@ def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: 
     collect(task, config, seed=0, out=tmp_path / "out", progress=silent, name="walks")
     dataset = Dataset.open(tmp_path / "out")
     assert dataset.reference == "walks@data-1.0.0"
+    told = dataset.description["config"]
+    for kind, folder in (("policy", trained), ("grounding", grounded), ("target_encoder", aligned)):
+        digest = hashlib.sha256((folder / f"{kind}.safetensors").read_bytes()).hexdigest()
+        assert told[f"{kind}_sha256"] == digest
     told = dataset.description["behavior"]
-    assert told["policy_sha256"] == hashlib.sha256((trained / "policy.safetensors").read_bytes()).hexdigest()
     assert told["policy_dataset"] == f"{TASK}-random-seed0@data-2.0.0"
     actions = dataset.columns([ACTION])[ACTION]
     # Drawn, not the mean: alike starts would give alike commands.
@@ -153,10 +156,11 @@ def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: 
 
 
 def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Path, tmp_path: Path) -> None:
-    config = TINY.model_copy(update={"behavior": "policy"})
-    with pytest.raises(BadInputError, match=r'behaviour "policy": expected the folder'):
-        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
-    without_latent = config.model_copy(update={"policy": str(trained)})
+    with pytest.raises(ValueError, match=r'behavior "policy": expected the folder'):
+        CollectConfig(behavior="policy")
+    with pytest.raises(ValueError, match=r'policy: expected behavior "policy", got "random"'):
+        CollectConfig(policy=str(trained))
+    without_latent = TINY.model_copy(update={"behavior": "policy", "policy": str(trained)})
     with pytest.raises(BadInputError, match=r"sees 24 values, the task shows 8: expected a policy of"):
         collect(task, without_latent, seed=0, out=tmp_path / "out", progress=silent)
     assert list(tmp_path.iterdir()) == []

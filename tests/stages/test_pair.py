@@ -1,3 +1,4 @@
+import hashlib
 import shutil
 from pathlib import Path
 
@@ -42,7 +43,12 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
     assert after.description["parents"] == [before.identity]
     assert after.reference == before.reference.replace("1.0.0", "2.0.0")
     assert after.description["reset_error"] == 0.0
-    assert after.description["simulator"] == {"id": "point_mass", "timestep_s": 0.05, "radius_m": 0.1}
+    assert after.description["simulator"] == {
+        "id": "point_mass",
+        "task": "antmaze-short",
+        "timestep_s": 0.05,
+        "radius_m": 0.1,
+    }
     steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
     assert steps == pytest.approx(after.lengths.sum())
     assert after.description["machine"] == before.description["machine"]
@@ -81,7 +87,8 @@ def test_many_simulators_give_what_one_gives(collected: Path) -> None:
 def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
     pair(f"{MINE}:Glider", PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
     dataset = Dataset.open(tmp_path / "out")
-    assert dataset.description["simulator"] == {"id": "Glider", "timestep_s": 0.05}
+    digest = hashlib.sha256(MINE.read_bytes()).hexdigest()
+    assert dataset.description["simulator"] == {"id": "Glider", "file_sha256": digest, "timestep_s": 0.05}
     assert dataset.features[ABSTRACT_STATE]["names"] == ["x", "y"]
     columns = dataset.columns([STATE, ACTION, ABSTRACT_SIMULATED_NEXT_STATE])
     expected = columns[STATE][:, :2] + np.float32(0.05) * columns[ACTION]
@@ -95,6 +102,11 @@ def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
         (f"{MINE}:Exploding", r"stepped from φ\(s\) of step 0, gives x = .*: expected finite states"),
         (f"{MINE}:Greedy", r"abstraction of Greedy, given states \(\d+, 29\), fails with IndexError"),
         (f"{MINE}:Clumsy", r"Clumsy\(4096\) fails with TypeError"),
+        (f"{MINE}:Stateless", r"Stateless\(4096\) fails with AttributeError"),
+        (f"{MINE}:Narrow", r"Narrow\(4096\).state has shape \(4096, 1\), expected \(4096, 2\)"),
+        (f"{MINE}:Bare", r"Bare.parameters: expected numbers or texts for maze"),
+        (f"{MINE}:Squeezing", r"step of Squeezing returns shape \(4096, 1\), expected \(4096, 2\)"),
+        ("antmaze-long", r"was collected for antmaze-short, which has another maze .*: give --simulator"),
         (f"{MINE}:Lazy", r"step of Lazy fails with NotImplementedError"),
         (f"{MINE}:Wide", r"abstraction of Wide makes \(\d+, 3\) of states .* expected \(\d+, 2\)"),
         (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),
@@ -105,7 +117,7 @@ def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_simulator_that_does_not_fit_is_refused(
-    collected: Path, tmp_path: Path, simulator: str, told: str
+    task: str, collected: Path, tmp_path: Path, simulator: str, told: str
 ) -> None:
     with pytest.raises(BadInputError, match=told) as caught:
         pair(simulator, PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
