@@ -66,6 +66,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "merge": editing.merge,
         "delete": editing.delete,
         "filter": editing.filter_,
+        "list": inspecting.list_,
         "inspect": inspecting.inspect,
         "validate": checking.validate,
         "repair": checking.repair,

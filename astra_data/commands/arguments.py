@@ -8,12 +8,21 @@ import typer
 DatasetName = Annotated[
     str,
     typer.Argument(
-        metavar="DATASET", help="A folder, name@data-1.2.0, or name for the newest.", show_default=False
+        metavar="DATASET",
+        help="A folder, name@data-1.2.0, or name for its highest version.",
+        show_default=False,
     ),
 ]
 Out = Annotated[
     Path | None,
     typer.Option(
         help="Folder of the new dataset.", show_default="its place in $ASTRA_DATA_HOME or ./datasets"
+    ),
+]
+
+NewName = Annotated[
+    str | None,
+    typer.Option(
+        "--name", help="Make it a dataset of its own, from version 1.0.0 on.", show_default="a new version"
     ),
 ]

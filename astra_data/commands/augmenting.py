@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands.arguments import DatasetName, Out
+from astra_data.commands.arguments import DatasetName, NewName, Out
 
 
 def augment(
@@ -13,6 +13,7 @@ def augment(
         str | None,
         typer.Option(help="Task that judges the copies.", show_default="what the dataset was collected for"),
     ] = None,
+    name: NewName = None,
     out: Out = None,
     copies: Annotated[
         int | None, typer.Option(help="Copies of each training episode.", show_default="3")
@@ -84,5 +85,7 @@ def augment(
     given = {key: value for key, value in options.items() if value is not None}
     config = validated(given, AugmentConfig, "augment")
     with shown("augment") as progress:
-        folder = augment_dataset(task, config, dataset=locate(dataset), seed=seed, out=out, progress=progress)
+        folder = augment_dataset(
+            task, config, dataset=locate(dataset), seed=seed, name=name, out=out, progress=progress
+        )
     typer.echo(f"finished: {folder}")

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.commands.arguments import Out
+from astra_data.commands.arguments import NewName, Out
 from astra_data.commands.recipes import RUNS, Jobs, Root, Seeds, resumable, run_stage
 from astra_data.errors import BadInputError
 
@@ -21,9 +21,17 @@ Source = Annotated[
     str,
     typer.Argument(
         metavar="RECIPE|DATASET",
-        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for the newest; "
+        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for its highest version; "
         "what follows is for a dataset.",
         show_default=False,
+    ),
+]
+SeedOrSeeds = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--seed",
+        help="Of everything random; of a recipe, only these of its seeds.",
+        show_default="0; all of a recipe",
     ),
 ]
 Behavior = Annotated[
@@ -54,7 +62,7 @@ Resume = Annotated[
 
 def collect(
     task: Task,
-    seeds: Seeds = None,
+    seeds: SeedOrSeeds = None,
     jobs: Jobs = None,
     root: Root = RUNS,
     behavior: Behavior = None,
@@ -122,12 +130,13 @@ def pair(
         float | None,
         typer.Option(help="Largest difference of a reset simulator from φ(s).", show_default="1e-6"),
     ] = None,
+    name: NewName = None,
     out: Out = None,
 ) -> None:
     """Add to every transition where the abstract simulator lands from the same state."""
     given = _given(reset_tolerance=reset_tolerance)
     if dataset.endswith(".toml"):
-        _refuse(given | _given(simulator=simulator, out=out), "pair")
+        _refuse(given | _given(simulator=simulator, name=name, out=out), "pair")
         run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
@@ -142,7 +151,9 @@ def pair(
     if simulator is None:
         raise BadInputError("pair: expected --simulator, a task or path.py:MySimulator")
     with shown("pair") as progress:
-        folder = pair_dataset(simulator, config, dataset=locate(dataset), out=out, progress=progress)
+        folder = pair_dataset(
+            simulator, config, dataset=locate(dataset), name=name, out=out, progress=progress
+        )
     typer.echo(f"finished: {folder}")
 
 

@@ -41,3 +41,20 @@ def inspect(
             typer.echo(f"written: {path}")
     except OSError as error:
         raise BadInputError(f"--plot {plot}: expected a folder to write to ({error.strerror})") from None
+
+
+def list_() -> None:
+    """List the datasets at home and their versions."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
+
+    table = Table("dataset", "stage", "episodes", "steps", "content", title=str(home()))
+    for name in names_at_home():
+        for version in versions_at_home(name):
+            found = open_dataset(f"{name}@data-{version}")
+            steps = int(found.lengths.sum())
+            facts = (found.description["stage"], f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
+            table.add_row(found.reference, *facts)
+    Console().print(table)

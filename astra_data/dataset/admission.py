@@ -1,8 +1,8 @@
 """Does an episode fit the dataset that it is added to?"""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from astra_data.columns import Column, Episode
+from astra_data.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode
 from astra_data.dataset.format import METADATA_KEYS
 from astra_data.errors import BadInputError
 
@@ -42,6 +42,20 @@ class Admission:
                 faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
             if key in METADATA_KEYS:
                 faults.append(f"metadata {key}: is the writer's, leave it out")
+        faults += _outcome_faults(episode.columns)
         if episode.uid in self._uids:
             faults.append("an earlier episode has the same uid")
         return faults
+
+
+def _outcome_faults(columns: Mapping[str, Array]) -> list[str]:
+    """List what is wrong with the ends: only the last step of an episode ends it."""
+    faults = []
+    for name in (TERMINATED, TRUNCATED, DONE):
+        ends = columns.get(name)
+        if ends is not None and ends.dtype == bool and ends[:-1].any():
+            faults.append(f"{name}: true in frame {int(ends.argmax())}, expected in the last one only")
+    done = columns.get(DONE)
+    if done is not None and done.dtype == bool and not done[-1]:
+        faults.append(f"{DONE}: false in the last frame, expected true: an episode ends there")
+    return faults

@@ -88,6 +88,7 @@ class StagedWriter:
         self._fsync = fsync
         self._admission = Admission(columns)
         self._exit = ExitStack()
+        self._is_open = False
 
     def __enter__(self) -> "StagedWriter":
         """Start the recording, or go on with it."""
@@ -111,12 +112,14 @@ class StagedWriter:
                 self._admission.admit(episode)
                 self.staged[int(path.stem)] = episode.metadata
             self._exit = stack.pop_all()
+        self._is_open = True
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Write the dataset and remove the staged episodes; after an error, leave them to be resumed."""
+        self._is_open = False
         with self._exit:
             try:
                 if error is None:
@@ -139,6 +142,10 @@ class StagedWriter:
         Raises:
             BadInputError: it does not fit the columns, or the place is taken.
         """
+        if not self._is_open:
+            raise BadInputError(
+                f"{self.root}: add episodes inside `with StagedWriter(...) as writer:`."
+            )
         place = max(self.staged, default=-1) + 1 if position is None else position
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")

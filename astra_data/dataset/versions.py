@@ -78,6 +78,11 @@ def place(description: Mapping[str, Any]) -> Path:
     return home() / str(description["name"]) / f"data-{description['version']}"
 
 
+def names_at_home() -> list[str]:
+    """Return the names of the datasets at home."""
+    return sorted(folder.name for folder in home().glob("*") if versions_at_home(folder.name))
+
+
 def versions_at_home(name: str) -> list[Version]:
     """Return the versions of dataset `name` at home, the oldest first."""
     folders = (home() / name).glob("data-*.*.*")
@@ -86,7 +91,7 @@ def versions_at_home(name: str) -> list[Version]:
 
 
 def locate(dataset: str | Path) -> Path:
-    """Return the folder of `dataset`: a folder, `name@data-1.2.0`, or `name` for its newest version at home.
+    """Return the folder of `dataset`: a folder, `name@data-1.2.0`, or `name` for its highest version at home.
 
     Raises:
         BadInputError: there is no such folder and no such name at home.
@@ -99,8 +104,7 @@ def locate(dataset: str | Path) -> Path:
     name, version = reference["name"], reference["version"]
     versions = versions_at_home(name)
     if not versions:
-        names = sorted(path.name for path in home().glob("*") if versions_at_home(path.name))
-        raise BadInputError(f"no dataset '{name}' in {home()}{did_you_mean(name, names)}")
+        raise BadInputError(f"no dataset '{name}' in {home()}{did_you_mean(name, names_at_home())}")
     if version and Version.parse(version) not in versions:
         known = ", ".join(f"data-{known}" for known in versions)
         raise BadInputError(f"{name} has no version data-{version} in {home()}; it has {known}")
@@ -123,6 +127,7 @@ def successor(
     *,
     stage: str,
     config: Mapping[str, Any],
+    name: str | None = None,
     out: Path | None = None,
     parents: Iterable[Dataset] = (),
     **more: Any,  # noqa: ANN401 - JSON
@@ -134,7 +139,8 @@ def successor(
         change: what moves the version.
         stage: what makes it.
         config: how.
-        out: its folder.
+        name: of a dataset of its own, which begins with version 1.0.0; by default that of `source`.
+        out: its folder; versions at home are then not looked at, so that the version is the same anywhere.
         parents: further datasets that it is made of.
         more: keys of the description that differ from those of `source`.
 
@@ -142,8 +148,13 @@ def successor(
         the description that `DatasetWriter` takes, and the folder.
     """
     kept = {key: source.description[key] for key in ("name", "seeds", "environment", "simulator")}
-    taken = versions_at_home(source.description["name"]) if out is None else []
-    version = Version.parse(source.description["version"]).next(change, taken)
+    taken = versions_at_home(name or source.description["name"]) if out is None else []
+    version = Version.parse(source.description["version"])
+    if name in (None, source.description["name"]):
+        version = version.next(change, taken)
+    else:
+        kept["name"] = name
+        version = taken[-1].next(change, taken) if taken else Version(1, 0, 0)
     identities = [dataset.identity for dataset in (source, *parents)]
     changed = {"version": str(version), "stage": stage, "config": dict(config), "parents": identities}
     description = {**kept, **changed, **more}

@@ -91,6 +91,7 @@ class DatasetWriter:
         self._metadata: list[Mapping[str, Scalar]] = []
         self._admission = Admission(columns)
         self._exit = ExitStack()
+        self._is_open = False
 
     def __enter__(self) -> "DatasetWriter":
         """Start the hidden folder."""
@@ -101,16 +102,22 @@ class DatasetWriter:
         )
         self._rows = EpisodeRows(self._folder, self._stored, self._task)
         self._exit.push(self._finish)
+        self._is_open = True
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Commit, or remove every trace."""
+        self._is_open = False
         self._exit.__exit__(kind, error, trace)
 
     def add(self, episode: Episode) -> None:
         """Append `episode`; one that is refused leaves the dataset as it was."""
+        if not self._is_open:
+            raise BadInputError(
+                f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`."
+            )
         self._admission.admit(episode)
         length = len(episode)
         frames = np.arange(length)

@@ -96,6 +96,7 @@ def augment(
     *,
     dataset: Path,
     seed: int,
+    name: str | None = None,
     out: Path | None = None,
     progress: Progress,
 ) -> Path:
@@ -110,7 +111,8 @@ def augment(
         config: settings.
         dataset: folder of the dataset, not paired.
         seed: of everything random; the same seed gives the same bytes.
-        out: folder of the new version, by default its place at home.
+        name: of the new dataset, by default that of `dataset`, whose next version it is.
+        out: its folder, by default its place at home.
         progress: is told how far it is.
 
     Raises:
@@ -136,6 +138,7 @@ def augment(
         "episodes",
         stage="augment",
         config=config.model_dump(mode="json"),
+        name=name,
         out=out,
         seeds=source.description["seeds"] | {"augment": seed},
     )

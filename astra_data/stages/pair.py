@@ -43,7 +43,13 @@ class PairConfig(Config):
 
 
 def pair(
-    simulator: str, config: PairConfig, *, dataset: Path, out: Path | None = None, progress: Progress
+    simulator: str,
+    config: PairConfig,
+    *,
+    dataset: Path,
+    name: str | None = None,
+    out: Path | None = None,
+    progress: Progress,
 ) -> Path:
     """Add the columns `abstract.*` to `dataset`, vectorised over its steps; return the new folder.
 
@@ -51,7 +57,8 @@ def pair(
         simulator: a task, for its abstract simulator, or `path.py:MySimulator`; see `pairing_named`.
         config: settings.
         dataset: folder of the dataset.
-        out: folder of the new version, by default its place at home.
+        name: of the new dataset, by default that of `dataset`, whose next version it is.
+        out: its folder, by default its place at home.
         progress: is told how far it is.
 
     Raises:
@@ -68,6 +75,7 @@ def pair(
         "columns",
         stage="pair",
         config=config.model_dump(mode="json"),
+        name=name,
         out=out,
         simulator={"id": pairing.id, **pairing.origin, **batch.parameters},
     )

@@ -4,7 +4,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from astra_data import cli
-from astra_data.dataset import Dataset
+from astra_data.columns import Episode
+from astra_data.dataset import Dataset, StagedWriter
 from astra_data.dataset.versions import open_dataset
 from astra_data.errors import AstraDataError
 
@@ -62,3 +63,23 @@ def test_what_does_not_fit_is_told(home: Path, arguments: list[str], told: str) 
     with pytest.raises(AstraDataError, match=told):
         raise error
     assert not home.exists()
+
+
+def test_datasets_at_home_are_listed(home: Path) -> None:
+    call("collect", "antmaze-umaze", *SMALL, "--name", "walks")
+    call("pair", "walks", "--simulator", "antmaze-umaze", "--name", "pairs")
+    told = call("list").output
+    assert [line.split()[1] for line in told.splitlines() if "@" in line] == [
+        "pairs@data-1.0.0",
+        "walks@data-1.0.0",
+    ]
+
+
+def test_stopping_a_recording_says_how_to_go_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(StagedWriter, "add", stop)
+    stopped = call("collect", "antmaze-umaze", *SMALL)
+    assert stopped.exit_code == 130
+    assert stopped.output.splitlines()[-1] == "stopped: the same command with --resume goes on from here"

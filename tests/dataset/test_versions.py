@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from fake_dataset import write_fake
 
-from astra_data.dataset.versions import Version, locate, open_dataset, place, successor
+from astra_data.dataset.versions import Version, locate, names_at_home, open_dataset, place, successor
 from astra_data.errors import BadInputError
 
 
@@ -73,3 +73,13 @@ def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) 
     elsewhere = successor(source, "columns", stage="pair", config={}, out=tmp_path / "here")
     assert (elsewhere[0]["version"], elsewhere[1]) == ("2.0.0", tmp_path / "here")
     assert open_dataset(tmp_path / "first").reference == source.reference
+
+
+def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> None:
+    source = write_fake(tmp_path / "first")
+    description, folder = successor(source, "episodes", stage="subset", config={}, name="half")
+    assert (description["name"], description["version"]) == ("half", "1.0.0")
+    assert description["parents"] == [source.identity]
+    folder.mkdir(parents=True)
+    assert successor(source, "episodes", stage="subset", config={}, name="half")[0]["version"] == "1.1.0"
+    assert names_at_home() == ["half"]

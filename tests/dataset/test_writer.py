@@ -3,16 +3,25 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import fake_dataset
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from fake_dataset import COLUMNS, fake_columns, fake_episode, fake_episodes, write_fake, writer
+from fake_dataset import (
+    COLUMNS,
+    fake_columns,
+    fake_episode,
+    fake_episodes,
+    staged_writer,
+    write_fake,
+    writer,
+)
 
-from astra_data.columns import ACTION, REWARD, STATE, Column, Episode
-from astra_data.dataset import Dataset, episode_rows, parquet
+from astra_data.columns import ACTION, DONE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
+from astra_data.dataset import Dataset, DatasetWriter, episode_rows, parquet
 from astra_data.errors import BadInputError
 
 
@@ -186,3 +195,31 @@ def test_the_dataset_says_where_it_comes_from(tmp_path: Path) -> None:
     assert paired.reference == "fake@data-1.1.0"
     assert {"python", "astra-data", "lerobot", "mujoco", "numpy"} <= said["packages"].keys()
     assert "git_commit" in said
+
+
+@pytest.mark.parametrize("make", [writer, staged_writer])
+def test_outside_its_block_a_writer_says_so(tmp_path: Path, make: Callable[[Path], DatasetWriter]) -> None:
+    made = make(tmp_path / "set")
+    with pytest.raises(BadInputError, match=r"inside `with \w+\(\.\.\.\) as writer:`"):
+        made.add(fake_episode(1, 4))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "frame", "value", "told"),
+    [
+        (DONE, 3, False, "next.done: false in the last frame"),
+        (DONE, 1, True, "next.done: true in frame 1, expected in the last one only"),
+        (TERMINATED, 0, True, "next.terminated: true in frame 0"),
+        (TRUNCATED, 2, True, "next.truncated: true in frame 2"),
+    ],
+)
+def test_only_the_last_step_ends_an_episode(
+    tmp_path: Path, name: str, frame: int, value: bool, told: str
+) -> None:
+    columns = fake_columns(4, seed=1)
+    columns[name][frame] = value
+    with writer(tmp_path / "set") as open_writer:
+        open_writer.add(fake_episode(1, 4))
+        with pytest.raises(BadInputError, match=told):
+            open_writer.add(Episode(2, columns))
