@@ -143,9 +143,7 @@ class StagedWriter:
             BadInputError: it does not fit the columns, or the place is taken.
         """
         if not self._is_open:
-            raise BadInputError(
-                f"{self.root}: add episodes inside `with StagedWriter(...) as writer:`."
-            )
+            raise BadInputError(f"{self.root}: add episodes inside `with StagedWriter(...) as writer:`.")
         place = max(self.staged, default=-1) + 1 if position is None else position
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")

@@ -115,9 +115,7 @@ class DatasetWriter:
     def add(self, episode: Episode) -> None:
         """Append `episode`; one that is refused leaves the dataset as it was."""
         if not self._is_open:
-            raise BadInputError(
-                f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`."
-            )
+            raise BadInputError(f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`.")
         self._admission.admit(episode)
         length = len(episode)
         frames = np.arange(length)
