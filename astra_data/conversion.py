@@ -92,6 +92,8 @@ def _complete(converted: dict[str, Column]) -> tuple[Column, ...]:
     if STATE in columns and NEXT_STATE not in columns:
         state = columns[STATE]
         meaning = f"{state.meaning or 'the state'}, one step later"
+        if TERMINATED in columns:
+            meaning += "; where an episode terminates, not recorded: the state itself"
         columns[NEXT_STATE] = Column(NEXT_STATE, state.dtype, state.size, state.names, meaning, state.astra)
     derived = (
         Column(TERMINATED, "bool", meaning="the recording does not tell: never set"),

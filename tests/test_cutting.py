@@ -65,6 +65,27 @@ def test_a_flag_ends_an_episode(block_rows: int) -> None:
 
 
 @BLOCKS
+def test_columns_that_are_flags_end_episodes_too(block_rows: int) -> None:
+    fell = {"fields": ("alive",), "scale": (-1,), "offset": (1,)}
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | {TERMINATED: fell, TRUNCATED: {"fields": ("late",)}})
+    episodes = cut(
+        cutting, block_rows, x=np.arange(8) * 2, alive=[1, 1, 0, 1, 1, 1, 1, 1], late=[0, 0, 0, 0, 0, 1, 0, 0]
+    )
+    # Of row 2 the next state is its own, since it is terminal; of rows 5 and 7 nobody recorded one.
+    assert rows(episodes) == [[0, 1, 2], [3, 4], [6]]
+    assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4, 4], [8, 10], [14]]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [
+        [False, False, True],
+        [False] * 2,
+        [False],
+    ]
+    assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False] * 3, [False, True], [True]]
+    assert cutting.tally.split_points == {"end": 2}
+    assert (cutting.tally.last_rows, cutting.tally.last_reward) == (2, 12)
+
+
+@BLOCKS
 def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
     cutting = cutter(time="t", split={"gap_s": 0.5})
     episodes = cut(cutting, block_rows, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])

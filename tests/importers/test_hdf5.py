@@ -41,13 +41,23 @@ def test_d4rl_needs_no_mapping(tmp_path: Path) -> None:
     assert dataset.info["fps"] == 20
 
 
-def test_without_next_observations_each_episode_loses_its_last_step(tmp_path: Path) -> None:
+def test_without_next_observations_a_terminal_step_is_kept_and_others_lose_their_last_row(
+    tmp_path: Path,
+) -> None:
     fields = d4rl(tmp_path / "ant.hdf5", next_observations=False)
     dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
-    assert dataset.lengths.tolist() == [6, 4]
-    assert report.tally.last_rows == 2
-    state = fields["observations"]
-    np.testing.assert_array_equal(dataset.columns([NEXT_STATE])[NEXT_STATE], [*state[1:7], *state[8:]])
+    assert dataset.lengths.tolist() == [7, 4]
+    assert report.tally.last_rows == 1
+    assert report.tally.last_reward == fields["rewards"][11]
+    state, got = fields["observations"], dataset.columns([NEXT_STATE, TERMINATED, TRUNCATED, REWARD])
+    np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], state[6], *state[8:]])
+    np.testing.assert_array_equal(got[TERMINATED], fields["terminals"][:11])
+    np.testing.assert_array_equal(got[TRUNCATED], np.arange(11) == 10)
+    np.testing.assert_array_equal(got[REWARD], fields["rewards"][:11])
+    assert (
+        "where an episode terminates, not recorded"
+        in dataset.info["features"][NEXT_STATE]["astra"]["meaning"]
+    )
 
 
 def test_d4rl_needs_a_name_and_fps(tmp_path: Path) -> None:
