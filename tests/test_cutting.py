@@ -170,6 +170,21 @@ def test_scale_offset_take_and_types() -> None:
     assert episode["id"].tolist() == [2**60 + 1, -1]
 
 
+@pytest.mark.parametrize("dtype", ["int8", "uint64", "int64", "float16", "bool"])
+def test_whole_numbers_of_any_kind_arrive(dtype: str) -> None:
+    columns = {"id": {"fields": ("x",), "dtype": "int64"}, "value": {"fields": ("x",)}}
+    (episode,) = cut(cutter(columns=columns), x=np.array([0, 1], dtype))
+    assert episode["id"].tolist() == episode["value"].tolist() == [0, 1]
+
+
+def test_the_largest_whole_number_is_the_largest_of_its_kind() -> None:
+    cutting = cutter(columns={"id": {"fields": ("x",), "dtype": "int64"}})
+    (episode,) = cut(cutting, x=[2**63 - 1, -(2**63)])
+    assert episode["id"].tolist() == [2**63 - 1, -(2**63)]
+    with pytest.raises(BadInputError, match=r"id: expected whole numbers below 2\^63"):
+        cut(cutting, x=np.array([2**63], np.uint64))
+
+
 @pytest.mark.parametrize(
     ("spec", "told"),
     [

@@ -140,3 +140,40 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(BadInputError, match=r'h5py .*not installed: pip install "astra-data\[hdf5\]"'):
         imported(tmp_path, path)
+
+
+STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_integers_arrive_exactly(tmp_path: Path, name: str) -> None:
+    stamps = 1_700_000_000_050_000_002 + np.arange(20) * 10**8
+    dataset, _ = imported(tmp_path, write_table(tmp_path / name, rows() | {"stamp": stamps}), STAMPED)
+    expected = np.concatenate([stamps[:5], stamps[6:15], stamps[15:19]])
+    np.testing.assert_array_equal(dataset.columns(["gait"])["gait"], expected)
+
+
+@pytest.mark.parametrize("last", ["", "0.5"])
+def test_integers_that_floats_would_alter_are_told(tmp_path: Path, last: str) -> None:
+    stamps = np.array(["1700000000050000002"] * 19 + [last])
+    path = write_table(tmp_path / "log.csv", rows() | {"stamp": stamps})
+    told = r"numbers of 2\^53 or more came as floats" if not last else "expected whole numbers"
+    with pytest.raises(BadInputError, match=f"gait: {told}"):
+        imported(tmp_path, path, 'not_finite = "drop"\n' + STAMPED)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("spec", ['fields = ["stamp", "x"]', 'fields = ["stamp"]\nscale = [1.0]'])
+def test_integers_that_become_floats_on_their_way_are_told(tmp_path: Path, spec: str) -> None:
+    fields = rows() | {"stamp": np.full(20, 2**60 + 1), "x": np.zeros(20)}
+    with pytest.raises(BadInputError, match=r"gait: numbers of 2\^53 or more came as floats"):
+        imported(
+            tmp_path, write_table(tmp_path / "log.npz", fields), MAPPING.replace('fields = ["gait"]', spec)
+        )
+
+
+def test_large_integers_need_a_dtype_that_holds_them(tmp_path: Path) -> None:
+    fields = rows() | {"stamp": np.full(20, 2**60 + 1)}
+    mapping = STAMPED.replace('dtype = "int64"\n', "")
+    with pytest.raises(BadInputError, match=r"gait: integers beyond 2\^53 do not fit float32; set dtype"):
+        imported(tmp_path, write_table(tmp_path / "log.npz", fields), mapping)
