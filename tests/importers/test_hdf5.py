@@ -133,6 +133,34 @@ def test_groups_that_do_not_exist_are_told(tmp_path: Path) -> None:
         imported(tmp_path, tmp_path / "log.h5", 'episodes = "demos/*"\n' + MAPPING)
 
 
+def test_dones_that_stay_set_end_an_episode_once(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "lift.hdf5", "w") as file:
+        for demo in ("demo_0", "demo_1"):
+            for field in ("obs/x", "next_obs/x", "actions"):
+                file[f"data/{demo}/{field}"] = np.zeros((5, 2))
+            file[f"data/{demo}/dones"] = np.array([0, 0, 1, 1, 1])
+    dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", fps=20)
+    assert dataset.lengths.tolist() == [3, 3]
+    assert report.tally.short_rows == 4
+
+
+@pytest.mark.parametrize("link", [h5py.ExternalLink("secret.h5", "/"), h5py.SoftLink("/kept")])
+@pytest.mark.parametrize("place", ["runs/two", "runs"])
+def test_groups_that_are_links_are_refused(tmp_path: Path, link: object, place: str) -> None:
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        for name, values in rows().items():
+            secret[name] = secret[f"one/{name}"] = values
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in rows().items():
+            file[f"kept/{name}"] = file[f"kept/one/{name}"] = values
+            if place == "runs/two":
+                file[f"runs/one/{name}"] = values
+        file[place] = link
+    with pytest.raises(BadInputError, match=f"log.h5/{place} is a link; copy what it names into its place"):
+        imported(tmp_path, tmp_path / "log.h5", 'episodes = "runs/*"\n' + MAPPING)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("kind", ["link", "virtual", "external"])
 def test_values_in_other_files_are_not_read(tmp_path: Path, kind: str) -> None:
     fields = rows()
