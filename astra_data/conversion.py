@@ -11,6 +11,8 @@ from astra_data.import_mapping import FLAGS, ColumnMapping, ImportMapping
 from astra_data.recording import Block
 
 Mask = NDArray[np.bool_]
+EXACT = 2**53
+"""Below it, floats hold whole numbers exactly."""
 
 
 class Converter:
@@ -92,6 +94,8 @@ def _complete(converted: dict[str, Column]) -> tuple[Column, ...]:
     if STATE in columns and NEXT_STATE not in columns:
         state = columns[STATE]
         meaning = f"{state.meaning or 'the state'}, one step later"
+        if TERMINATED in columns:
+            meaning += "; where an episode terminates, not recorded: the state itself"
         columns[NEXT_STATE] = Column(NEXT_STATE, state.dtype, state.size, state.names, meaning, state.astra)
     derived = (
         Column(TERMINATED, "bool", meaning="the recording does not tell: never set"),
@@ -135,12 +139,25 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
     finite: Mask = np.asarray(np.isfinite(values).all(axis=1))
     sound = values[finite]
     if column.dtype == "float32":
+        if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
+            raise BadInputError(
+                f'{column.name}: integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or '
+                "an offset that makes them small"
+            )
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)
         return cast, finite & np.isfinite(cast).all(axis=1)
     if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
         raise BadInputError(f"{column.name}: expected true and false, or 1 and 0")
-    is_whole = sound.dtype.kind != "f" or (sound == np.floor(sound)).all()
-    if column.dtype == "int64" and not (is_whole and (abs(sound.astype(float)) < 2**63).all()):
+    if column.dtype == "int64" and sound.dtype.kind == "f":
+        if not (sound == np.floor(sound)).all():
+            raise BadInputError(f"{column.name}: expected whole numbers")
+        if (abs(sound.astype(float)) >= EXACT).any():
+            raise BadInputError(
+                f"{column.name}: numbers of 2^53 or more came as floats, which do not hold them exactly; "
+                "expected integers: no fractions or empty cells among them, no field of floats beside them, "
+                "no scale, offset or clip"
+            )
+    elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
         raise BadInputError(f"{column.name}: expected whole numbers below 2^63")
     return np.where(finite[:, None], values, 0).astype(column.dtype), finite

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.columns import DONE, NEXT_STATE, STATE, TERMINATED, TRUNCATED, Array, Column, Scalar
+from astra_data.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Column, Scalar
 from astra_data.conversion import Converter, Mask
 from astra_data.errors import BadInputError
 from astra_data.import_mapping import ImportMapping
@@ -15,7 +15,8 @@ from astra_data.recording import Block
 
 REASONS = ("file", "source", "field", "end", "gap", "jump", "rejected")
 """What begins an episode, the first that applies: a new file, the format's own episodes, a field that
-changes, a flag in the row before, a gap in time, a jump, rows that were rejected."""
+changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, a jump, rows that
+were rejected."""
 
 RATE_TOLERANCE = 0.1
 """By which share the rate that the times tell may differ from fps."""
@@ -33,6 +34,7 @@ class Tally:
         rejected_first: where the first of them is.
         split_points: where an episode ends and the next begins, by reason.
         last_rows: last rows of episodes, dropped because nobody recorded their next state.
+        last_reward: the sum of their rewards.
         short_rows: rows of episodes that were too short.
     """
 
@@ -41,6 +43,7 @@ class Tally:
     rejected_first: str = ""
     split_points: dict[str, int] = field(default_factory=dict)
     last_rows: int = 0
+    last_reward: float = 0.0
     short_rows: int = 0
 
 
@@ -86,7 +89,7 @@ class Cutter:
             first = row + int(np.argmax(rejected))
             self.tally.rejected_first = self.tally.rejected_first or f"{block.origin} row {first}"
             self.tally.rejected_rows += int(rejected.sum())
-        counters = self._count(block, rejected, is_apart=is_apart)
+        counters = self._count(block, columns, rejected, is_apart=is_apart)
         if not finite.any():
             return
         kept = {name: values[finite] for name, values in columns.items()}
@@ -108,10 +111,15 @@ class Cutter:
         self._pieces = []
         length = len(next(iter(episode.values())))
         if STATE in episode and NEXT_STATE not in episode:
-            next_state = episode[STATE][1:]
-            episode = {name: values[:-1] for name, values in episode.items()} | {NEXT_STATE: next_state}
-            self.tally.last_rows += 1
-            length -= 1
+            state = episode[STATE]
+            if TERMINATED in episode and episode[TERMINATED][-1]:
+                # Nobody bootstraps on what follows a terminal step, but its reward counts.
+                episode[NEXT_STATE] = np.concatenate([state[1:], state[-1:]])
+            else:
+                self.tally.last_rows += 1
+                self.tally.last_reward += float(episode[REWARD][-1]) if REWARD in episode else 0.0
+                episode = {name: values[:-1] for name, values in episode.items()} | {NEXT_STATE: state[1:]}
+                length -= 1
         if length < self._mapping.min_steps:
             self.tally.short_rows += length
             return
@@ -134,12 +142,15 @@ class Cutter:
                     "correct fps or time_scale, or resample the recording"
                 )
 
-    def _count(self, block: Block, rejected: Mask, *, is_apart: bool) -> NDArray[np.int64]:
+    def _count(
+        self, block: Block, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
+    ) -> NDArray[np.int64]:
         """Return how often each reason but jumps has applied up to each row, (reasons, n)."""
         split, n = self._mapping.split, len(block)
         masks: dict[str, Mask] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
         now: dict[str, Array] = {f"end {name}": fields[name] for name in split.ends}
+        now |= {name: columns[name][:, None] for name in (TERMINATED, TRUNCATED) if name in columns}
         if split.field:
             now["field"] = fields[split.field]
         if self._mapping.time:

@@ -22,7 +22,6 @@ from astra_data.recipe import Config, Count, Positive
 Index = Annotated[int, Field(ge=0)]
 FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
 FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
-Format = Literal["csv", "hdf5", "json", "mcap", "minari", "npz"]
 
 
 class ColumnMapping(Config):
@@ -86,7 +85,8 @@ class Split(Config):
     field: str | None = None
     """A field of the source whose value changes."""
     ends: tuple[str, ...] = ()
-    """Fields of the source that are true in the last row of an episode."""
+    """Fields of the source that are true in the last row of an episode, besides those of next.terminated and
+    next.truncated."""
     gap_s: Positive | None = None
     """A step in `time` that is longer, or backwards; of MCAP, how long a topic's last value may be held."""
     jump: Jump | None = None
@@ -104,12 +104,15 @@ class ImportMapping(Config):
     """Steps per second. MCAP is resampled to it, by holding each value until the next; of other formats, each
     row is a step."""
     columns: Annotated[dict[str, ColumnMapping], Field(min_length=1)]
-    """By name. next.observation.state is derived where it is left out: each episode then loses its last row,
-    whose next state nobody recorded. next.done is always derived."""
+    """By name. next.observation.state is derived where it is left out: an episode then loses its last row,
+    whose next state nobody recorded, unless it is terminated: then the state stands for the next state, on
+    which nobody bootstraps. A row with next.terminated or next.truncated ends its episode, also where such a
+    flag stays set row by row: `min_steps` = 2 leaves out what follows the first. next.done is always
+    derived."""
     version: str = "1.0.0"
     """The dataset's version."""
-    format: Format | None = None
-    """By default told from the file's name."""
+    format: str | None = None
+    """One of `imports.FORMATS`, by default told from the file's name."""
     split: Split = Split()
     """What begins a new episode."""
     time: str | None = None

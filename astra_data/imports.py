@@ -61,7 +61,7 @@ class ImportReport:
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
             f"split points: {points}\n"
             f"rejected rows: {tally.rejected_rows}{first}\n"
-            f"last rows without a next state: {tally.last_rows}; "
+            f"last rows without a next state: {_last_rows(tally)}; "
             f"rows of episodes that were too short: {tally.short_rows}"
         )
 
@@ -92,8 +92,6 @@ def import_dataset(
         RecipeError: the mapping is not what was expected.
     """
     began = time.perf_counter()
-    if file_format is not None and file_format not in FORMATS:
-        raise BadInputError(f"no format '{file_format}'{did_you_mean(file_format, FORMATS)}")
     given = {"name": name, "fps": fps, "task": task, "format": file_format}
     options = {key: value for key, value in given.items() if value is not None}
     settings = None
@@ -101,6 +99,8 @@ def import_dataset(
         read = load_recipe(mapping, ImportMapping)
         settings = validated(read.model_dump() | options, ImportMapping, str(mapping))
     chosen = (settings.format if settings else file_format) or _told_format(recordings)
+    if chosen not in FORMATS:
+        raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
     sources = [source for recording in recordings for source in _sources(recording, chosen)]
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
@@ -224,8 +224,13 @@ def _refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
 def _losses(tally: Tally) -> str:
     return (
         f"rows {tally.rows}, rejected {tally.rejected_rows}, last ones without a next state "
-        f"{tally.last_rows}, in episodes that were too short {tally.short_rows}"
+        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}"
     )
+
+
+def _last_rows(tally: Tally) -> str:
+    lost = f" (with them a reward of {tally.last_reward:g} in sum)" if tally.last_reward else ""
+    return f"{tally.last_rows}{lost}"
 
 
 def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:

@@ -5,9 +5,8 @@ import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
-from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from pathlib import Path, PurePath, PurePosixPath
+from typing import IO
 
 from astra_data.columns import Array
 from astra_data.errors import BadInputError
@@ -71,7 +70,7 @@ class Block:
 
 
 def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
-    """List the files of a recording in their natural order: 2 before 10.
+    """List the files of a recording in their natural order: 2 before 10; what is hidden is left out.
 
     Args:
         recording: a file, a folder, or an archive, whose members must be plain files inside of it.
@@ -83,10 +82,11 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
     if not recording.exists():
         raise BadInputError(f"{recording} does not exist")
     if recording.is_dir():
-        paths = [path for path in recording.rglob("*") if path.is_file() and not path.name.startswith(".")]
-        sources = [Source(path, None, recording) for path in paths]
+        files = [path for path in recording.rglob("*") if path.is_file()]
+        sources = [Source(path, None, recording) for path in files if _is_seen(path.relative_to(recording))]
     elif is_archive(recording):
-        sources = [Source(recording, member, recording) for member in _members(recording)]
+        members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]
+        sources = [Source(recording, member, recording) for member in members]
     else:
         return [Source(recording, None, recording)]
     sources = [source for source in sources if str(source).endswith(tuple(suffixes))]
@@ -103,6 +103,11 @@ def is_archive(path: Path) -> bool:
 def natural(name: str) -> list[tuple[int, str]]:
     """Return what sorts names with numbers in them as people do."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+
+
+def _is_seen(path: PurePath) -> bool:
+    """Tell whether no part of `path` is hidden; archives made on a Mac hide a file beside each."""
+    return not any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
 
 
 def _members(archive: Path) -> list[tarfile.TarInfo]:
@@ -144,18 +149,3 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
     return next(iter(lengths.values()))
-
-
-def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
-    """Import a module of one of the optional extras.
-
-    Raises:
-        BadInputError: it is not installed; the message holds the command that installs it.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        package = module.partition(".")[0]
-        raise BadInputError(
-            f'{package} is needed and not installed: pip install "astra-data[{extra}]"'
-        ) from error

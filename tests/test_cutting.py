@@ -65,6 +65,27 @@ def test_a_flag_ends_an_episode(block_rows: int) -> None:
 
 
 @BLOCKS
+def test_columns_that_are_flags_end_episodes_too(block_rows: int) -> None:
+    fell = {"fields": ("alive",), "scale": (-1,), "offset": (1,)}
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | {TERMINATED: fell, TRUNCATED: {"fields": ("late",)}})
+    episodes = cut(
+        cutting, block_rows, x=np.arange(8) * 2, alive=[1, 1, 0, 1, 1, 1, 1, 1], late=[0, 0, 0, 0, 0, 1, 0, 0]
+    )
+    # Of row 2 the next state is its own, since it is terminal; of rows 5 and 7 nobody recorded one.
+    assert rows(episodes) == [[0, 1, 2], [3, 4], [6]]
+    assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4, 4], [8, 10], [14]]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [
+        [False, False, True],
+        [False] * 2,
+        [False],
+    ]
+    assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False] * 3, [False, True], [True]]
+    assert cutting.tally.split_points == {"end": 2}
+    assert (cutting.tally.last_rows, cutting.tally.last_reward) == (2, 12)
+
+
+@BLOCKS
 def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
     cutting = cutter(time="t", split={"gap_s": 0.5})
     episodes = cut(cutting, block_rows, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])
@@ -147,6 +168,21 @@ def test_scale_offset_take_and_types() -> None:
     assert episode[STATE].tolist() == [21, 41]
     assert episode[NEXT_STATE].tolist() == [1, 2]
     assert episode["id"].tolist() == [2**60 + 1, -1]
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint64", "int64", "float16", "bool"])
+def test_whole_numbers_of_any_kind_arrive(dtype: str) -> None:
+    columns = {"id": {"fields": ("x",), "dtype": "int64"}, "value": {"fields": ("x",)}}
+    (episode,) = cut(cutter(columns=columns), x=np.array([0, 1], dtype))
+    assert episode["id"].tolist() == episode["value"].tolist() == [0, 1]
+
+
+def test_the_largest_whole_number_is_the_largest_of_its_kind() -> None:
+    cutting = cutter(columns={"id": {"fields": ("x",), "dtype": "int64"}})
+    (episode,) = cut(cutting, x=[2**63 - 1, -(2**63)])
+    assert episode["id"].tolist() == [2**63 - 1, -(2**63)]
+    with pytest.raises(BadInputError, match=r"id: expected whole numbers below 2\^63"):
+        cut(cutting, x=np.array([2**63], np.uint64))
 
 
 @pytest.mark.parametrize(

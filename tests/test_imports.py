@@ -1,21 +1,19 @@
 import tarfile
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
-from recordings import LENGTHS, MAPPING, imported, rows, write_table
+from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 from typer.testing import CliRunner
 
 from astra_data import cli
-from astra_data.columns import STATE
+from astra_data.columns import REWARD, STATE, TERMINATED
 from astra_data.dataset import Dataset
 from astra_data.errors import BadInputError
-from astra_data.import_mapping import Format
 from astra_data.imports import FORMATS
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
-ONE_LOG = PER_FILE + "files = false\n"
+ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
 
 
 def parts(folder: Path) -> list[Path]:
@@ -30,13 +28,9 @@ def parts(folder: Path) -> list[Path]:
     ]
 
 
-def test_mappings_know_every_format() -> None:
-    assert set(get_args(Format)) == set(FORMATS)
-
-
 def test_each_file_is_an_episode(tmp_path: Path) -> None:
     dataset, report = imported(tmp_path, parts(tmp_path / "logs"), PER_FILE)
-    assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
+    assert dataset.lengths.tolist() == list(STEPS)
     assert report.tally.split_points == {"file": 2}
     assert dataset.metadata["source"] == ["part_8.csv", "part_9.csv", "part_10.csv"]
 
@@ -60,7 +54,7 @@ def test_a_first_file_without_rows_changes_nothing(tmp_path: Path) -> None:
     folder = parts(tmp_path / "logs")[0].parent
     write_table(folder / "part_0.csv", {name: values[:0] for name, values in rows().items()})
     dataset, report = imported(tmp_path, folder, MAPPING + "files = false\n")
-    assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
+    assert dataset.lengths.tolist() == list(STEPS)
     assert report.tally.split_points == {"field": 2}
 
 
@@ -72,7 +66,7 @@ def test_options_override_the_mapping(tmp_path: Path, monkeypatch: pytest.Monkey
     result = CliRunner().invoke(cli.app, [*arguments, "--name", "renamed", "--fps", "5", "--task", "run"])
     assert result.exit_code == 0, result.output
     dataset = Dataset.open(tmp_path / "home/renamed/data-1.0.0")
-    assert "3 episodes, 17 frames from 20 rows" in result.output
+    assert "3 episodes, 18 frames from 20 rows" in result.output
     assert "split points: field 2" in result.output
     assert dataset.info["fps"] == 5
     assert dataset.description["stage"] == "import"
@@ -120,3 +114,31 @@ def test_formats_that_need_seeking_are_not_read_from_archives(tmp_path: Path) ->
         archive.add(path, "a.npz")
     with pytest.raises(BadInputError, match="npz cannot be read from an archive, unpack it"):
         imported(tmp_path, tmp_path / "a.tar")
+
+
+def test_the_help_names_every_format() -> None:
+    told = CliRunner().invoke(cli.app, ["import", "--help"], env={"COLUMNS": "200"}).output
+    assert ", ".join(list(FORMATS)[:-1]) + f" or {list(FORMATS)[-1]}." in told
+
+
+def test_a_mapping_with_a_format_that_does_not_exist_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "a.csv", rows())
+    with pytest.raises(BadInputError, match="no format 'cvs': did you mean 'csv'"):
+        imported(tmp_path, path, 'format = "cvs"\n' + MAPPING)
+
+
+def test_mapped_flags_split_a_log_of_many_episodes(tmp_path: Path) -> None:
+    done = np.isin(np.arange(20), (4, 9, 14, 18))
+    path = write_table(tmp_path / "log.csv", rows() | {"fell": done})
+    dataset, report = imported(tmp_path, path, PER_FILE)
+    assert dataset.lengths.tolist() == [5, 5, 5, 4]
+    assert report.tally.split_points == {"end": 4}
+    np.testing.assert_array_equal(dataset.columns([TERMINATED])[TERMINATED], done[:19])
+
+
+def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
+    reward = np.zeros(20)
+    reward[[5, 14, 19]] = (1, 1, 0.5)
+    dataset, report = imported(tmp_path, write_table(tmp_path / "log.csv", rows() | {"reward": reward}))
+    assert dataset.columns([REWARD])[REWARD].sum() == 1
+    assert "last rows without a next state: 2 (with them a reward of 1.5 in sum); rows" in str(report)

@@ -23,16 +23,19 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.
     return info
 
 
-def test_files_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    names = ("log_10.csv", "log_2.csv", "log_1.csv", ".log_3.csv", "notes.txt")
+HIDDEN = (".log_3.csv", "._log_1.csv", ".ipynb_checkpoints/log_1-checkpoint.csv", "__MACOSX/log_1.csv")
+
+
+def test_files_come_in_the_order_of_their_numbers_without_those_that_are_hidden(tmp_path: Path) -> None:
+    names = ("log_10.csv", "log_2.csv", "log_1.csv", "notes.txt", *HIDDEN)
     for name in names:
-        (tmp_path / name).write_text("")
-    found = find_sources(tmp_path, [".csv"])
+        (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "logs" / name).write_text("")
+    found = find_sources(tmp_path / "logs", [".csv"])
     assert [str(source) for source in found] == ["log_1.csv", "log_2.csv", "log_10.csv"]
     path = archive(tmp_path / "logs.tar.gz", *(member(f"logs/{name}") for name in names))
     in_archive = find_sources(path, [".csv"])
     assert [source.member.name for source in in_archive if source.member] == [
-        "logs/.log_3.csv",
         "logs/log_1.csv",
         "logs/log_2.csv",
         "logs/log_10.csv",

@@ -34,10 +34,4 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
     missing = [name for name in NEEDED if name not in dataset.features]
     if missing:
         raise BadInputError(f"{dataset.reference} cannot be exported: it lacks {', '.join(missing)}")
-    try:
-        EXPORTERS[format](dataset, out)
-    except ModuleNotFoundError as error:
-        extra = "minari" if format == "minari" else "hdf5"
-        raise BadInputError(
-            f'{format} needs the package {error.name}: pip install "astra-data[{extra}]"'
-        ) from error
+    EXPORTERS[format](dataset, out)

@@ -7,6 +7,7 @@ import numpy as np
 from astra_data.columns import ACTION, GOAL, REWARD, STATE, TERMINATED
 from astra_data.dataset.atomic import atomic_file
 from astra_data.dataset.reader import Dataset
+from astra_data.extras import optional
 
 VERSION = "2.1"
 
@@ -16,8 +17,7 @@ def export(dataset: Dataset, out: Path) -> None:
 
     Its algorithms take one observation, so the goal, where there is one, follows the state.
     """
-    import h5py  # noqa: PLC0415 - an extra
-
+    h5py = optional("h5py", "hdf5")
     observed = [STATE, GOAL] if GOAL in dataset.features else [STATE]
     with atomic_file(out) as path, h5py.File(path, "w") as file:
         file["columns"] = ["observations", "actions", "rewards", "terminated"]

@@ -4,19 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
+from astra_data.columns import TERMINATED, TRUNCATED
 from astra_data.dataset.atomic import atomic_file
 from astra_data.dataset.reader import Dataset
-
-_NAMES = {
-    STATE: "observations",
-    ACTION: "actions",
-    REWARD: "rewards",
-    NEXT_STATE: "next_observations",
-    TERMINATED: "terminals",
-    TRUNCATED: "timeouts",
-    GOAL: "infos/goal",
-}
+from astra_data.extras import optional
+from astra_data.layouts import D4RL
 
 
 def export(dataset: Dataset, out: Path) -> None:
@@ -25,19 +17,18 @@ def export(dataset: Dataset, out: Path) -> None:
     Goals (N, G) become infos/goal. The last step of every episode is a terminal or a timeout, since there is
     nothing else to tell the episodes apart.
     """
-    import h5py  # noqa: PLC0415 - an extra
-
+    h5py = optional("h5py", "hdf5")
     rows = int(dataset.lengths.sum())
-    columns = [column for column in dataset.schema if column.name in _NAMES]
+    columns = [column for column in dataset.schema if column.name in D4RL]
     with atomic_file(out) as path, h5py.File(path, "w") as file:
         for column in columns:
             shape = (rows,) if column.size == 1 else (rows, column.size)
-            file.create_dataset(_NAMES[column.name], shape, column.dtype)
+            file.create_dataset(D4RL[column.name], shape, column.dtype)
         first = 0
         for episode in dataset.episodes([column.name for column in columns]):
             values = dict(episode.columns)
             is_last = np.arange(len(episode)) == len(episode) - 1
             values[TRUNCATED] = (values[TRUNCATED] | is_last) & ~values[TERMINATED]
             for name, array in values.items():
-                file[_NAMES[name]][first : first + len(episode)] = array
+                file[D4RL[name]][first : first + len(episode)] = array
             first += len(episode)

@@ -20,6 +20,7 @@ from astra_data.columns import (
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.reader import Dataset
 from astra_data.errors import BadInputError
+from astra_data.extras import optional
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
@@ -35,7 +36,7 @@ def export(dataset: Dataset, out: Path) -> None:
         BadInputError: next states are not the states of the following steps, as Minari takes for granted, or
             the name of `out` is no id.
     """
-    import minari  # noqa: PLC0415 - an extra
+    minari = optional("minari", "minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
     from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415
     from minari.dataset.minari_storage import MinariStorage  # noqa: PLC0415

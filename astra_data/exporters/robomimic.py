@@ -6,6 +6,8 @@ from pathlib import Path
 from astra_data.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.dataset.atomic import atomic_file
 from astra_data.dataset.reader import Dataset
+from astra_data.extras import optional
+from astra_data.layouts import ROBOMIMIC
 
 VALID_SHARE = 0.1
 """Share of the episodes in mask/valid, as in robomimic's own split; the others are in mask/train."""
@@ -14,13 +16,13 @@ _GYM = 2
 
 
 def export(dataset: Dataset, out: Path) -> None:
-    """Write data/demo_i with actions (T, A), rewards, dones (T,), obs/state, next_obs/state (T, S).
+    """Write data/demo_i: actions (T, A), rewards, dones, truncated (T,), obs/state, next_obs/state (T, S).
 
+    `dones` is terminated alone: robomimic's learners do not bootstrap on it. `truncated` is for the way back.
     Goals (T, G) become obs/goal and next_obs/goal. mask/train and mask/valid follow the permutation of the
     nested subsets; a dataset of a single episode has only mask/train.
     """
-    import h5py  # noqa: PLC0415 - an extra
-
+    h5py = optional("h5py", "hdf5")
     goal = [GOAL] if GOAL in dataset.features else []
     environment = dataset.description["environment"]
     arguments = {
@@ -37,10 +39,12 @@ def export(dataset: Dataset, out: Path) -> None:
             demo = data.create_group(f"demo_{number}")
             demo.attrs["num_samples"] = len(episode)
             demo.attrs["episode_uid"] = episode.uid
-            values = episode.columns
-            demo["actions"] = values[ACTION].reshape(len(episode), -1)
-            demo["rewards"] = values[REWARD]
-            demo["dones"] = (values[TERMINATED] | values[TRUNCATED]).astype("int64")
+            values = dict(episode.columns)
+            values[ACTION] = values[ACTION].reshape(len(episode), -1)
+            for name in (TERMINATED, TRUNCATED):
+                values[name] = values[name].astype("int64")
+            for name, key in ROBOMIMIC.items():
+                demo[key] = values[name]
             demo["obs/state"], demo["next_obs/state"] = values[STATE], values[NEXT_STATE]
             for name in goal:
                 demo["obs/goal"] = demo["next_obs/goal"] = values[name]

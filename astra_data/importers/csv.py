@@ -16,7 +16,7 @@ SUFFIXES = (".csv", ".tsv")
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows; fields are numbers, or true and false, and an empty cell is NaN.
+    """Yield the rows; fields are whole numbers, numbers, or true and false, and an empty cell is NaN.
 
     Raises:
         BadInputError: fields are missing, doubled or no numbers.
@@ -58,11 +58,14 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
 
 
 def _numbers(texts: pa.StringArray, where: str) -> Array:
-    for kind in (pa.float64(), pa.bool_()):
+    whole = [] if texts.null_count else [pa.int64()]  # No integer stands for an empty cell.
+    for kind in (*whole, pa.float64(), pa.bool_()):
         try:
-            numbers = pc.cast(texts, kind).cast(pa.float64())
+            numbers = pc.cast(texts, kind)
         except pa.ArrowInvalid as error:
             fault = str(error)
             continue
-        return np.from_dlpack(numbers.fill_null(np.nan))
+        if kind == pa.int64():
+            return np.from_dlpack(numbers)
+        return np.from_dlpack(numbers.cast(pa.float64()).fill_null(np.nan))
     raise BadInputError(f"{where} and below: expected numbers, or true and false ({fault})")

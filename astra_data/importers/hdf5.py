@@ -5,25 +5,17 @@ from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
-from astra_data.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
+from astra_data.columns import NEXT_STATE, STATE, TRUNCATED
 from astra_data.errors import BadInputError
+from astra_data.extras import optional
 from astra_data.import_mapping import ImportMapping
-from astra_data.recording import BLOCK_ROWS, Block, Source, natural, optional, row_count
+from astra_data.layouts import D4RL, ROBOMIMIC
+from astra_data.recording import BLOCK_ROWS, Block, Source, natural, row_count
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 
-D4RL = {
-    STATE: "observations",
-    ACTION: "actions",
-    REWARD: "rewards",
-    TERMINATED: "terminals",
-    TRUNCATED: "timeouts",
-    NEXT_STATE: "next_observations",
-    GOAL: "infos/goal",
-}
 MOST_COMPRESSED = 10_000
 """No filter makes this many bytes of one; beyond, values were never written."""
-ROBOMIMIC = {ACTION: "actions", REWARD: "rewards", TERMINATED: "dones"}
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -34,7 +26,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
-        for group in _groups(file, mapping.episodes, str(source)):
+        for group in _groups(h5py, file, mapping.episodes, str(source)):
             origin = f"{source}{group.name}".rstrip("/")
             datasets = _datasets(h5py, group)
             order = slice(None, None, -1 if mapping.transposed else 1)
@@ -55,7 +47,8 @@ def layout(source: Source) -> dict[str, Any]:
     """Return the keys of a mapping for a file in the layout of D4RL or of robomimic.
 
     Of robomimic, the state is all of `obs` with one or two dimensions (images are left out), in the order of
-    their names; `dones` is taken for terminated, as robomimic's own learners do.
+    their names; `dones` is taken for terminated, as robomimic's own learners do. It may stay set while
+    success lasts: rows after its first are episodes of one step, left out unless truncation is told too.
 
     Raises:
         BadInputError: it is neither.
@@ -65,8 +58,7 @@ def layout(source: Source) -> dict[str, Any]:
         fields = _datasets(h5py, file)
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
-            ends = [field for field in ("terminals", "timeouts") if field in fields]
-            return {"columns": columns, "split": {"ends": ends}}
+            return {"columns": columns}
         demos = sorted({name.split("/")[1] for name in fields if name.startswith("data/demo_")}, key=natural)
         if not demos:
             raise BadInputError(
@@ -80,20 +72,36 @@ def layout(source: Source) -> dict[str, Any]:
             if found:
                 columns[name] = {"fields": sorted(found)}
         keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
+        if TRUNCATED not in columns:
+            keys["min_steps"] = 2
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
         fps = env_args.get("env_kwargs", {}).get("control_freq")
         return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
 
 
-def _groups(file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
+def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
+    groups = [file]
     if pattern is None:
-        return [file]
-    folder, _, names = pattern.rpartition("/")
-    parent = file.get(folder) if folder else file
-    found = sorted((name for name in parent or () if fnmatchcase(name, names)), key=natural)
-    if not found:
+        return groups
+    for part in pattern.strip("/").split("/"):
+        groups = [
+            _linked(h5py, group, name, origin)
+            for group in groups
+            for name in sorted(group, key=natural)
+            if fnmatchcase(name, part)
+        ]
+    if not groups:
         raise BadInputError(f"{origin}: no groups '{pattern}'; it has {', '.join(list(file)[:10])}")
-    return [parent[name] for name in found]
+    return groups
+
+
+def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN401 - of h5py
+    """Return the group `name` of `group`, unless the name stands for what may lie in another file."""
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise BadInputError(
+            f"{origin}{group.name.rstrip('/')}/{name} is a link; copy what it names into its place"
+        )
+    return group[name]
 
 
 def _check_storage(datasets: Mapping[str, Any], origin: str) -> None:

@@ -14,9 +14,10 @@ import numpy as np
 
 from astra_data.columns import Array
 from astra_data.errors import BadInputError
+from astra_data.extras import optional
 from astra_data.import_mapping import ImportMapping
 from astra_data.recipe import did_you_mean
-from astra_data.recording import BLOCK_ROWS, Block, Source, optional
+from astra_data.recording import BLOCK_ROWS, Block, Source
 
 SUFFIXES = (".mcap",)
 

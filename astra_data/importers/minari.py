@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from astra_data.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.extras import optional
 from astra_data.import_mapping import ImportMapping
-from astra_data.recording import Block, Source, optional, row_count
+from astra_data.recording import Block, Source, row_count
 
 GOAL_FIELD = "observations/desired_goal"
 

@@ -26,6 +26,7 @@ from astra_data.columns import (
 from astra_data.dataset import Dataset
 from astra_data.errors import BadInputError
 from astra_data.exporters import EXPORTERS, export
+from astra_data.imports import import_dataset
 
 EXTRA = (Column(NEXT_STATE, size=3), Column(GOAL, size=2))
 
@@ -127,9 +128,23 @@ def test_robomimic_has_a_group_per_demonstration(dataset: Dataset, tmp_path: Pat
                 ("next_obs/state", NEXT_STATE),
             ):
                 np.testing.assert_array_equal(demo[key][()], values[name])
-            np.testing.assert_array_equal(demo["dones"][()], values[TERMINATED] | values[TRUNCATED])
+            np.testing.assert_array_equal(demo["dones"][()], values[TERMINATED])
+            np.testing.assert_array_equal(demo["truncated"][()], values[TRUNCATED])
         assert [name.decode() for name in file["mask/train"][()]] == [f"demo_{number}" for number in range(5)]
         assert "valid" not in file["mask"]
+
+
+@pytest.mark.parametrize("format", ["d4rl", "robomimic"])
+def test_the_way_there_and_back_keeps_how_episodes_end(dataset: Dataset, tmp_path: Path, format: str) -> None:
+    export(dataset, tmp_path / "set.hdf5", format=format)
+    report = import_dataset([tmp_path / "set.hdf5"], out=tmp_path / "back", name="back", fps=10)
+    names = [ACTION, REWARD, TERMINATED, TRUNCATED]
+    back, expected = Dataset.open(report.root), dataset.columns(names)
+    assert back.lengths.tolist() == dataset.lengths.tolist()
+    assert expected[TERMINATED].any()
+    assert expected[TRUNCATED].any()
+    for name, values in back.columns(names).items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
 def test_robomimics_masks_share_the_episodes(tmp_path: Path) -> None:
@@ -164,6 +179,17 @@ def test_d3rlpy_has_arrays_per_episode(dataset: Dataset, tmp_path: Path) -> None
             assert file[f"terminated_{number}"][()] == values[TERMINATED][-1]
 
 
+def test_d3rlpy_is_told_how_the_last_step_ends(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    columns = next(dataset.episodes()).columns
+    inner = Episode(1, {**columns, TERMINATED: np.arange(len(columns[TERMINATED])) == 1})
+    monkeypatch.setattr(Dataset, "episodes", lambda *_: iter([inner]))
+    export(dataset, tmp_path / "set.h5", format="d3rlpy")
+    with h5py.File(tmp_path / "set.h5") as file:
+        assert not file["terminated_0"][()]
+
+
 @pytest.mark.parametrize("format", sorted(EXPORTERS))
 def test_nothing_is_overwritten_and_nothing_half_is_left(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
@@ -186,7 +212,9 @@ def test_what_is_missing_is_told(dataset: Dataset, tmp_path: Path, monkeypatch: 
     with pytest.raises(BadInputError, match=r"it lacks next\.observation\.state"):
         export(write_fake(tmp_path / "bare"), tmp_path / "a", format="d4rl")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(BadInputError, match=r'd4rl needs the package h5py: pip install "astra-data\[hdf5\]"'):
+    with pytest.raises(
+        BadInputError, match=r'h5py is needed and not installed: pip install "astra-data\[hdf5\]"'
+    ):
         export(dataset, tmp_path / "a", format="d4rl")
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(BadInputError, match=r'pip install "astra-data\[minari\]"'):

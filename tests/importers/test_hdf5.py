@@ -41,13 +41,23 @@ def test_d4rl_needs_no_mapping(tmp_path: Path) -> None:
     assert dataset.info["fps"] == 20
 
 
-def test_without_next_observations_each_episode_loses_its_last_step(tmp_path: Path) -> None:
+def test_without_next_observations_a_terminal_step_is_kept_and_others_lose_their_last_row(
+    tmp_path: Path,
+) -> None:
     fields = d4rl(tmp_path / "ant.hdf5", next_observations=False)
     dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
-    assert dataset.lengths.tolist() == [6, 4]
-    assert report.tally.last_rows == 2
-    state = fields["observations"]
-    np.testing.assert_array_equal(dataset.columns([NEXT_STATE])[NEXT_STATE], [*state[1:7], *state[8:]])
+    assert dataset.lengths.tolist() == [7, 4]
+    assert report.tally.last_rows == 1
+    assert report.tally.last_reward == fields["rewards"][11]
+    state, got = fields["observations"], dataset.columns([NEXT_STATE, TERMINATED, TRUNCATED, REWARD])
+    np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], state[6], *state[8:]])
+    np.testing.assert_array_equal(got[TERMINATED], fields["terminals"][:11])
+    np.testing.assert_array_equal(got[TRUNCATED], np.arange(11) == 10)
+    np.testing.assert_array_equal(got[REWARD], fields["rewards"][:11])
+    assert (
+        "where an episode terminates, not recorded"
+        in dataset.info["features"][NEXT_STATE]["astra"]["meaning"]
+    )
 
 
 def test_d4rl_needs_a_name_and_fps(tmp_path: Path) -> None:
@@ -121,6 +131,34 @@ def test_groups_that_do_not_exist_are_told(tmp_path: Path) -> None:
         file["runs/x"] = np.zeros(3)
     with pytest.raises(BadInputError, match="no groups 'demos/\\*'; it has runs"):
         imported(tmp_path, tmp_path / "log.h5", 'episodes = "demos/*"\n' + MAPPING)
+
+
+def test_dones_that_stay_set_end_an_episode_once(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "lift.hdf5", "w") as file:
+        for demo in ("demo_0", "demo_1"):
+            for field in ("obs/x", "next_obs/x", "actions"):
+                file[f"data/{demo}/{field}"] = np.zeros((5, 2))
+            file[f"data/{demo}/dones"] = np.array([0, 0, 1, 1, 1])
+    dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", fps=20)
+    assert dataset.lengths.tolist() == [3, 3]
+    assert report.tally.short_rows == 4
+
+
+@pytest.mark.parametrize("link", [h5py.ExternalLink("secret.h5", "/"), h5py.SoftLink("/kept")])
+@pytest.mark.parametrize("place", ["runs/two", "runs"])
+def test_groups_that_are_links_are_refused(tmp_path: Path, link: object, place: str) -> None:
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        for name, values in rows().items():
+            secret[name] = secret[f"one/{name}"] = values
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in rows().items():
+            file[f"kept/{name}"] = file[f"kept/one/{name}"] = values
+            if place == "runs/two":
+                file[f"runs/one/{name}"] = values
+        file[place] = link
+    with pytest.raises(BadInputError, match=f"log.h5/{place} is a link; copy what it names into its place"):
+        imported(tmp_path, tmp_path / "log.h5", 'episodes = "runs/*"\n' + MAPPING)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("kind", ["link", "virtual", "external"])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import LENGTHS, MAPPING, TABLES, imported, rows, write_table
+from recordings import LENGTHS, MAPPING, STEPS, TABLES, imported, rows, write_table
 
 from astra_data.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.errors import BadInputError
@@ -21,22 +21,23 @@ def test_every_value_arrives(
         monkeypatch.setattr(module, "BLOCK_ROWS", block_rows)
     fields = rows()
     dataset, report = imported(tmp_path, write_table(tmp_path / name, fields))
-    assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
-    kept = np.concatenate([np.arange(n - 1) + first for n, first in zip(LENGTHS, (0, 6, 15), strict=True)])
+    assert dataset.lengths.tolist() == list(STEPS)
+    kept = np.concatenate([np.arange(n) + first for n, first in zip(STEPS, (0, 6, 15), strict=True)])
+    following = np.where(fields["fell"][kept], kept, kept + 1)
     position = np.stack([fields["x"], fields["y"]], axis=1) * 0.001
     got = dataset.columns([STATE, NEXT_STATE, ACTION, REWARD, TERMINATED, TRUNCATED, DONE, "gait"])
     np.testing.assert_array_equal(got[STATE], position[kept].astype(np.float32))
-    np.testing.assert_array_equal(got[NEXT_STATE], position[kept + 1].astype(np.float32))
+    np.testing.assert_array_equal(got[NEXT_STATE], position[following].astype(np.float32))
     np.testing.assert_array_equal(got[ACTION], np.clip(fields["command"], -1, 1)[kept].astype(np.float32))
     np.testing.assert_array_equal(got[REWARD], fields["reward"][kept].astype(np.float32))
     np.testing.assert_array_equal(got[TERMINATED], fields["fell"][kept])
-    np.testing.assert_array_equal(np.flatnonzero(got[TRUNCATED]), np.cumsum(dataset.lengths) - 1)
-    np.testing.assert_array_equal(got[DONE], got[TERMINATED] | got[TRUNCATED])
+    np.testing.assert_array_equal(np.flatnonzero(got[DONE]), np.cumsum(dataset.lengths) - 1)
+    np.testing.assert_array_equal(got[TRUNCATED], got[DONE] & ~got[TERMINATED])
     np.testing.assert_array_equal(got["gait"], fields["gait"][kept])
     assert dataset.verify() == []
     tally = report.tally
-    assert (report.episodes, report.frames, tally.rows) == (3, sum(LENGTHS) - 3, sum(LENGTHS))
-    assert (tally.split_points, tally.last_rows, tally.rejected_rows) == ({"field": 2}, 3, 0)
+    assert (report.episodes, report.frames, tally.rows) == (3, sum(STEPS), sum(LENGTHS))
+    assert (tally.split_points, tally.last_rows, tally.rejected_rows) == ({"field": 2}, 2, 0)
     assert dataset.description["split_points"] == {"field": 2}
     assert dataset.metadata["source_row"] == [0, 6, 15]
     assert dataset.metadata["source"] == [name] * 3
@@ -84,13 +85,13 @@ def test_text_tells_episodes_apart(tmp_path: Path) -> None:
     fields = rows()
     names = np.array(["first", "2", "last"])[fields["trial"].astype(int)]
     dataset, _ = imported(tmp_path, write_table(tmp_path / "log.csv", fields | {"trial": names}))
-    assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
+    assert dataset.lengths.tolist() == list(STEPS)
 
 
 def test_csv_whose_later_blocks_look_different(tmp_path: Path) -> None:
     # Two blocks of 1 MB: whole numbers and labels that look like numbers first, then others.
     n = 60_000
-    lines = [f"{i},1,0,0,1,1,2,{'0' * 20}\n" for i in range(n)]
+    lines = [f"{i},1,0,0,0,1,2,{'0' * 20}\n" for i in range(n)]
     lines += [f"{i}.5,,0.5,0,0,1,b,zzz\n" for i in range(n)]
     path = tmp_path / "log.csv"
     path.write_text("x,y,command,reward,fell,gait,trial,unused\n" + "".join(lines))
@@ -139,3 +140,40 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(BadInputError, match=r'h5py .*not installed: pip install "astra-data\[hdf5\]"'):
         imported(tmp_path, path)
+
+
+STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_integers_arrive_exactly(tmp_path: Path, name: str) -> None:
+    stamps = 1_700_000_000_050_000_002 + np.arange(20) * 10**8
+    dataset, _ = imported(tmp_path, write_table(tmp_path / name, rows() | {"stamp": stamps}), STAMPED)
+    expected = np.concatenate([stamps[:5], stamps[6:15], stamps[15:19]])
+    np.testing.assert_array_equal(dataset.columns(["gait"])["gait"], expected)
+
+
+@pytest.mark.parametrize("last", ["", "0.5"])
+def test_integers_that_floats_would_alter_are_told(tmp_path: Path, last: str) -> None:
+    stamps = np.array(["1700000000050000002"] * 19 + [last])
+    path = write_table(tmp_path / "log.csv", rows() | {"stamp": stamps})
+    told = r"numbers of 2\^53 or more came as floats" if not last else "expected whole numbers"
+    with pytest.raises(BadInputError, match=f"gait: {told}"):
+        imported(tmp_path, path, 'not_finite = "drop"\n' + STAMPED)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("spec", ['fields = ["stamp", "x"]', 'fields = ["stamp"]\nscale = [1.0]'])
+def test_integers_that_become_floats_on_their_way_are_told(tmp_path: Path, spec: str) -> None:
+    fields = rows() | {"stamp": np.full(20, 2**60 + 1), "x": np.zeros(20)}
+    with pytest.raises(BadInputError, match=r"gait: numbers of 2\^53 or more came as floats"):
+        imported(
+            tmp_path, write_table(tmp_path / "log.npz", fields), MAPPING.replace('fields = ["gait"]', spec)
+        )
+
+
+def test_large_integers_need_a_dtype_that_holds_them(tmp_path: Path) -> None:
+    fields = rows() | {"stamp": np.full(20, 2**60 + 1)}
+    mapping = STAMPED.replace('dtype = "int64"\n', "")
+    with pytest.raises(BadInputError, match=r"gait: integers beyond 2\^53 do not fit float32; set dtype"):
+        imported(tmp_path, write_table(tmp_path / "log.npz", fields), mapping)
