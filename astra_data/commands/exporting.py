@@ -11,7 +11,9 @@ from astra_data.commands.arguments import DatasetName
 def export(
     dataset: DatasetName,
     format: Annotated[str, typer.Option(help="minari, d4rl, robomimic or d3rlpy.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="The new file; a folder for minari.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option(help="The new file; for minari a folder, maze/random-v0.", show_default=False)
+    ],
 ) -> None:
     """Write a dataset in the format of another library."""
     from astra_data.dataset.versions import open_dataset

@@ -44,11 +44,12 @@ def export(dataset: Dataset, out: Path) -> None:
 
     shelf, place = get_dataset_path().resolve(), out.resolve()
     name = str(place.relative_to(shelf)) if place.is_relative_to(shelf) else place.name
+    # Without a version its own parser ends in a TypeError.
     try:
         parse_dataset_id(name)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise BadInputError(
-            f"{out}: '{name}' is no id of Minari, expected one such as maze/random-v0"
+            f"{out}: '{name}' is no id of Minari; end --out with a name and a version, such as maze/random-v0"
         ) from error
 
     def box(column: str) -> Box:
@@ -57,7 +58,8 @@ def export(dataset: Dataset, out: Path) -> None:
 
     goal = {"desired_goal": box(GOAL)} if GOAL in dataset.features else {}
     observed = Dict({"observation": box(STATE), **goal}) if goal else box(STATE)
-    with atomic_folder(out) as folder:
+    # Minari mixes up relative paths.
+    with atomic_folder(place) as folder:
         storage = MinariStorage.new(folder / "data", observed, box(ACTION), data_format="hdf5")
         description = f"{dataset.reference}, content hash {dataset.content_hash}"
         about = {"dataset_id": name, "minari_version": minari.__version__, "description": description}

@@ -56,7 +56,8 @@ def test_minari_loads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_go
 
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     dataset = write(tmp_path / "set", has_goal=has_goal)
-    export(dataset, tmp_path / "minari/fake/random-v2", format="minari")
+    monkeypatch.chdir(tmp_path)
+    export(dataset, Path("minari/fake/random-v2"), format="minari")
     loaded = minari.load_dataset("fake/random-v2")
     assert (loaded.total_episodes, loaded.total_steps) == (5, 55)
     assert loaded.spec.dataset_id == "fake/random-v2"
@@ -84,6 +85,8 @@ def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
         export(apart, tmp_path / "random-v0", format="minari")
     with pytest.raises(BadInputError, match="no id of Minari"):
         export(apart, tmp_path / "no id!", format="minari")
+    with pytest.raises(BadInputError, match="no id of Minari; end --out with a name and a version"):
+        export(apart, tmp_path / "without-version", format="minari")
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
