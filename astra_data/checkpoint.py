@@ -1,6 +1,5 @@
 """Weights and training states on disk: safetensors and JSON, whole or not at all, nothing unpickled."""
 
-import hashlib
 import json
 import os
 import re
@@ -15,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from astra_data.digest import file_digest
 from astra_data.errors import BadInputError
 
 type Nested = (
@@ -51,7 +51,7 @@ def _with_sorted_metadata(data: bytes) -> bytes:
 
 def file_hash(path: Path) -> str:
     """Return the sha256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return file_digest(path)
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
