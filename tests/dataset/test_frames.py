@@ -138,7 +138,7 @@ def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: p
 
 
 def test_processes_map_the_same_columns_at_once(fake: Dataset, tmp_path: Path) -> None:
-    script = Path(__file__).with_name("mapped_rounds.py")
+    script = Path(__file__).parents[1] / "mapped_rounds.py"
     command = [sys.executable, *map(str, (script, fake.root, tmp_path))]
     processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
     told = [process.communicate(timeout=120)[1] for process in processes]
