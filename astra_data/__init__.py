@@ -3,7 +3,7 @@
 The house, from the ground up; a file uses only what is below it or beside it, never what is above:
 
 words       errors  extras  columns  layouts  seeding  recipe  rows  batched  simulator  progress  statistics
-            lock  cores
+            digest  lock  cores
 knowledge   geometry  mazes  free_space  navigation  ant  physics  abstraction  checkpoint  models/
             recording  import_mapping  conversion
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/

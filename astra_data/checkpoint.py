@@ -1,6 +1,5 @@
 """Weights and training states on disk: safetensors and JSON, whole or not at all, nothing unpickled."""
 
-import hashlib
 import json
 import os
 import re
@@ -47,11 +46,6 @@ def _with_sorted_metadata(data: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data[start:]
-
-
-def file_hash(path: Path) -> str:
-    """Return the sha256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

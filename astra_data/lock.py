@@ -8,11 +8,14 @@ from pathlib import Path
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[bool]:
-    """Hold the lock of `folder`, which dies with its process; yield False if another process does."""
+def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
+    """Hold the lock of `folder`, which dies with its process.
+
+    If another process holds it, yield False, or with `wait` do so only once it is free.
+    """
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         yield False
     else:

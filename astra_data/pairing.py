@@ -1,6 +1,5 @@
 """What pairing needs of an abstract simulator: those of the tasks, and your own."""
 
-import hashlib
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from astra_data.columns import ABSTRACT_STATE, Array, Column
+from astra_data.digest import file_digest
 from astra_data.errors import BadInputError
 from astra_data.mazes import Maze
 from astra_data.simulator import AbstractSimulator
@@ -65,7 +65,7 @@ def pairing_named(name: str) -> Pairing:
     column = made.abstract_state
     if not isinstance(column, Column):
         raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
-    origin = {"file_sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
+    origin = {"file_sha256": file_digest(Path(path))}
     return Pairing(kind, origin, None, replace(column, name=ABSTRACT_STATE), made.abstraction, made)
 
 

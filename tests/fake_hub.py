@@ -159,7 +159,8 @@ class Handler(BaseHTTPRequestHandler):
     def info(self, repo: Repository, revision: str = "main") -> None:
         if repo.files(revision) is None:
             return self._missing("RevisionNotFound")
-        return self._answer({"id": "me/it", "sha": repo.head if revision == "main" else revision})
+        sha = repo.head if revision == "main" else revision
+        return self._answer({"id": "me/it", "sha": sha, "private": repo.private})
 
     def tree(self, repo: Repository, revision: str, path: str = "") -> None:
         files = repo.files(revision)

@@ -43,7 +43,11 @@ def subset(
 
 def merge(
     datasets: Annotated[
-        list[str], typer.Argument(metavar="DATASET...", help="Two or more, with equal columns, fps and task.")
+        list[str],
+        typer.Argument(
+            metavar="DATASET...",
+            help="Two or more, with equal columns, fps, task, environment and simulator.",
+        ),
     ],
     new_uids: Annotated[
         bool, typer.Option("--new-uids", help="Give episodes whose uid is taken a new one.")

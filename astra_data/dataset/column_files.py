@@ -9,7 +9,11 @@ import numpy as np
 from astra_data.columns import Array
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.reader import Dataset
-from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.errors import CorruptDatasetError
+from astra_data.lock import held
+
+MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""Bytes that the processes of a container may take, or "max"; absent outside of one."""
 
 
 def cache_folder() -> Path:
@@ -18,27 +22,34 @@ def cache_folder() -> Path:
 
 
 def memory_bytes() -> int:
-    """Return the size of this machine's memory."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Return the size of this machine's memory, or of the share of it that a container has."""
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    limit = MEMORY_LIMIT.read_text().strip() if MEMORY_LIMIT.exists() else "max"
+    return machine if limit == "max" else min(machine, int(limit))
 
 
 def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[str, Array]:
     """Map whole columns, (N, size) or (N,), from raw files in `cache`, which are written where missing.
 
-    <cache>/<content hash>/<column>/values.npy; what is written to the arrays stays in this process.
+    <cache>/<content hash>/<column>/values.npy; what is written to the arrays stays in this process. One
+    process at a time writes a dataset's files, and the others wait for them.
 
     Raises:
         BadInputError: a column does not exist.
         CorruptDatasetError: the dataset or a raw file cannot be read.
     """
-    folders = {name: cache / dataset.content_hash / name for name in names}
-    for column in dataset.specs(names):
-        folder = folders[column.name]
-        if not folder.exists():
-            shape = (int(dataset.lengths.sum()), *([column.size] if column.size > 1 else []))
-            _write(dataset, column.name, column.dtype, shape, folder)
+    specs = dataset.specs(names)
+    parent = cache / dataset.content_hash
+    parent.mkdir(parents=True, exist_ok=True)
+    with held(parent, wait=True):
+        for column in specs:
+            folder = parent / column.name
+            if not folder.exists():
+                shape = (int(dataset.lengths.sum()), *([column.size] if column.size > 1 else []))
+                _write(dataset, column.name, column.dtype, shape, folder)
     columns: dict[str, Array] = {}
-    for name, folder in folders.items():
+    for name in names:
+        folder = parent / name
         try:
             columns[name] = np.load(folder / "values.npy", mmap_mode="c")
         except (OSError, ValueError) as error:
@@ -47,18 +58,13 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
 
 
 def _write(dataset: Dataset, name: str, dtype: str, shape: tuple[int, ...], folder: Path) -> None:
-    try:
-        with atomic_folder(folder) as unfinished:
-            path = unfinished / "values.npy"
-            values = np.lib.format.open_memmap(  # type: ignore[no-untyped-call]
-                path, mode="w+", dtype=np.dtype(dtype), shape=shape
-            )
-            row = 0
-            for block in dataset.blocks([name]):
-                values[row : row + len(block[name])] = block[name]
-                row += len(block[name])
-            values.flush()
-    except BadInputError:
-        # Another process was faster: what it wrote is the same.
-        if not folder.exists():
-            raise
+    with atomic_folder(folder) as unfinished:
+        path = unfinished / "values.npy"
+        values = np.lib.format.open_memmap(  # type: ignore[no-untyped-call]
+            path, mode="w+", dtype=np.dtype(dtype), shape=shape
+        )
+        row = 0
+        for block in dataset.blocks([name]):
+            values[row : row + len(block[name])] = block[name]
+            row += len(block[name])
+        values.flush()

@@ -55,6 +55,14 @@ def schema_differences(a: Dataset, b: Dataset) -> list[str]:
     return told
 
 
+def world_differences(a: Dataset, b: Dataset) -> list[str]:
+    """List how the environment and the simulator that `b` comes from differ from those of `a`."""
+    ours, theirs = (
+        {key: dataset.description[key] for key in ("environment", "simulator")} for dataset in (a, b)
+    )
+    return list(_value_differences(ours, theirs))
+
+
 def _facts(column: Column) -> dict[str, Any]:
     return {**vars(column), "astra": column.astra or {}}
 

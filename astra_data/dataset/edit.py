@@ -5,13 +5,13 @@ folder. Only `out` says where; without it the new version goes to its place at h
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from astra_data.columns import Scalar
-from astra_data.dataset.compare import schema_differences
+from astra_data.columns import Episode, Scalar
+from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.provenance import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import successor
@@ -134,9 +134,10 @@ def merge(sources: Sequence[Dataset], *, new_uids: bool = False, out: Path | Non
     """Write the episodes of all `sources` one after another; the first gives name, version and seeds.
 
     Args:
-        sources: two datasets at least, with equal columns, fps and task.
+        sources: two datasets at least, with equal columns, fps, task, environment and simulator.
         new_uids: whether an episode whose uid an earlier one has gets a new one, the same in every run;
-            its old one is kept as "source_episode". Otherwise that is refused.
+            its old one is kept as "merged_uid", and a "source_episode" in the same dataset is still named.
+            Otherwise that is refused.
         out: folder of the new dataset.
 
     Raises:
@@ -145,20 +146,38 @@ def merge(sources: Sequence[Dataset], *, new_uids: bool = False, out: Path | Non
     if len(sources) < 2:
         raise BadInputError("expected two datasets or more to merge")
     first, *others = sources
-    faults = [fault for other in others for fault in schema_differences(first, other)]
+    faults = [
+        f"{other.reference}: {fault}"
+        for other in others
+        for fault in (*schema_differences(first, other), *world_differences(first, other))
+    ]
     if faults:
-        raise BadInputError("the datasets do not fit together:\n  " + "\n  ".join(faults))
-    names = list(_merged_uids(sources, new_uids))
+        raise BadInputError(
+            f"the datasets do not fit together: expected the columns, fps, task, environment and simulator "
+            f"of {first.reference} in all of them; merge those apart that share them:\n  "
+            + "\n  ".join(faults)
+        )
+    names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
     description, folder = successor(
         first, "episodes", stage="merge", config=config, out=out, parents=tuple(others)
     )
     with _writer(first, folder, description, first.subset_seed) as writer:
-        episodes = (episode for source in sources for episode in source.episodes())
-        for uid, episode in zip(names, episodes, strict=True):
-            origin = {} if uid == episode.uid else {"source_episode": episode.uid}
-            writer.add(replace(episode, uid=uid, metadata=origin | dict(episode.metadata)))
+        for source, named in zip(sources, names, strict=True):
+            for episode in source.episodes():
+                writer.add(_renamed(episode, named))
     return folder
+
+
+def _renamed(episode: Episode, names: Mapping[int, int]) -> Episode:
+    metadata = dict(episode.metadata)
+    origin = metadata.get("source_episode")
+    if isinstance(origin, int):
+        metadata["source_episode"] = names.get(origin, origin)
+    uid = names[episode.uid]
+    if uid != episode.uid:
+        metadata["merged_uid"] = episode.uid
+    return replace(episode, uid=uid, metadata=metadata)
 
 
 def _write(
@@ -230,28 +249,29 @@ def _stratified(source: Dataset, key: str, strata: Mapping[str, int], seed: int)
     return sorted(place, key=lambda uid: place[uid])
 
 
-def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> Iterator[int]:
-    everything = [(source, uid) for source in sources for uid in _uids(source)]
-    known = {uid for _, uid in everything}
+def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:
+    """Return, for each of `sources`, the uids that its episodes get, by those that they have."""
+    known = {uid for source in sources for uid in _uids(source)}
     repeated: list[int] = []
     taken: set[int] = set()
-    names = []
-    for source, uid in everything:
-        name = uid
-        if uid in taken:
-            repeated.append(uid)
-            while name in known:
-                digest = hashlib.sha256(f"{source.content_hash} {name}".encode()).digest()
-                name = int.from_bytes(digest[:8]) >> 1
-            known.add(name)
-        taken.add(name)
-        names.append(name)
+    names: list[dict[int, int]] = [{} for _ in sources]
+    for source, named in zip(sources, names, strict=True):
+        for uid in _uids(source):
+            name = uid
+            if uid in taken:
+                repeated.append(uid)
+                while name in known:
+                    digest = hashlib.sha256(f"{source.content_hash} {name}".encode()).digest()
+                    name = int.from_bytes(digest[:8]) >> 1
+                known.add(name)
+            taken.add(name)
+            named[uid] = name
     if repeated and not new_uids:
         raise BadInputError(
             f"{len(repeated)} episodes have the uid of an earlier one ({_listed(sorted(repeated))}): leave "
             "them out, or give them new ones with --new-uids"
         )
-    yield from names
+    return names
 
 
 def _listed(uids: Sequence[int]) -> str:

@@ -1,5 +1,6 @@
 """The order in which samples are drawn, which can be left and taken up again."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -80,14 +81,19 @@ class Order:
         """Go on where `state` was taken.
 
         Raises:
-            BadInputError: it is of another order; lists the differences.
+            BadInputError: it is of another order, or names a batch that there is not; lists every fault.
         """
         faults = [
             f"{key} is {state.get(key)!r}, expected {value!r}"
             for key, value in self._facts.items()
             if state.get(key) != value
         ]
-        faults += [f"{key} is missing" for key in ("epoch", "batch") if key not in state]
+        places = {"epoch": (math.inf, "0 or more"), "batch": (len(self), f"0 to {len(self) - 1}")}
+        faults += [
+            f"{key} is {state.get(key)!r}, expected {expected}"
+            for key, (end, expected) in places.items()
+            if type(state.get(key)) is not int or not 0 <= state[key] < end
+        ]
         if faults:
             raise BadInputError(f"the state is of another order of samples: {'; '.join(faults)}")
         self.epoch, self.batch = state["epoch"], state["batch"]

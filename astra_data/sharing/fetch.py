@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from astra_data.digest import file_digest
 from astra_data.errors import SharingError
 from astra_data.sharing.store import RemoteFolder
-from astra_data.sharing.sums import file_digest
 
 BLOCK_BYTES = 2**24
 """Asked for at once."""

@@ -27,15 +27,27 @@ class HubStore:
         """Take the repository; nothing is asked yet."""
         self._repo = repo
 
-    def create(self, *, private: bool) -> None:
+    def create(self, card: Path, *, private: bool) -> None:
         """Make the repository unless it exists.
 
+        Args:
+            card: a folder with the README.md that it is to get, which the Hub checks first.
+            private: whether nobody else may see it.
+
         Raises:
+            BadInputError: the Hub does not take the card, or the repository is public and not to be.
             SharingError: the Hub refuses or cannot be reached.
         """
         with _told(self._repo) as api:
+            _validate(api, (card / "README.md").read_text(encoding="utf-8"))
             # None leaves it to what the user or the organisation prefers.
             api.create_repo(self._repo, repo_type=KIND, private=private or None, exist_ok=True)
+            if private and not api.repo_info(self._repo, repo_type=KIND).private:
+                raise BadInputError(
+                    f"{self._repo} exists already and is public, expected a private repository. Nothing was "
+                    "uploaded: make it private in its settings on the Hub, choose another, or leave out "
+                    "--private."
+                )
 
     def versions(self) -> list[Version]:
         """Return the tagged versions, the oldest first."""
@@ -127,6 +139,22 @@ class HubStore:
             tags = api.list_repo_refs(self._repo, repo_type=KIND).tags
         versions = ((Version.from_tag(tag.name), tag.target_commit) for tag in tags)
         return {version: commit for version, commit in versions if version}
+
+
+def _validate(api: "HfApi", card: str) -> None:
+    """Ask the Hub whether it takes `card`; a commit asks only once there is a repository to commit to."""
+    from huggingface_hub import get_session, get_token, hf_raise_for_status  # noqa: PLC0415 - slow to import
+
+    token = get_token()
+    answer = get_session().post(
+        f"{api.endpoint}/api/validate-yaml",
+        json={"content": card, "repoType": KIND},
+        headers={"Authorization": f"Bearer {token}"} if token else {},
+    )
+    if answer.status_code == 400:
+        faults = "; ".join(str(fault.get("message")) for fault in answer.json().get("errors", []))
+        raise ValueError(f"faults in the card: {faults}")
+    hf_raise_for_status(answer)
 
 
 @contextmanager

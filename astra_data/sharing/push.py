@@ -3,6 +3,7 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from astra_data.dataset import Dataset
 from astra_data.dataset.versions import Version, open_dataset
 from astra_data.errors import BadInputError, CorruptDatasetError
 from astra_data.progress import Progress, silent
@@ -11,7 +12,7 @@ from astra_data.sharing.address import Hub, Url, parse_place
 from astra_data.sharing.card import write_card
 from astra_data.sharing.hub import HubStore
 from astra_data.sharing.notes import Notes
-from astra_data.sharing.store import Store
+from astra_data.sharing.store import RemoteFolder, Store
 from astra_data.sharing.sums import SUMS_PATH, make_sums
 from astra_data.sharing.urls import UrlStore
 
@@ -31,14 +32,15 @@ def push(
         destination: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or any URL that fsspec
             knows, below which <name>/data-<version>/ is made.
         notes: TOML file with the human part of the card, see `Notes`.
-        private: whether a repository that is made on the Hub is private.
+        private: whether the repository on the Hub is private: one that is made is, a public one is refused.
         progress: is told how far it is.
 
     Returns:
         where `pull` finds it, with its version.
 
     Raises:
-        BadInputError: there is no such dataset, or the place holds this version with other values.
+        BadInputError: there is no such dataset, the place holds something else under this version, the
+            Hub does not take the card, or a repository that is to be private is public.
         CorruptDatasetError: the dataset is incomplete or was altered.
         RecipeError: the notes are not what they should be.
         SharingError: the place refuses or cannot be reached.
@@ -52,24 +54,29 @@ def push(
     if faults:
         raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
     version = Version.parse(local.description["version"])
-    store: Store
-    if isinstance(place, Hub):
-        store = hub = HubStore(place.repo)
-        hub.create(private=private)
-    else:
+    if isinstance(place, Url):
         place = Url(f"{place}/{local.description['name']}")
-        store = UrlStore(place.url)
-    if version in store.versions():
-        there = store.folder(version).description()
-        if there.get("content_hash") != local.content_hash:
-            raise BadInputError(
-                f"{place} has another {version.tag}: its content hash is {there.get('content_hash')}, not "
-                f"{local.content_hash}. Versions never change: give the dataset a new one, or push elsewhere."
-            )
-        return f"{place}@{version.tag}"
     with TemporaryDirectory() as folder:
         card = Path(folder)
-        (card / SUMS_PATH).write_text(make_sums(local.root), encoding="utf-8")
         write_card(local, card / "README.md", written, source=str(place))
-        store.upload(local, card, progress)
+        store: Store
+        if isinstance(place, Hub):
+            store = hub = HubStore(place.repo)
+            hub.create(card, private=private)
+        else:
+            store = UrlStore(place.url)
+        if version in store.versions():
+            _refuse_change(store.folder(version), local)
+        else:
+            (card / SUMS_PATH).write_text(make_sums(local.root), encoding="utf-8")
+            store.upload(local, card, progress)
     return f"{place}@{version.tag}"
+
+
+def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
+    found = there.description().get("content_hash")
+    if found != local.content_hash:
+        raise BadInputError(
+            f"{there.name} holds other values: its content hash is {found}, not {local.content_hash}. "
+            "Versions never change: give the dataset a new one, or push elsewhere."
+        )

@@ -1,10 +1,10 @@
 """SHA256SUMS: which files a shared dataset has, and what each of them holds; `sha256sum -c` reads it too."""
 
-import hashlib
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
+from astra_data.digest import file_digest
 from astra_data.errors import SharingError
 
 SUMS_PATH = "SHA256SUMS"
@@ -24,12 +24,6 @@ def dataset_files(root: Path) -> list[str]:
 def make_sums(root: Path) -> str:
     """Return SHA256SUMS of the dataset in folder `root`."""
     return "".join(f"{file_digest(root / path)}  {path}\n" for path in dataset_files(root))
-
-
-def file_digest(path: Path) -> str:
-    """Return the sha256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def parse_sums(text: str, source: str) -> Mapping[str, str]:

@@ -10,7 +10,7 @@ from astra_data.dataset.versions import Version
 from astra_data.errors import AstraDataError, BadInputError, SharingError
 from astra_data.progress import Progress
 from astra_data.sharing.store import RemoteFolder
-from astra_data.sharing.sums import dataset_files
+from astra_data.sharing.sums import SUMS_PATH, dataset_files
 
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 """Which extra of this package reads which URLs."""
@@ -57,20 +57,43 @@ class UrlStore:
         return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self._url}/{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Add `dataset`: `layout.DATASET_PATH` is written last and marks it as whole."""
+        """Add `dataset`: `layout.DATASET_PATH` is written last and marks it as whole.
+
+        SHA256SUMS is written first and says whose folder it is: an upload that was stopped is gone over
+        again by the next one of the same files, and nothing that is there is ever deleted.
+
+        Raises:
+            BadInputError: the folder holds other files.
+            SharingError: the place refuses or cannot be reached.
+        """
         version = Version.parse(dataset.description["version"])
-        folder = self.folder(version).path
+        remote = self.folder(version)
+        sums = card / SUMS_PATH
         files = {path: dataset.root / path for path in dataset_files(dataset.root)}
-        files |= {path.name: path for path in sorted(card.iterdir())}
+        files |= {path.name: path for path in sorted(card.iterdir()) if path != sums}
         files[layout.DATASET_PATH] = files.pop(layout.DATASET_PATH)
         with _told(self._url):
-            if self._filesystem.exists(folder):
-                # What an upload left that never came to its end, perhaps of other values.
-                self._filesystem.rm(folder, recursive=True)
+            self._filesystem.invalidate_cache()
+            if not self._filesystem.find(remote.path):
+                self._filesystem.put_file(str(sums), f"{remote.path}/{SUMS_PATH}")
             for number, (path, file) in enumerate(files.items()):
+                # Each time anew: a push of other values may have begun at the same moment.
+                self._refuse_others(remote, sums.read_bytes())
                 progress(number / len(files), path)
-                self._filesystem.put_file(str(file), f"{folder}/{path}")
+                self._filesystem.put_file(str(file), f"{remote.path}/{path}")
         progress(1.0, f"{len(files)} files")
+
+    def _refuse_others(self, remote: RemoteFolder, sums: bytes) -> None:
+        try:
+            there = self._filesystem.cat_file(f"{remote.path}/{SUMS_PATH}")
+        except FileNotFoundError:
+            there = None
+        if there != sums:
+            raise BadInputError(
+                f"{remote.name} exists already and holds something else: other files, or a part of another "
+                f"push of this version, stopped or going on right now. Nothing in it is replaced: look at it "
+                "and delete it, give the dataset a new version, or push elsewhere."
+            )
 
     def _mark(self, version: Version) -> str:
         return f"{self.folder(version).path}/{layout.DATASET_PATH}"

@@ -10,7 +10,6 @@ from pydantic import model_validator
 from torch import Tensor
 
 from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands
-from astra_data.checkpoint import file_hash
 from astra_data.columns import (
     ACTION,
     DONE,
@@ -28,6 +27,7 @@ from astra_data.columns import (
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
 from astra_data.deployment import DeployedPolicy
+from astra_data.digest import file_digest
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding
@@ -111,7 +111,7 @@ def collect(
     world = task_named(task)
     began = time.perf_counter()
     saved = {
-        f"{kind}_sha256": file_hash(path) for kind, path in _saved_files(config).items() if path.is_file()
+        f"{kind}_sha256": file_digest(path) for kind, path in _saved_files(config).items() if path.is_file()
     }
     description = {
         "name": name or f"{task}-{config.behavior}-seed{seed}".replace("_", "-"),

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, fake_episode, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, write_fake, writer
 
 from astra_data.columns import STATE, Column
 from astra_data.dataset import Dataset
@@ -156,9 +156,37 @@ def test_repeated_uids_are_refused_or_replaced(tmp_path: Path) -> None:
     made = Dataset.open(merge([a, b, b], new_uids=True, out=tmp_path / "all"))
     assert made.uids[:5].tolist() == [0, 1, 2, 3, 4]
     assert len(set(made.uids.tolist())) == 11
-    assert made.metadata["source_episode"][5] == 4
+    assert made.metadata["merged_uid"][:6] == [None] * 5 + [4]
     again = Dataset.open(merge([a, b, b], new_uids=True, out=tmp_path / "again"))
     assert again.content_hash == made.content_hash
+
+
+def test_copies_still_name_the_episodes_of_their_own_dataset(tmp_path: Path) -> None:
+    parts = [write(tmp_path / f"{first}", range(first, 5)) for first in (1, 2)]
+    assert [dict(zip(part.uids, part.metadata["source_episode"], strict=True))[3] for part in parts] == [2, 2]
+    made = Dataset.open(merge(parts, new_uids=True, out=tmp_path / "all"))
+    one, two, three, four, other_two, other_three, other_four = made.uids.tolist()
+    assert [one, two, three, four] == [1, 2, 3, 4]
+    assert len({one, two, three, four, other_two, other_three, other_four}) == 7
+    assert made.metadata["source_episode"] == [None, None, two, None, None, other_two, None]
+    assert made.metadata["merged_uid"] == [None, None, None, None, 2, 3, 4]
+    more = Dataset.open(merge([made, made], new_uids=True, out=tmp_path / "more"))
+    assert more.metadata["merged_uid"][7:] == made.uids.tolist()
+    assert [more.metadata["source_episode"][row] for row in (9, 12)] == [more.uids[8], more.uids[11]]
+
+
+@pytest.mark.parametrize("world", ["environment", "simulator"])
+def test_datasets_of_different_worlds_are_not_merged(tmp_path: Path, world: str) -> None:
+    parts = []
+    for maze, uid in (("umaze", 1), ("long", 2)):
+        described = {**DESCRIPTION, world: {"id": f"antmaze-{maze}", "timestep_s": 0.1}}
+        with writer(tmp_path / maze, description=described) as open_writer:
+            open_writer.add(fake_episode(uid, 3))
+        parts.append(Dataset.open(tmp_path / maze))
+    told = rf"fake@data-1\.0\.0: {world}\.id: 'antmaze-umaze', then 'antmaze-long'"
+    with pytest.raises(BadInputError, match=told):
+        merge(parts, out=tmp_path / "all")
+    assert not (tmp_path / "all").exists()
 
 
 def test_datasets_that_differ_are_told_apart(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ from fake_dataset import COLUMNS, LENGTHS, concatenated, write_fake
 from torch.utils.data import DataLoader
 
 from astra_data.columns import ACTION, INDEX, REWARD, STATE, TERMINATED
-from astra_data.dataset import Dataset
+from astra_data.dataset import Dataset, column_files
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.samples import Batch, Samples
 from astra_data.dataset.windows import Padding
@@ -111,6 +113,38 @@ def test_mapped_columns_equal_loaded_ones(
     mapped.columns[STATE].zero_()
     again = Frames.load(fake, NAMES, memory_share=0.0)
     assert torch.equal(again.columns[STATE], frames.columns[STATE])
+
+
+def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = sum(LENGTHS) * 3 * 4
+    for memory, share in ((2 * size, 0.5), (10 * size, 0.1)):
+        monkeypatch.setattr("astra_data.dataset.frames.memory_bytes", lambda memory=memory: memory)
+        Frames.load(fake, [STATE], memory_share=share, cache=tmp_path)
+        assert not list(tmp_path.iterdir())
+    monkeypatch.setattr("astra_data.dataset.frames.memory_bytes", lambda: 2 * size - 2)
+    Frames.load(fake, [STATE], memory_share=0.5, cache=tmp_path)
+    assert list(tmp_path.rglob("values.npy"))
+
+
+def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(column_files, "MEMORY_LIMIT", limit)
+    machine = column_files.memory_bytes()
+    for text, expected in (("max\n", machine), (f"{2**60}\n", machine), (f"{2**20}\n", 2**20)):
+        limit.write_text(text)
+        assert column_files.memory_bytes() == expected
+
+
+def test_processes_map_the_same_columns_at_once(fake: Dataset, tmp_path: Path) -> None:
+    script = Path(__file__).parents[1] / "mapped_rounds.py"
+    command = [sys.executable, *map(str, (script, fake.root, tmp_path))]
+    processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
+    told = [process.communicate(timeout=120)[1] for process in processes]
+    assert told == [""] * 4
+    assert len(list(tmp_path.rglob("values.npy"))) == 2 * 40
+    assert not list(tmp_path.rglob(".*"))
 
 
 def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:

@@ -51,8 +51,26 @@ def test_a_state_of_another_order_is_refused() -> None:
     state = Order(20, 5, seed=4).state_dict()
     with pytest.raises(BadInputError, match="count is 20, expected 21; seed is 4, expected 0"):
         Order(21, 5).load_state_dict(state)
-    with pytest.raises(BadInputError, match="drop_last is None, expected False; epoch is missing"):
+    with pytest.raises(BadInputError, match="drop_last is None, expected False; epoch is None, expected 0"):
         Order(20, 5, seed=4).load_state_dict({"count": 20, "batch_size": 5, "seed": 4, "shuffle": True})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("epoch", -1, "0 or more"),
+        ("epoch", 1.5, "0 or more"),
+        ("batch", -1, "0 to 3"),
+        ("batch", 4, "0 to 3"),
+    ],
+)
+def test_a_batch_that_there_is_not_is_refused(key: str, value: float, expected: str) -> None:
+    order = Order(20, 5, seed=4)
+    with pytest.raises(BadInputError, match=f"{key} is {value}, expected {expected}"):
+        order.load_state_dict(order.state_dict() | {key: value})
+    assert (order.epoch, order.batch) == (0, 0)
+    order.load_state_dict(order.state_dict() | {"epoch": 7, "batch": 3})
+    assert len(list(order)) == 1
 
 
 @pytest.mark.parametrize(("count", "size", "drop_last"), [(10, 0, False), (0, 5, False), (10, 11, True)])

@@ -83,7 +83,7 @@ def test_a_version_there_never_changes(hub: Hub, fake: Dataset, tmp_path: Path) 
     repo = hub.repos["me/it"]
     before = (dict(repo.tags), list(repo.history))
     push(fake.root, "hf://datasets/me/it")
-    with pytest.raises(BadInputError, match=r"has another data-1\.0\.0"):
+    with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
         push(write_fake(tmp_path / "changed", fps=10).root, "me/it")
     assert (repo.tags, repo.history) == before
 
@@ -108,6 +108,34 @@ def test_a_push_beside_another_one_is_told(hub: Hub, fake: Dataset) -> None:
     with pytest.raises(SharingError, match="changed by somebody else at the same time"):
         push(fake.root, "me/it")
     assert hub.repos["me/it"].tags == {}
+
+
+@pytest.mark.parametrize("moment", ["files", "card"])
+def test_neither_commit_goes_on_top_of_one_that_came_between(hub: Hub, fake: Dataset, moment: str) -> None:
+    commits = 0
+
+    def another(method: str, path: str) -> None:
+        nonlocal commits
+        commits += path.endswith("/commit/main")
+        if path.endswith("/commit/main") and commits == ["files", "card"].index(moment) + 1:
+            hub.repos["me/it"].commit({}, "of somebody else")
+
+    hub.refuse = another
+    with pytest.raises(SharingError, match="changed by somebody else at the same time"):
+        push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    assert (repo.history[-1], repo.tags) == ("of somebody else", {})
+
+
+def test_a_public_repository_does_not_get_what_is_to_be_private(hub: Hub, fake: Dataset) -> None:
+    hub.repos["me/it"] = Repository()
+    with pytest.raises(BadInputError, match=r"me/it exists already and is public, .*Nothing was uploaded"):
+        push(fake.root, "me/it", private=True)
+    assert hub.repos["me/it"].history == ["initial commit"]
+    assert not hub.large
+    hub.repos["me/it"].private = True
+    push(fake.root, "me/it", private=True)
+    assert "data-1.0.0" in hub.repos["me/it"].tags
 
 
 def test_a_private_repository_is_hidden_from_others(
@@ -160,7 +188,7 @@ def test_a_card_that_the_hub_refuses_is_told(hub: Hub, fake: Dataset, tmp_path: 
     (tmp_path / "notes.toml").write_text('license = "none-such"\n')
     with pytest.raises(BadInputError, match=r'does not take this: (.|\n)*"license" must be one of a list'):
         push(fake.root, "me/it", notes=tmp_path / "notes.toml")
-    assert hub.repos["me/it"].tags == {}
+    assert not hub.repos
     push(fake.root, "me/it")
     assert set(hub.repos["me/it"].tags) == {"v3.0", "data-1.0.0"}
 

@@ -2,12 +2,14 @@
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import pytest
 from fake_dataset import DESCRIPTION, write_fake
+from fsspec.implementations.local import LocalFileSystem
 from moto.server import ThreadedMotoServer
 from shared_files import contents
 
@@ -76,7 +78,7 @@ def test_a_version_there_never_changes(place: str, fake: Dataset, tmp_path: Path
     filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/SHA256SUMS")
     filesystem.pipe_file(path, b"not looked at")
     push(fake.root, place)
-    with pytest.raises(BadInputError, match=r"has another data-1\.0\.0"):
+    with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
         push(changed(tmp_path / "changed").root, place)
     assert filesystem.cat_file(path) == b"not looked at"
 
@@ -98,18 +100,87 @@ def test_the_newest_version_is_pulled_unless_another_is_named(
         pull(f"{place}/fake@data-1.0.0", version="1.9.0")
 
 
-def test_an_upload_that_stopped_is_not_there_and_is_replaced(
-    place: str, fake: Dataset, tmp_path: Path
-) -> None:
-    push(changed(tmp_path / "changed").root, place)
+def stopped(place: str) -> tuple[Any, str]:
+    """Make the pushed version one whose upload was stopped on its way; its file system and folder."""
     filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
     filesystem.rm_file(f"{path}/meta/astra/dataset.json")
-    filesystem.pipe_file(f"{path}/data/chunk-000/file-001.parquet", b"left over")
+    filesystem.rm_file(f"{path}/meta/info.json")
+    filesystem.pipe_file(f"{path}/data/chunk-000/file-000.parquet", b"a part")
+    return filesystem, path
+
+
+def test_an_upload_that_stopped_is_not_there_and_is_finished_by_the_next(
+    place: str, fake: Dataset, tmp_path: Path
+) -> None:
+    push(fake.root, place)
+    stopped(place)
     with pytest.raises(SharingError, match="has no dataset of astra-data"):
         pull(f"{place}/fake", out=tmp_path / "out")
     push(fake.root, place)
     assert contents(pull(f"{place}/fake", out=tmp_path / "out").root) == contents(fake.root)
-    assert not filesystem.exists(f"{path}/data/chunk-000/file-001.parquet")
+
+
+def test_what_else_is_in_the_folder_is_left_there(place: str, fake: Dataset, tmp_path: Path) -> None:
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
+    filesystem.makedirs(path, exist_ok=True)
+    filesystem.pipe_file(f"{path}/precious.parquet", b"of somebody else")
+    with pytest.raises(BadInputError, match=r"/fake/data-1\.0\.0 exists already and holds something else"):
+        push(fake.root, place)
+    assert [name.rpartition("/")[2] for name in filesystem.find(path)] == ["precious.parquet"]
+    filesystem.rm(path, recursive=True)
+    push(changed(tmp_path / "changed").root, place)
+    stopped(place)
+    before = filesystem.cat(filesystem.find(path))
+    with pytest.raises(BadInputError, match="a part of another push of this version"):
+        push(fake.root, place)
+    assert filesystem.cat(filesystem.find(path)) == before
+
+
+def at_the_third_file(monkeypatch: pytest.MonkeyPatch, act: Callable[[], object]) -> list[str]:
+    """Let `act` happen before a push to a local folder sends its third file; lists what was sent."""
+    put, sent = LocalFileSystem.put_file, list[str]()
+
+    def watched(self: LocalFileSystem, file: str, path: str) -> None:
+        sent.append(path)
+        if len(sent) == 3:
+            act()
+        put(self, file, path)
+
+    monkeypatch.setattr(LocalFileSystem, "put_file", watched)
+    return sent
+
+
+def test_a_second_push_at_once_takes_nothing_from_the_first(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = changed(tmp_path / "changed")
+
+    def second() -> None:
+        with pytest.raises(BadInputError, match="going on right now"):
+            push(other.root, f"file://{tmp_path}/shared")
+
+    sent = at_the_third_file(monkeypatch, second)
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert len(sent) == len(contents(fake.root)) + 3
+    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
+
+
+def test_two_pushes_of_the_same_at_once_both_succeed(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_the_third_file(monkeypatch, lambda: push(fake.root, f"file://{tmp_path}/shared"))
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
+
+
+def test_a_push_stops_where_another_began_with_it(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sums = tmp_path / "shared/fake/data-1.0.0/SHA256SUMS"
+    sent = at_the_third_file(monkeypatch, lambda: sums.write_text("of other values"))
+    with pytest.raises(BadInputError, match="a part of another push of this version"):
+        push(fake.root, f"file://{tmp_path}/shared")
+    assert len(sent) == 3
 
 
 def test_the_mark_is_uploaded_last(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,8 +195,10 @@ def test_the_mark_is_uploaded_last(fake: Dataset, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(store._filesystem, "put_file", watched)
     (tmp_path / "card").mkdir()
     (tmp_path / "card/README.md").touch()
+    (tmp_path / "card/SHA256SUMS").touch()
     store.upload(fake, tmp_path / "card", lambda fraction, note: None)
-    assert len(sent) == len(contents(fake.root)) + 1
+    assert len(sent) == len(contents(fake.root)) + 2
+    assert sent[0].endswith("SHA256SUMS")
     assert sent[-1].endswith("meta/astra/dataset.json")
 
 
