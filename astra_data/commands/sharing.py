@@ -41,7 +41,7 @@ def push(
         str,
         typer.Argument(
             metavar="URL",
-            help="user/name on the Hugging Face Hub, or s3://, gs://, file://…",
+            help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared",
             show_default=False,
         ),
     ],
@@ -64,7 +64,7 @@ def pull(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="user/name on the Hugging Face Hub, or the URL of the dataset's folder.",
+            help="user/name on the Hugging Face Hub, or URL or path of the dataset's folder.",
             show_default=False,
         ),
     ],

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from astra_data.dataset.versions import Version
 from astra_data.errors import BadInputError
@@ -38,17 +39,19 @@ Place = Hub | Url
 
 
 def parse_place(text: str) -> Place:
-    """Read "user/name", "hf://datasets/user/name" or another URL.
+    """Read "user/name", "hf://datasets/user/name", another URL, or a folder that begins with a dot, / or ~.
 
     Raises:
         BadInputError: it is none of them.
     """
     if hub := _HUB.fullmatch(text):
         return Hub(hub["repo"])
+    if text.startswith(("/", "./", "../", "~/")):
+        return Url(Path(text).expanduser().absolute().as_uri())
     if not _URL.fullmatch(text) or text.startswith("hf://"):
         raise BadInputError(
             f"{text}: expected user/name or hf://datasets/user/name for the Hugging Face Hub, "
-            "or a URL such as s3://bucket/folder, gs://bucket/folder or file:///folder"
+            "a URL such as s3://bucket/folder or gs://bucket/folder, or a folder such as ./shared or /shared"
         )
     return Url(text.rstrip("/"))
 

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 
 from astra_data.dataset.versions import Version
@@ -22,9 +24,14 @@ def test_places_and_versions(text: str, place: Hub | Url, version: str | None) -
     assert parse_source(text) == (place, Version.parse(version) if version else None)
 
 
-@pytest.mark.parametrize(
-    "text", ["ant", "a/b/c", "/tmp/ant", "../ant", "hf://models/me/it", "hf://me/it", "", "s3://"]
-)
+@pytest.mark.parametrize("text", ["ant", "a/b/c", "hf://models/me/it", "hf://me/it", "", "s3://"])
 def test_anything_else_is_told(text: str) -> None:
     with pytest.raises(BadInputError, match="expected user/name or hf://datasets/user/name"):
         parse_place(text)
+
+
+def test_a_folder_is_a_place_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert parse_place("./shared") == parse_place(f"{tmp_path}/shared") == Url(f"file://{tmp_path}/shared")
+    assert parse_place("~/shared") == Url(f"file://{Path.home()}/shared")
+    assert parse_source(f"{tmp_path}/it@data-1.2.0") == (Url(f"file://{tmp_path}/it"), Version(1, 2, 0))
