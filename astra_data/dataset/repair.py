@@ -210,12 +210,11 @@ def _whole_runs(
 ) -> Iterator[tuple[int, Run]]:
     """Yield the uid and the rows of each whole episode, and note which are left out, and where it stops."""
     lengths = _lengths(folder, notes)
-    row = 0
+    episode = row = 0
     uids: set[int] = set()
     every = (run for path in data_files(folder) for run in _file_runs(path, columns, notes))
-    episode = 0
     try:
-        for episode, run in enumerate(every):
+        for run in every:
             found = list(run_faults(run, number=episode, row=row, fps=fps))
             structural = [fault for name, fault in found if name in _STRUCTURE]
             if lengths.get(episode, len(run)) != len(run):
@@ -232,9 +231,9 @@ def _whole_runs(
             else:
                 uids.add(uid)
                 yield uid, run
-            row += len(run)
+            episode, row = episode + 1, row + len(run)
     except CorruptDatasetError as error:
-        notes.append(f"stopped after episode {episode}: {error}")
+        notes.append(f"stopped before episode {episode}: {error}")
 
 
 def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:

@@ -204,6 +204,19 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
     assert "index is 70 in episode 2 frame 0, expected 8" in check(root).faults
 
 
+def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for path in (root / "meta/astra").iterdir():
+        path.unlink()
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["next.reward"]["dtype"] = None
+    features["action"]["shape"] = ["2"]
+    edit("meta/info.json", features=features)(root)
+    report = check(root)
+    assert report.faults == []
+    assert "not checked, for they are not rows of numbers: action, next.reward" in report.notes
+
+
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="no dataset there"):
         check(tmp_path)
