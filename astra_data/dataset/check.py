@@ -89,7 +89,7 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
     if version != CODEBASE_VERSION:
         report.fault(INFO_PATH, f"{INFO_PATH}: the format is {version}, expected {CODEBASE_VERSION}")
     if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < MOST_FPS:
-        report.fault(INFO_PATH, f"{INFO_PATH}: fps is {fps!r}, expected a positive number")
+        report.fault(INFO_PATH, f"{INFO_PATH}: fps is {fps!r}, expected a positive number below 2^31")
         return []
     if not isinstance(features, dict):
         report.fault(INFO_PATH, f"{INFO_PATH}: features is {features!r}, expected an object")

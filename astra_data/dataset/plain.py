@@ -22,6 +22,7 @@ TIMESTAMP_TOLERANCE_S = 1e-4
 EPISODES_AT_ONCE = 100
 """Rows of meta/episodes that are held in memory."""
 MOST_FPS = 2**31
+"""Steps per second stay below."""
 _MOST_VALUES = 2**31
 """Of a row; what Arrow's lists hold."""
 _NUMBERS = (
@@ -123,7 +124,10 @@ def read_tasks(root: Path) -> dict[int, str] | str:
     if (table.num_columns, numbers, len(texts)) != (2, [names.TASK_INDEX], 1):
         told = ", ".join(f"{field.name} ({field.type})" for field in table.schema)
         return f"has the columns {told}, expected {names.TASK_INDEX} and one of texts"
-    return {row[names.TASK_INDEX]: row[texts[0]] for row in table.to_pylist()}
+    tasks = {row[names.TASK_INDEX]: row[texts[0]] for row in table.to_pylist()}
+    if len(tasks) < len(table) or any(column.null_count for column in table.columns):
+        return f"lists {table.to_pylist()}, expected one text per {names.TASK_INDEX}"
+    return tasks
 
 
 def read_small_table(path: Path) -> pa.Table | str:

@@ -99,6 +99,7 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
             drop("meta/tasks.parquet"),
             ["meta/tasks.parquet is missing", "episode 0 has the unknown tasks [0]"],
         ),
+        (alter("meta/tasks.parquet", "task", 0, None), ["expected one text per task_index"]),
         (drop("meta/astra/subsets.json"), ["meta/astra/subsets.json is missing"]),
         (drop(DATA), ["data has no parquet file"]),
         (drop(EPISODES), ["meta/episodes has no parquet file"]),
