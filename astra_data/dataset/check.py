@@ -20,7 +20,7 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
     TASKS_PATH,
 )
-from astra_data.dataset.meta_files import is_data_path, read_description, read_info, read_subsets
+from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
 from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
 from astra_data.dataset.plain import (
     MOST_FPS,
@@ -59,12 +59,6 @@ def check(root: Path) -> Report:
     if not is_ours:
         report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset, nothing is known of its origin")
     columns = _info_faults(info, report)
-    if is_ours and columns:
-        try:
-            read_info(root)
-        except CorruptDatasetError as error:
-            report.fault(INFO_PATH, str(error))
-            columns = []
     if columns and _files_are_readable(root, info, columns, report):
         checks = EpisodeChecks(root, info, columns, is_ours, report)
         try:
@@ -73,7 +67,7 @@ def check(root: Path) -> Report:
             if is_ours:
                 _global_statistics(root, columns, report)
                 _astra_faults(root, checks, report)
-        except CorruptDatasetError as error:
+        except AstraDataError as error:
             report.fault("values", str(error))
     if is_ours and not report.faults:
         try:

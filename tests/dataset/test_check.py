@@ -205,6 +205,18 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
     assert "index is 70 in episode 2 frame 0, expected 8" in check(root).faults
 
 
+def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / DATA)
+    at = table.column_names.index("next.reward")
+    wide = table.column("next.reward").cast(pa.float64())
+    pq.write_table(table.set_column(at, "next.reward", wide), root / DATA)
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["next.reward"]["dtype"] = "float64"
+    edit("meta/info.json", features=features)(root)
+    assert "dtype 'float64' is not one of float32, int64, bool" in "\n".join(check(root).faults)
+
+
 def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     for path in (root / "meta/astra").iterdir():
