@@ -8,7 +8,7 @@ import pytest
 from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake, writer
 from rich.console import Console
 
-from astra_data.columns import ACTION, STATE, Column, Episode
+from astra_data.columns import ACTION, STATE, Column, Episode, Scalar
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.edit import filter_episodes
 from astra_data.errors import BadInputError, CorruptDatasetError
@@ -99,12 +99,21 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
     assert places.counts.tolist() == [[sum(LENGTHS)]]
 
 
-@pytest.mark.parametrize("silent", [lambda uid: True, lambda uid: uid == 4])
-def test_whether_episodes_succeeded_has_one_answer(tmp_path: Path, silent: Callable[[int], bool]) -> None:
+@pytest.mark.parametrize(
+    "told",
+    [
+        lambda uid: {},
+        lambda uid: {} if uid == 4 else {"success": False},
+        lambda uid: {"success": "perhaps"},
+        lambda uid: {"success": float(uid in (13, 2**53 + 1))},
+    ],
+)
+def test_whether_episodes_succeeded_has_one_answer(
+    tmp_path: Path, told: Callable[[int], dict[str, Scalar]]
+) -> None:
     with writer(tmp_path / "set") as open_writer:
         for episode in fake_episodes():
-            metadata = {} if silent(episode.uid) else {"success": False}
-            open_writer.add(replace(episode, metadata=metadata))
+            open_writer.add(replace(episode, metadata=told(episode.uid)))
     dataset = Dataset.open(tmp_path / "set")
     assert dataset.successes() == [True, False, True, False, False]  # as next.success says
     assert inspect_dataset(dataset).success == 2
