@@ -1,6 +1,5 @@
 """What a dataset holds: its episodes, how its values spread, where its robot was. In one pass over it."""
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +7,9 @@ from numpy.typing import NDArray
 
 from astra_data.columns import STATE, Array, Column
 from astra_data.dataset.format import STATS_PATH
+from astra_data.dataset.plain import read_statistics
 from astra_data.dataset.reader import Dataset
+from astra_data.errors import CorruptDatasetError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -17,6 +18,8 @@ BINS = 16
 """Bins of a histogram, from the smallest value to the largest."""
 CELLS = 64
 """Cells of a map along its longer side."""
+_LARGEST = float(np.finfo(np.float32).max)
+_REMEDY = "astra-data repair makes it anew"
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     Raises:
         CorruptDatasetError: a file cannot be read.
     """
-    ranges = json.loads((dataset.root / STATS_PATH).read_text(encoding="utf-8"))
-    spreads = [_empty_spread(column, ranges[column.name]) for column in dataset.schema]
+    spreads = _empty_spreads(dataset, dataset.schema)
     maps = {role: _empty_map(spreads, role) for role in ("position", "vector")}
     for episode in dataset.episodes():
         for spread in spreads:
@@ -97,12 +99,12 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
             if found is not None:
                 planar, group = found
                 _visit(planar, episode.columns[STATE][:, group])
-    success = dataset.metadata.get("success")
+    successes = dataset.successes()
     return Inspection(
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
         lengths=dataset.lengths,
-        success=None if success is None else sum(value is True for value in success),
+        success=None if successes is None else sum(value is True for value in successes),
         spreads=tuple(spreads),
         positions=maps["position"] and maps["position"][0],
         velocities=maps["vector"] and maps["vector"][0],
@@ -115,9 +117,8 @@ def visited(dataset: Dataset) -> Map | None:
     Raises:
         CorruptDatasetError: a file cannot be read.
     """
-    ranges = json.loads((dataset.root / STATS_PATH).read_text(encoding="utf-8"))
     states = [column for column in dataset.schema if column.name == STATE]
-    found = _empty_map([_empty_spread(column, ranges[STATE]) for column in states], "position")
+    found = _empty_map(_empty_spreads(dataset, states), "position")
     if found is None:
         return None
     planar, group = found
@@ -126,9 +127,27 @@ def visited(dataset: Dataset) -> Map | None:
     return planar
 
 
-def _empty_spread(column: Column, ranges: dict[str, list[float]]) -> Spread:
-    low, high, mean = (np.array(ranges[key], dtype=np.float64) for key in ("min", "max", "mean"))
-    return Spread(column, low, high, mean, np.zeros((column.size, BINS), dtype=np.int64))
+def _empty_spreads(dataset: Dataset, columns: list[Column]) -> list[Spread]:
+    ranges = read_statistics(dataset.root)
+    if isinstance(ranges, str):
+        raise CorruptDatasetError(f"{dataset.root}: {STATS_PATH} {ranges}; {_REMEDY}")
+    spreads = []
+    for column in columns:
+        told = ranges.get(column.name, {})
+        try:
+            table = np.array([told[key] for key in ("min", "max", "mean")], dtype=np.float64)
+        except (KeyError, OverflowError, TypeError, ValueError):
+            table = np.empty(0)
+        if (
+            table.shape != (3, column.size)
+            or not (np.abs(table) <= _LARGEST).all()
+            or (table[0] > table[1]).any()
+        ):
+            expected = f"expected {column.size} finite numbers as min, max and mean of {column.name}"
+            raise CorruptDatasetError(f"{dataset.root}: {STATS_PATH} is malformed, {expected}; {_REMEDY}")
+        counts = np.zeros((column.size, BINS), dtype=np.int64)
+        spreads.append(Spread(column, table[0], table[1], table[2], counts))
+    return spreads
 
 
 def _count(spread: Spread, values: Array) -> None:
@@ -153,5 +172,6 @@ def _empty_map(spreads: list[Spread], role: str) -> tuple[Map, slice] | None:
 
 def _visit(planar: Map, points: Array) -> None:
     height, width = planar.counts.shape
-    cells = np.floor((points - planar.origin) / planar.cell + 1e-9).astype(np.int64)
-    np.add.at(planar.counts, (cells[:, 1].clip(0, height - 1), cells[:, 0].clip(0, width - 1)), 1)
+    cells = np.floor((points - planar.origin) / planar.cell + 1e-9)
+    x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
+    np.add.at(planar.counts, (y, x), 1)

@@ -1,15 +1,21 @@
+from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import LENGTHS, concatenated, write_fake
+from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake, writer
 from rich.console import Console
 
-from astra_data.columns import ACTION, STATE
+from astra_data.columns import ACTION, STATE, Column, Episode, Scalar
 from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.edit import filter_episodes
+from astra_data.errors import BadInputError, CorruptDatasetError
 from astra_data.inspection import BINS, Inspection, Map, inspect_dataset, visited
 from astra_data.inspection_page import inspection_page, shaded, sparkline
+from astra_data.sharing.card import render_card
+from astra_data.sharing.notes import Notes
 
 
 @pytest.fixture(scope="module")
@@ -91,3 +97,49 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
     places = inspect_dataset(Dataset.open(root)).positions
     assert places is not None
     assert places.counts.tolist() == [[sum(LENGTHS)]]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        lambda uid: {},
+        lambda uid: {} if uid == 4 else {"success": False},
+        lambda uid: {"success": "perhaps"},
+        lambda uid: {"success": float(uid in (13, 2**53 + 1))},
+    ],
+)
+def test_whether_episodes_succeeded_has_one_answer(
+    tmp_path: Path, told: Callable[[int], dict[str, Scalar]]
+) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for episode in fake_episodes():
+            open_writer.add(replace(episode, metadata=told(episode.uid)))
+    dataset = Dataset.open(tmp_path / "set")
+    assert dataset.successes() == [True, False, True, False, False]  # as next.success says
+    assert inspect_dataset(dataset).success == 2
+    assert "2 of 5 episodes (40.0%)" in render_card(dataset, Notes())
+    kept = Dataset.open(filter_episodes(dataset, success=True, out=tmp_path / "kept"))
+    assert kept.uids.tolist() == [13, 2**53 + 1]
+
+
+def test_without_metadata_and_column_success_is_unknown(tmp_path: Path) -> None:
+    columns = [Column("x")]
+    description = {"name": "x", "stage": "x"}
+    with DatasetWriter(tmp_path / "set", columns, fps=5, task="x", description=description) as open_writer:
+        open_writer.add(Episode(0, {"x": np.zeros(3, np.float32)}))
+    dataset = Dataset.open(tmp_path / "set")
+    assert dataset.successes() is None
+    assert inspect_dataset(dataset).success is None
+    with pytest.raises(BadInputError, match="have no 'success'"):
+        filter_episodes(dataset, success=True, out=tmp_path / "kept")
+
+
+@pytest.mark.parametrize(
+    "statistics", ["{", "{}", '{"observation.state": {"min": [0], "max": 1, "mean": {}}}']
+)
+def test_malformed_statistics_are_told(tmp_path: Path, statistics: str) -> None:
+    dataset = write_fake(tmp_path / "set")
+    (dataset.root / "meta/stats.json").write_text(statistics)
+    for read in (inspect_dataset, visited):
+        with pytest.raises(CorruptDatasetError, match=r"meta/stats\.json is .*; astra-data repair"):
+            read(dataset)

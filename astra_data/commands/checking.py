@@ -27,7 +27,8 @@ def validate(
     for note in report.notes:
         typer.echo(f"note: {note}")
     if report.faults:
-        told = "\n  ".join([f"{root} has {len(report.faults)} faults:", *report.faults])
+        count = "1 fault" if report.fault_count == 1 else f"{report.fault_count} faults"
+        told = "\n  ".join([f"{root} has {count}:", *report.faults])
         raise CorruptDatasetError(f"{told}\nTo save its whole episodes: astra-data repair {root} --out DIR")
     typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
 

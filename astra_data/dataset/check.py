@@ -11,6 +11,7 @@ from astra_data.columns import Array, Column
 from astra_data.dataset.check_episodes import EXACT, EpisodeChecks, is_close
 from astra_data.dataset.format import (
     CODEBASE_VERSION,
+    DATA_PATH,
     DATASET_PATH,
     DEFAULT_COLUMNS,
     INFO_PATH,
@@ -19,14 +20,17 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
     TASKS_PATH,
 )
+from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
 from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
 from astra_data.dataset.plain import (
+    MOST_FPS,
     PlainColumn,
     data_files,
     episodes_files,
     plain_columns,
     read_object,
     read_small_table,
+    read_statistics,
     schema_faults,
 )
 from astra_data.dataset.provenance import permutation
@@ -63,7 +67,7 @@ def check(root: Path) -> Report:
             if is_ours:
                 _global_statistics(root, columns, report)
                 _astra_faults(root, checks, report)
-        except CorruptDatasetError as error:
+        except AstraDataError as error:
             report.fault("values", str(error))
     if is_ours and not report.faults:
         try:
@@ -78,11 +82,15 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
     version, fps, features = info.get("codebase_version"), info.get("fps"), info.get("features")
     if version != CODEBASE_VERSION:
         report.fault(INFO_PATH, f"{INFO_PATH}: the format is {version}, expected {CODEBASE_VERSION}")
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not fps > 0:
-        report.fault(INFO_PATH, f"{INFO_PATH}: fps is {fps!r}, expected a positive number")
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < MOST_FPS:
+        report.fault(INFO_PATH, f"{INFO_PATH}: fps is {fps!r}, expected a positive number below 2^31")
         return []
     if not isinstance(features, dict):
         report.fault(INFO_PATH, f"{INFO_PATH}: features is {features!r}, expected an object")
+        return []
+    if not is_data_path(data_path := info.get("data_path")):
+        told = f"data_path is {data_path!r}, expected a path inside the folder such as {DATA_PATH}"
+        report.fault(INFO_PATH, f"{INFO_PATH}: {told}")
         return []
     columns, others = plain_columns(features)
     if others:
@@ -107,7 +115,7 @@ def _files_are_readable(
 ) -> bool:
     """Check the footers of all parquet files and the schemas of the data files."""
     _strangers(root, report)
-    before = len(report.faults)
+    before = report.fault_count
     for kind, files in (("data", data_files(root)), ("meta/episodes", episodes_files(root))):
         if not files:
             report.fault("files", f"{kind} has no parquet file")
@@ -124,7 +132,7 @@ def _files_are_readable(
                 faults = schema_faults(schema, columns)
                 for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:
                     report.fault("columns", f"{name} {fault}")
-    if len(report.faults) > before:
+    if report.fault_count > before:
         report.note("values", "values were not checked, because not all files could be read as declared")
         return False
     return True
@@ -140,7 +148,7 @@ def _strangers(root: Path, report: Report) -> None:
 
 
 def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -> None:
-    stored = read_object(root / STATS_PATH)
+    stored = read_statistics(root)
     if isinstance(stored, str):
         report.fault(STATS_PATH, f"{STATS_PATH} {stored}")
         return
@@ -159,11 +167,12 @@ def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -
 
 
 def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
-    description = read_object(root / DATASET_PATH)
-    if isinstance(description, str):
-        report.fault("origin", f"{DATASET_PATH} {description}")
-    elif (stored := description.get("content_hash")) != (found := checks.hash.hexdigest()):
-        report.fault("origin", f"the content hash is {found}, expected {stored}")
+    try:
+        stored = read_description(root)["content_hash"]
+        if (found := checks.hash.hexdigest()) != stored:
+            report.fault("origin", f"the content hash is {found}, expected {stored}")
+    except CorruptDatasetError as error:
+        report.fault("origin", str(error))
     table = read_small_table(root / METADATA_PATH)
     if isinstance(table, str):
         report.fault(METADATA_PATH, f"{METADATA_PATH} {table}")
@@ -174,8 +183,9 @@ def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
             if said != is_:
                 fault = f"{said} as uid and length of episode {episode}, expected {is_}"
                 report.fault(METADATA_PATH, f"{METADATA_PATH} has {fault}")
-    subsets = read_object(root / SUBSETS_PATH)
-    if isinstance(subsets, str):
-        report.fault(SUBSETS_PATH, f"{SUBSETS_PATH} {subsets}")
-    elif subsets.get("uids") != permutation(checks.uids, subsets.get("seed", 0)):
-        report.fault(SUBSETS_PATH, f"{SUBSETS_PATH}: the uids are not in the order of their seed")
+    try:
+        subsets = read_subsets(root)
+        if subsets["uids"] != permutation(checks.uids, subsets["seed"]):
+            report.fault(SUBSETS_PATH, f"{SUBSETS_PATH}: the uids are not in the order of their seed")
+    except CorruptDatasetError as error:
+        report.fault(SUBSETS_PATH, str(error))

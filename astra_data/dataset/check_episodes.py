@@ -16,8 +16,9 @@ from astra_data.dataset.plain import (
     Run,
     data_files,
     episode_rows,
-    read_object,
-    read_small_table,
+    flag_faults,
+    read_statistics,
+    read_tasks,
     run_faults,
     runs,
 )
@@ -78,6 +79,8 @@ class EpisodeChecks:
                 continue
             for name, fault in run_faults(run, number=number, row=self._report.frames, fps=self._info["fps"]):
                 self._report.fault(name, fault)
+            for fault in flag_faults(run, number):
+                (self._report.fault if self._is_ours else self._report.note)("flags", fault)
             tasks = np.unique(run.columns[names.TASK_INDEX])
             unknown = [task for task in tasks.tolist() if task not in self._tasks]
             if unknown:
@@ -107,15 +110,11 @@ class EpisodeChecks:
             self._check_extremes()
 
     def _read_tasks(self) -> dict[int, str]:
-        table = read_small_table(self._root / TASKS_PATH)
-        if isinstance(table, str):
-            self._report.fault("tasks", f"{TASKS_PATH} {table}")
+        tasks = read_tasks(self._root)
+        if isinstance(tasks, str):
+            self._report.fault("tasks", f"{TASKS_PATH} {tasks}")
             return {}
-        texts = [name for name in table.column_names if name != names.TASK_INDEX]
-        if len(texts) != 1 or names.TASK_INDEX not in table.column_names:
-            self._report.fault("tasks", f"{TASKS_PATH} has the columns {table.column_names}, expected two")
-            return {}
-        return {row[names.TASK_INDEX]: row[texts[0]] for row in table.to_pylist()}
+        return tasks
 
     def _check_row(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
         start = self._report.frames
@@ -130,7 +129,8 @@ class EpisodeChecks:
                 told = f"meta/episodes: {key} of episode {number} is {row.get(key)}, expected {value}"
                 self._report.fault("meta/episodes", told)
         place = {"chunk_index": row.get("data/chunk_index"), "file_index": row.get("data/file_index")}
-        said = None if None in place.values() else str(self._info["data_path"]).format(**place)
+        known = all(isinstance(index, int) for index in place.values())
+        said = self._info["data_path"].format(**place) if known else None
         if said != str(run.path.relative_to(self._root)):
             told = f"meta/episodes: episode {number} is said to be in {said}, it is in {run.path.name}"
             self._report.fault("meta/episodes", told)
@@ -159,7 +159,7 @@ class EpisodeChecks:
             first = last
 
     def _check_extremes(self) -> None:
-        stored = read_object(self._root / STATS_PATH)
+        stored = read_statistics(self._root)
         if isinstance(stored, str):
             self._report.fault("statistics", f"{STATS_PATH} {stored}")
             return
@@ -183,7 +183,7 @@ def is_close(told: object, found: object, tolerance: float) -> bool:
     """Tell whether stored statistics equal the values `found`, relative to the largest of them."""
     try:
         stored, values = np.asarray(told, dtype=np.float64), np.asarray(found, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         return False
     if stored.size != values.size:
         return False

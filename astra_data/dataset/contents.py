@@ -1,6 +1,5 @@
 """A dataset's table of contents: everything but the values of its columns."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,9 @@ from numpy.typing import NDArray
 
 from astra_data.columns import Column, Scalar
 from astra_data.dataset import format as layout
+from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
+from astra_data.dataset.plain import read_tasks
 from astra_data.dataset.validate import file_faults
 from astra_data.errors import CorruptDatasetError
 
@@ -67,9 +68,7 @@ def read_contents(root: Path) -> Contents:
     missing = [path for path in needed if not (root / path).is_file()]
     if missing:
         raise CorruptDatasetError(f"{', '.join(missing)} missing")
-    info, description, subsets = (
-        _read_json(root / path) for path in (layout.INFO_PATH, layout.DATASET_PATH, layout.SUBSETS_PATH)
-    )
+    info, description, subsets = read_info(root), read_description(root), read_subsets(root)
     if info.get("codebase_version") != layout.CODEBASE_VERSION:
         raise CorruptDatasetError(
             f"the format is {info.get('codebase_version')}, expected {layout.CODEBASE_VERSION}"
@@ -77,8 +76,11 @@ def read_contents(root: Path) -> Contents:
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
     tables = list(read_blocks(sorted((root / "meta/episodes").glob("*/*.parquet")), _LOCATION))
     facts = list(read_blocks([root / layout.METADATA_PATH]))
-    tasks = list(read_blocks([root / layout.TASKS_PATH], ["task"]))
-    empty = {"meta/episodes": tables, layout.METADATA_PATH: facts, layout.TASKS_PATH: tasks}
+    tasks = read_tasks(root)
+    if isinstance(tasks, str) or 0 not in tasks:
+        fault = tasks if isinstance(tasks, str) else "has no task 0"
+        raise CorruptDatasetError(f"{layout.TASKS_PATH} {fault}")
+    empty = {"meta/episodes": tables, layout.METADATA_PATH: facts}
     if not all(empty.values()):
         names = ", ".join(name for name, found in empty.items() if not found)
         raise CorruptDatasetError(f"{names} has no rows")
@@ -116,13 +118,6 @@ def read_contents(root: Path) -> Contents:
         starts=starts,
         order=[position[uid] for uid in subsets["uids"]],
         subset_seed=subsets["seed"],
-        task=tasks[0].column("task")[0].as_py(),
+        task=tasks[0],
         paths=list(rows),
     )
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (TypeError, ValueError) as error:
-        raise CorruptDatasetError(f"{path.name} is no JSON object ({error})") from error

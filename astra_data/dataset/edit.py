@@ -95,8 +95,8 @@ def filter_episodes(
 ) -> Path:
     """Write the episodes of `source` that meet every given condition; both bounds belong to a range.
 
-    Success and return are those of the episodes' metadata; an episode without them does not meet a
-    condition on them.
+    Success is that of `Dataset.successes`, return that of the episodes' metadata; an episode without them
+    does not meet a condition on them.
 
     Raises:
         BadInputError: no condition is given, no episode has such metadata, or none meets the conditions.
@@ -215,10 +215,12 @@ def _uids(source: Dataset) -> list[int]:
     return uids
 
 
-def _facts(source: Dataset, key: str) -> list[Scalar | None]:
+def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
     if key == "length":
         lengths: list[Scalar | None] = source.lengths.tolist()
         return lengths
+    if key == "success" and (successes := source.successes()) is not None:
+        return successes
     if key not in source.metadata:
         known = ["length", *source.metadata]
         raise BadInputError(f"the episodes of {source.reference} have no {key!r}{did_you_mean(key, known)}")

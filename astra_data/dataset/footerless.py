@@ -122,7 +122,7 @@ def _page(data: memoryview, start: int) -> _Page | None:
         body, end = reader.position + levels, reader.position + packed
         if min(unpacked, packed, values, encoding, levels) < 0 or end > len(data):
             return None
-    except (IndexError, KeyError, TypeError, ValueError):
+    except (IndexError, KeyError, RecursionError, TypeError, ValueError):
         return None
     size = unpacked + reader.position - start
     return _Page(start, end, size, kind, values, encoding, data[body : body + 4] == _ZSTD_MAGIC)

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.plain import read_object
+from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import place
+from astra_data.errors import CorruptDatasetError
+
+_Described = tuple[Path, Mapping[str, Any]]
+"""Folder and description."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +40,12 @@ def lineage(dataset: Dataset) -> Ancestor:
     """Return `dataset` with all its ancestors, looked up at home and in the folders beside it.
 
     An ancestor counts as found if its content hash is the one that its descendant names.
+
+    Raises:
+        CorruptDatasetError: a dataset is named among its own ancestors.
     """
-    return _ancestor(dataset.identity, dataset.root, dataset.root.resolve().parent)
+    beside = dataset.root.resolve().parent
+    return _ancestor(dataset.identity, (dataset.root, dataset.description), beside, ())
 
 
 def tree_lines(ancestor: Ancestor) -> Iterator[str]:
@@ -51,33 +59,40 @@ def tree_lines(ancestor: Ancestor) -> Iterator[str]:
             yield ("    " if is_last else "│   ") + line
 
 
-def _ancestor(identity: Mapping[str, str], folder: Path | None, beside: Path) -> Ancestor:
-    description = read_object(folder / DATASET_PATH) if folder else {}
-    assert isinstance(description, dict)
+def _ancestor(
+    identity: Mapping[str, str],
+    found: _Described | None,
+    beside: Path,
+    descendants: tuple[Mapping[str, str], ...],
+) -> Ancestor:
+    reference = f"{identity['name']}@data-{identity['version']}"
+    if identity in descendants:
+        raise CorruptDatasetError(
+            f"{reference} is among its own ancestors: a {DATASET_PATH} was altered; restore it from a copy."
+        )
+    folder, description = found or (None, {})
     parents = description.get("parents", [])
+    below = (*descendants, identity)
     return Ancestor(
-        reference=f"{identity['name']}@data-{identity['version']}",
+        reference=reference,
         content_hash=identity["hash"],
         stage=description.get("stage", ""),
         config=description.get("config", {}),
-        parents=tuple(_ancestor(parent, _found(parent, beside), beside) for parent in parents),
+        parents=tuple(_ancestor(parent, _found(parent, beside), beside, below) for parent in parents),
         folder=folder,
     )
 
 
-def _found(identity: Mapping[str, str], beside: Path) -> Path | None:
+def _found(identity: Mapping[str, str], beside: Path) -> _Described | None:
     neighbours = sorted(path.parents[2] for path in beside.glob(f"*/{DATASET_PATH}"))
     for folder in (place(identity), *neighbours):
-        found = read_object(folder / DATASET_PATH)
-        if isinstance(found, str):
+        try:
+            found = read_description(folder)
+        except CorruptDatasetError:
             continue
         # A dataset may hold the same values under another name or version.
-        if (found.get("name"), found.get("version"), found.get("content_hash")) == (
-            identity["name"],
-            identity["version"],
-            identity["hash"],
-        ):
-            return folder
+        if identity == {"name": found["name"], "version": found["version"], "hash": found["content_hash"]}:
+            return folder, found
     return None
 
 

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from astra_data import columns as names
 from astra_data.columns import Array
+from astra_data.dataset.format import STATS_PATH, TASKS_PATH
 from astra_data.dataset.parquet import UNREADABLE, first_line, to_numpy
 from astra_data.errors import CorruptDatasetError
 
@@ -20,6 +21,15 @@ TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own."""
 EPISODES_AT_ONCE = 100
 """Rows of meta/episodes that are held in memory."""
+MOST_FPS = 2**31
+"""Steps per second stay below."""
+_MOST_VALUES = 2**31
+"""Of a row; what Arrow's lists hold."""
+_NUMBERS = (
+    *("bool", "float16", "float32", "float64"),
+    *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+)
+_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
 
 
 @dataclass(frozen=True)
@@ -66,10 +76,13 @@ def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[
     for name, feature in features.items():
         try:
             [size] = feature["shape"]
-            if np.dtype(feature["dtype"]).kind not in "fiub" or int(size) < 1:
-                raise TypeError
-            columns.append(PlainColumn(name, str(feature["dtype"]), int(size)))
+            dtype = feature["dtype"]
         except (KeyError, TypeError, ValueError):
+            others.append(name)
+            continue
+        if dtype in _NUMBERS and type(size) is int and 0 < size < _MOST_VALUES:
+            columns.append(PlainColumn(name, dtype, size))
+        else:
             others.append(name)
     return columns, others
 
@@ -77,17 +90,52 @@ def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[
 def read_object(path: Path) -> dict[str, Any] | str:
     """Return the JSON object in the file at `path`, or what is wrong with it."""
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return "is missing"
-    except (OSError, TypeError, ValueError) as error:
+    except (OSError, RecursionError, ValueError) as error:
         return f"is no JSON object ({error})"
+    return found if isinstance(found, dict) else f"is no JSON object but {type(found).__name__}"
+
+
+def read_statistics(root: Path) -> dict[str, dict[str, Any]] | str:
+    """Return meta/stats.json, column to statistic to values, or what is wrong with it."""
+    found = read_object(root / STATS_PATH)
+    if isinstance(found, str):
+        return found
+    strange = [name for name, statistics in found.items() if not isinstance(statistics, dict)]
+    return f"has no JSON object for {', '.join(strange)}" if strange else found
+
+
+def read_tasks(root: Path) -> dict[int, str] | str:
+    """Return the tasks by their task_index, or what is wrong with meta/tasks.parquet.
+
+    Pandas calls the column of their texts after its index.
+    """
+    table = read_small_table(root / TASKS_PATH)
+    if isinstance(table, str):
+        return table
+    numbers = [field.name for field in table.schema if pa.types.is_integer(field.type)]
+    texts = [
+        field.name
+        for field in table.schema
+        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
+    ]
+    if (table.num_columns, numbers, len(texts)) != (2, [names.TASK_INDEX], 1):
+        told = ", ".join(f"{field.name} ({field.type})" for field in table.schema)
+        return f"has the columns {told}, expected {names.TASK_INDEX} and one of texts"
+    tasks = {row[names.TASK_INDEX]: row[texts[0]] for row in table.to_pylist()}
+    if len(tasks) < len(table) or any(column.null_count for column in table.columns):
+        return f"lists {table.to_pylist()}, expected one text per {names.TASK_INDEX}"
+    return tasks
 
 
 def read_small_table(path: Path) -> pa.Table | str:
     """Return the parquet file at `path`, or what is wrong with it."""
     try:
-        table = pq.read_table(path)
+        # Not with read_table, which imports pandas.
+        with pq.ParquetFile(path) as file:
+            table = file.read()
         table.validate(full=True)
         return table.select(table.column_names)  # raises where names are no text
     except FileNotFoundError:
@@ -177,8 +225,6 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
     }
     if names.EPISODE_UID in run.columns:
         expected[names.EPISODE_UID] = np.full(len(run), run.columns[names.EPISODE_UID][0])
-    if {names.DONE, names.TERMINATED, names.TRUNCATED} <= run.columns.keys():
-        expected[names.DONE] = run.columns[names.TERMINATED] | run.columns[names.TRUNCATED]
     for name, values in run.columns.items():
         wrong = ~np.isfinite(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
         if name == names.TIMESTAMP:
@@ -191,3 +237,23 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
             wanted = f", expected {expected[name][at]}" if name in expected else ", expected a finite number"
             more = f" ({int(wrong.sum())} values are wrong)" if wrong.sum() > 1 else ""
             yield name, f"{name} is {values[at]} in {where}{wanted}{more}"
+
+
+def flag_faults(run: Run, number: int) -> Iterator[str]:
+    """Yield a sentence for each flag of episode `number` that ends it early, or contradicts the others."""
+    flags = {
+        name: values != 0
+        for name in _FLAGS
+        if (values := run.columns.get(name)) is not None and values.ndim == 1
+    }
+    for name, values in flags.items():
+        if values[:-1].any():
+            told = f"{name} is True in episode {number} frame {values.argmax()}"
+            yield f"{told}, before the last frame {len(run) - 1}"
+    if len(flags) == len(_FLAGS):
+        expected = flags[names.TERMINATED] | flags[names.TRUNCATED]
+        wrong = flags[names.DONE] != expected
+        if wrong.any():
+            at = wrong.argmax()
+            told = f"{names.DONE} is {flags[names.DONE][at]} in episode {number} frame {at}"
+            yield f"{told}, expected {expected[at]}: terminated or truncated"

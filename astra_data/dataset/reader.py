@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.columns import RESERVED, Array, Column, Episode
+from astra_data.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.validate import content_faults
@@ -143,6 +143,19 @@ class Dataset(Contents):
                 )
                 first, episode = last, episode + 1
             rest = {name: values[first:] for name, values in rest.items()} if first < rows else {}
+
+    def successes(self) -> list[bool | None] | None:
+        """Tell of each episode whether it succeeded, None where nothing does; None if nothing does of any.
+
+        It did if its metadata say so or, where they are silent of some, if a step does in next.success.
+        """
+        told = [
+            None if value is None or isinstance(value, str) else bool(value)
+            for value in self.metadata.get("success", [None])
+        ]
+        if None in told and SUCCESS in self.features:
+            return [bool(episode.columns[SUCCESS].any()) for episode in self.episodes([SUCCESS])]
+        return None if set(told) == {None} else told
 
     def subset(self, count: int) -> list[int]:
         """Return `count` episode indices; smaller subsets are prefixes of larger ones.

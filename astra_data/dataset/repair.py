@@ -21,15 +21,19 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
     TASKS_PATH,
 )
+from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.parquet import UNREADABLE, read_blocks
 from astra_data.dataset.plain import (
+    MOST_FPS,
     PlainColumn,
     Run,
     data_files,
     episodes_files,
+    flag_faults,
     plain_columns,
     read_object,
     read_small_table,
+    read_tasks,
     run_faults,
     runs,
 )
@@ -38,8 +42,11 @@ from astra_data.dataset.versions import Version, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError, CorruptDatasetError
 
-_KEPT = {"name", "version", "seeds", "environment", "simulator", "content_hash"}
-"""What a repaired dataset takes over from meta/astra/dataset.json."""
+_STRUCTURE = {
+    *(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX),
+    *(names.TIMESTAMP, names.EPISODE_UID),
+}
+"""Columns that tell where episodes begin: where they are wrong, so may be all that follows."""
 _DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
 
 
@@ -58,10 +65,11 @@ class Repaired:
 
 
 def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
-    """Write the longest prefix of whole, verified episodes in `folder` to a new dataset `out`.
+    """Write the whole, verified episodes in `folder` to a new dataset `out`.
 
-    Data files are read by their footers, or where a killed writer left none, by their pages. Statistics and
-    meta/episodes are made anew.
+    An episode whose values are wrong is left out; so is all that follows once it is unclear where episodes
+    begin, or a file cannot be read. Data files are read by their footers, or where a killed writer left none,
+    by their pages. Statistics and meta/episodes are made anew.
 
     Args:
         folder: the broken dataset; it is not touched.
@@ -80,24 +88,29 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
     if like is not None and names.EPISODE_UID not in info["features"]:
         raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {like.reference}")
     result = Repaired(notes=_conversions(info, columns))
-    tasks = _tasks(folder, result.notes)
+    tasks = read_tasks(folder)
+    if isinstance(tasks, str):
+        result.notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")
+        tasks = {}
     metadata = _metadata(folder, result.notes) if like is None else _facts(like.uids.tolist(), like.metadata)
-    description = _description(folder, like)
+    description = _description(folder, like, result.notes)
     unknown = 0
-    task = " / ".join(tasks) or "unknown"
+    task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
     seed = _subset_seed(folder if like is None else like.root)
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
-        for episode, run in enumerate(_whole_runs(folder, info, columns, fps, result.notes)):
+        for uid, run in _whole_runs(folder, columns, fps, result.notes):
             values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
-            uid = int(run.columns[names.EPISODE_UID][0]) if names.EPISODE_UID in run.columns else episode
             unknown += uid not in metadata
             facts = dict(metadata.get(uid, {}))
             if len(tasks) > 1:
-                index = int(run.columns[names.TASK_INDEX][0])
-                facts["task"] = tasks[index] if 0 <= index < len(tasks) else "unknown"
+                facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
             writer.add(Episode(uid, values, facts))
             result.episodes += 1
             result.frames += len(run)
+        counted = info.get("total_episodes")
+        if isinstance(counted, int) and counted > result.episodes:
+            lost = counted - result.episodes
+            result.notes.append(f"{lost} of the {counted} episodes that {INFO_PATH} counts are lost")
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
     if metadata and unknown:
@@ -114,7 +127,7 @@ def _declared(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn],
     features, fps = info.get("features"), info.get("fps")
     columns = plain_columns(features)[0] if isinstance(features, dict) else []
     missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
-    if missing or not isinstance(fps, int | float) or fps < 1 or fps != int(fps):
+    if missing or not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
         raise CorruptDatasetError(
             f"{folder}: {INFO_PATH} has fps {fps!r} and lacks the columns {', '.join(missing) or 'none'}; "
             "expected a whole number of frames per second and all of LeRobot's own columns"
@@ -126,7 +139,7 @@ def _declared(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn],
             continue
         feature = features[column.name]
         labels = feature.get("names")
-        fits = isinstance(labels, list) and len(labels) == column.size
+        fits = isinstance(labels, list) and [type(label) for label in labels] == [str] * column.size
         kind = _DTYPES[np.dtype(column.dtype).kind]
         known = feature | {"dtype": kind, "names": labels if fits else None}
         specs.append(Column.from_feature(column.name, known))
@@ -143,20 +156,6 @@ def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> lis
         if column.dtype != kind:
             notes.append(f"{column.name} was {column.dtype} and is now {kind}")
     return notes
-
-
-def _tasks(folder: Path, notes: list[str]) -> list[str]:
-    """Return the tasks by their index; pandas calls the column after its index."""
-    table = read_small_table(folder / TASKS_PATH)
-    if isinstance(table, str):
-        notes.append(f"{TASKS_PATH} {table}: the task is unknown")
-        return []
-    texts = [name for name in table.column_names if name != names.TASK_INDEX]
-    if len(texts) != 1 or len(texts) == len(table.column_names):
-        notes.append(f"{TASKS_PATH} has the columns {', '.join(table.column_names)}: the task is unknown")
-        return []
-    rows = sorted(table.to_pylist(), key=lambda row: row[names.TASK_INDEX])
-    return [str(row[texts[0]]) for row in rows]
 
 
 def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
@@ -182,12 +181,15 @@ def _facts(
     }
 
 
-def _description(folder: Path, like: Dataset | None) -> dict[str, Any]:
+def _description(folder: Path, like: Dataset | None, notes: list[str]) -> dict[str, Any]:
     config = {"folder": folder.name}
     if like is not None:
         return successor(like, "episodes", stage="repair", config=config, out=folder)[0]
-    old = read_object(folder / DATASET_PATH)
-    if isinstance(old, str) or not old.keys() >= _KEPT:
+    try:
+        old = read_description(folder)
+    except CorruptDatasetError as error:
+        if (folder / DATASET_PATH).exists():
+            notes.append(f"{error}: the origin is unknown")
         name = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name).lstrip("-._")
         return {"name": name or "repaired", "stage": "repair", "config": config}
     kept = {key: old[key] for key in ("name", "seeds", "environment", "simulator")}
@@ -204,38 +206,40 @@ def _subset_seed(folder: Path) -> int:
 
 
 def _whole_runs(
-    folder: Path, info: Mapping[str, Any], columns: Sequence[PlainColumn], fps: int, notes: list[str]
-) -> Iterator[Run]:
-    """Yield episode after episode until one is not whole, and note why, and how many are lost."""
+    folder: Path, columns: Sequence[PlainColumn], fps: int, notes: list[str]
+) -> Iterator[tuple[int, Run]]:
+    """Yield the uid and the rows of each whole episode, and note which are left out, and where it stops."""
     lengths = _lengths(folder, notes)
     episode = row = 0
     uids: set[int] = set()
+    every = (run for path in data_files(folder) for run in _file_runs(path, columns, notes))
     try:
-        for path in data_files(folder):
-            for run in _file_runs(path, columns, notes):
-                faults = [fault for _, fault in run_faults(run, number=episode, row=row, fps=fps)]
-                if episode in lengths and lengths[episode] != len(run):
-                    faults.append(f"episode {episode} has {len(run)} frames, expected {lengths[episode]}")
-                uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
-                if uid in uids or uid < 0:
-                    faults.append(f"episode {episode} has the uid {uid}, which is taken or negative")
-                if faults:
-                    notes.append(f"stopped before episode {episode}: {'; '.join(faults)}")
-                    return
-                yield run
+        for run in every:
+            found = list(run_faults(run, number=episode, row=row, fps=fps))
+            structural = [fault for name, fault in found if name in _STRUCTURE]
+            if lengths.get(episode, len(run)) != len(run):
+                structural.append(f"episode {episode} has {len(run)} frames, expected {lengths[episode]}")
+            if structural:
+                notes.append(f"stopped before episode {episode}: {'; '.join(structural)}")
+                return
+            faults = [*(fault for _, fault in found), *flag_faults(run, episode)]
+            uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
+            if uid in uids or uid < 0:
+                faults.append(f"its uid {uid} is taken or negative")
+            if faults:
+                notes.append(f"left out episode {episode}: {'; '.join(faults)}")
+            else:
                 uids.add(uid)
-                episode, row = episode + 1, row + len(run)
+                yield uid, run
+            episode, row = episode + 1, row + len(run)
     except CorruptDatasetError as error:
         notes.append(f"stopped before episode {episode}: {error}")
-    finally:
-        counted = info.get("total_episodes")
-        if isinstance(counted, int) and counted > episode:
-            notes.append(f"{counted - episode} of the {counted} episodes that {INFO_PATH} counts are lost")
 
 
 def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
     """Return the lengths that meta/episodes tells, as far as it can be read."""
     lengths: dict[int, int] = {}
+    before = len(notes)
     for path in episodes_files(folder):
         try:
             for block in read_blocks([path], ["episode_index", "length"]):
@@ -243,7 +247,7 @@ def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
                 lengths |= zip(columns["episode_index"], columns["length"], strict=True)
         except (CorruptDatasetError, KeyError) as error:
             notes.append(f"meta/episodes was made anew from the data: {error}")
-    if not lengths and not notes:
+    if not lengths and len(notes) == before:
         notes.append("meta/episodes was missing and was made anew from the data")
     return lengths
 

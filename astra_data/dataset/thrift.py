@@ -8,6 +8,9 @@ from typing import Any
 
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 
+_LONGEST = 63
+"""Bits of the longest number but its last seven."""
+
 Struct = dict[int, tuple[int, Any]]
 
 
@@ -71,6 +74,8 @@ class Reader:
             if byte < 128:
                 return number
             shift += 7
+            if shift > _LONGEST:
+                raise ValueError("a number does not end")
 
     def _signed(self) -> int:
         number = self._unsigned()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.columns import RESERVED, SUCCESS, Column
+from astra_data.columns import RESERVED, Column
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.errors import BadInputError
@@ -113,11 +113,8 @@ def _counts(dataset: Dataset) -> str:
         ("duration", f"{lengths.sum() / dataset.info['fps'] / 60:,.1f} min"),
         ("episode length", f"{lengths.min()} to {lengths.max()} steps; quartiles {_listed(quartiles)}"),
     ]
-    facts = {
-        key: [value for value in values if value is not None] for key, values in dataset.metadata.items()
-    }
-    if SUCCESS in dataset.features and "success" not in facts:
-        facts["success"] = [bool(episode.columns[SUCCESS].any()) for episode in dataset.episodes([SUCCESS])]
+    told = dataset.metadata | {"success": dataset.successes() or []}
+    facts = {key: [value for value in values if value is not None] for key, values in told.items()}
     for key, values in sorted(facts.items()):
         if values and all(isinstance(value, bool) for value in values):
             share = sum(map(bool, values)) / len(values)

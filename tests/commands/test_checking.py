@@ -33,3 +33,16 @@ def test_validate_and_repair(
     assert run(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
     assert "exists already" in capsys.readouterr().err
     assert run(monkeypatch, "validate", tmp_path / "saved") == 0
+
+
+def test_validate_counts_all_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    (root / "data/0.txt").touch()
+    run(monkeypatch, "validate", root)
+    assert "has 1 fault:" in capsys.readouterr().err
+    for number in range(30):
+        (root / f"data/{number}.txt").touch()
+    run(monkeypatch, "validate", root)
+    assert "has 30 faults:" in capsys.readouterr().err

@@ -73,7 +73,14 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
         (alter(DATA, "timestamp", 10, 0.2), ["timestamp is 0.2", "in episode 2 frame 2, expected 0.1"]),
         (alter(DATA, "task_index", 8, 3), ["episode 2 has the unknown tasks [3]"]),
         (alter(DATA, "episode_uid", 9, 5), ["episode_uid is 5 in episode 2 frame 1"]),
-        (alter(DATA, "next.done", 9, True), ["next.done is True in episode 2 frame 1, expected False"]),
+        (
+            alter(DATA, "next.done", 9, True),
+            [
+                "next.done is True in episode 2 frame 1, before the last frame 11",
+                "next.done is True in episode 2 frame 1, expected False: terminated or truncated",
+            ],
+        ),
+        (alter(DATA, "next.truncated", 9, True), ["next.truncated is True in episode 2 frame 1, before"]),
         (
             alter(DATA, "observation.state", 10, [0, np.nan, 0]),
             ["observation.state is nan in episode 2 frame 2 index 1, expected a finite number"],
@@ -85,11 +92,14 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
         (alter(EPISODES, "tasks", 0, ["walk"]), ["tasks of episode 0 are ['walk'], expected {'run'}"]),
         (alter(EPISODES, "stats/mode/max", 2, [5.0]), ["max of mode in episode 2 is [5.0]"]),
         (change_statistics, ["meta/stats.json: q99 of action is"]),
+        (write("meta/stats.json", b'{"action": 1}'), ["meta/stats.json has no JSON object for action"]),
+        (write("meta/stats.json", b"[]"), ["meta/stats.json is no JSON object but list"]),
         (drop("meta/stats.json"), ["meta/stats.json is missing"]),
         (
             drop("meta/tasks.parquet"),
             ["meta/tasks.parquet is missing", "episode 0 has the unknown tasks [0]"],
         ),
+        (alter("meta/tasks.parquet", "task", 0, None), ["expected one text per task_index"]),
         (drop("meta/astra/subsets.json"), ["meta/astra/subsets.json is missing"]),
         (drop(DATA), ["data has no parquet file"]),
         (drop(EPISODES), ["meta/episodes has no parquet file"]),
@@ -107,6 +117,15 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
                 "total_tasks is 3",
             ],
         ),
+        (
+            edit("meta/astra/dataset.json", parents=[{"name": "x"}], stage=""),
+            ["dataset.json has 3 faults: parents.0.version: expected a value", "parents.0.hash", "stage: "],
+        ),
+        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 11 faults: name: expected a value"]),
+        (edit("meta/astra/subsets.json", seed="0"), ["subsets.json: seed: expected a whole number"]),
+        (edit("meta/info.json", data_path="/etc/file.parquet"), ["expected a path inside the folder"]),
+        (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
+        (edit("meta/info.json", data_path="{file_index:99999999d}"), ["expected a path inside the folder"]),
         (edit("meta/info.json", fps="20"), ["fps is '20', expected a positive number"]),
         (edit("meta/info.json", features=[]), ["features is [], expected an object"]),
         (alter("meta/astra/episodes.parquet", "length", 3, 4), ["(6, 4) as uid and length of episode 3"]),
@@ -137,6 +156,27 @@ def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
     assert "timestamp: and 7 more of this kind" in faults
 
 
+def test_notes_are_counted_apart_from_faults(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for number in range(8):
+        (root / f"meta/{number}.txt").touch()
+    (root / "data/one.txt").touch()
+    report = check(root)
+    assert report.faults == ["data/one.txt does not belong to it"]
+    assert report.fault_count == 1
+    assert report.notes[-1] == "files: and 3 more of this kind"
+
+
+def test_an_unreadable_file_stops_the_check_of_values_also_after_many_faults(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for number in range(8):
+        (root / f"data/{number}.txt").touch()
+    truncate(DATA)(root)
+    report = check(root)
+    assert report.notes == ["values were not checked, because not all files could be read as declared"]
+    assert (len(report.faults), report.fault_count) == (MOST + 1, 9)
+
+
 def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     table = pq.read_table(root / DATA)
@@ -157,8 +197,37 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
     assert report.faults == []
     assert "a plain LeRobot dataset" in report.notes[0]
     assert "meta/other.json does not belong to it" in report.notes
+    alter(DATA, "next.done", 9, True)(root)
+    report = check(root)
+    assert not [fault for fault in report.faults if "next.done" in fault]
+    assert "next.done is True in episode 2 frame 1, before the last frame 11" in report.notes
     alter(DATA, "index", 8, 70)(root)
     assert "index is 70 in episode 2 frame 0, expected 8" in check(root).faults
+
+
+def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / DATA)
+    at = table.column_names.index("next.reward")
+    wide = table.column("next.reward").cast(pa.float64())
+    pq.write_table(table.set_column(at, "next.reward", wide), root / DATA)
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["next.reward"]["dtype"] = "float64"
+    edit("meta/info.json", features=features)(root)
+    assert "dtype 'float64' is not one of float32, int64, bool" in "\n".join(check(root).faults)
+
+
+def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for path in (root / "meta/astra").iterdir():
+        path.unlink()
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["next.reward"]["dtype"] = None
+    features["action"]["shape"] = ["2"]
+    edit("meta/info.json", features=features)(root)
+    report = check(root)
+    assert report.faults == []
+    assert "not checked, for they are not rows of numbers: action, next.reward" in report.notes
 
 
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:

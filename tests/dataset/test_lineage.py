@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import pytest
@@ -5,7 +6,9 @@ from fake_dataset import write_fake
 
 from astra_data.dataset import Dataset
 from astra_data.dataset.edit import delete, merge, subset
+from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.lineage import lineage, tree_lines
+from astra_data.errors import CorruptDatasetError
 
 
 def test_ancestors_are_found_at_home_and_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,3 +36,22 @@ def test_an_ancestor_is_known_by_its_hash(tmp_path: Path, monkeypatch: pytest.Mo
     delete(made, [0], out=tmp_path / "home/fake/data-1.0.0")
     [line] = list(tree_lines(lineage(made)))[1:]
     assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
+
+
+def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    first = write_fake(tmp_path / "home/fake/data-1.0.0")
+    made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
+    path = first.root / DATASET_PATH
+    path.write_text(json.dumps(first.description | {"parents": [made.identity]}))
+    with pytest.raises(CorruptDatasetError, match=r"fake@data-1\.1\.0 is among its own ancestors"):
+        lineage(made)
+
+
+def test_a_malformed_ancestor_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    first = write_fake(tmp_path / "home/fake/data-1.0.0")
+    made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
+    (first.root / DATASET_PATH).write_text(json.dumps(first.description | {"parents": 3}))
+    [line] = list(tree_lines(lineage(made)))[1:]
+    assert line.endswith("(not found here)")

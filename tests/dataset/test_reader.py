@@ -164,7 +164,7 @@ def drop_rows(root: Path) -> None:
         ),
         (
             lambda root: (root / "meta/info.json").write_text('{"codebase_version": "v3.0"}'),
-            ["'features' is missing"],
+            ["has 5 faults: fps: expected a value", "; features: expected a value"],
         ),
     ],
 )

@@ -131,28 +131,93 @@ def test_footers_are_rebuilt_for_many_pages_per_column(
             assert file.read().equals(table)
 
 
-def test_the_prefix_before_a_wrong_value_is_saved(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
+def alter(root: Path, column: str, changes: dict[int, object]) -> None:
+    """Change rows of the data."""
     table = pq.read_table(root / DATA)
-    rewards = table.column("next.reward").to_pylist()
-    rewards[25] = float("nan")
-    at = table.column_names.index("next.reward")
-    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(rewards, pa.float32())), root / DATA)
+    values = table.column(column).to_pylist()
+    for row, value in changes.items():
+        values[row] = value
+    at, field = table.column_names.index(column), table.schema.field(column)
+    pq.write_table(table.set_column(at, field, pa.array(values, field.type)), root / DATA)
+
+
+def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(root, "next.reward", {25: float("nan")})
+    alter(root, "next.done", {3: True})
     (root / EPISODES).unlink()
     (root / "meta/stats.json").unlink()
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.episodes == 3
     told = "\n".join(repaired.notes)
     assert "meta/episodes was missing" in told
-    assert "stopped before episode 3: next.reward is nan in episode 3 frame 5" in told
+    assert "left out episode 0: next.done is True in episode 0 frame 3, before the last frame 6" in told
+    assert "left out episode 3: next.reward is nan in episode 3 frame 5" in told
     assert "2 of the 5 episodes" in told
     saved = Dataset.open(tmp_path / "saved")
     assert (saved.reference, saved.description["stage"]) == ("fake@data-1.1.0", "repair")
     assert saved.verify() == []
-    for found, expected in zip(saved.episodes(), fake_episodes(), strict=False):
+    assert check(saved.root).faults == []
+    whole = [episode for number, episode in enumerate(fake_episodes()) if number not in (0, 3)]
+    for found, expected in zip(saved.episodes(), whole, strict=True):
         assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
         for name, values in expected.columns.items():
             np.testing.assert_array_equal(found.columns[name], values)
+
+
+def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(root, "episode_uid", dict.fromkeys(range(8, 20), 4))
+    repaired = repair(root, out=tmp_path / "saved")
+    assert "left out episode 2: its uid 4 is taken or negative" in repaired.notes
+    assert Dataset.open(tmp_path / "saved").uids.tolist() == [13, 4, 6, 0]
+
+
+def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(root, "frame_index", {9: 7})
+    repaired = repair(root, out=tmp_path / "saved")
+    assert repaired.episodes == 2
+    assert "stopped before episode 2: frame_index is 7 in episode 2 frame 1, expected 1" in repaired.notes
+
+
+def test_episodes_without_a_uid_keep_their_number(killed: Path, tmp_path: Path) -> None:
+    shutil.copytree(killed / "whole", tmp_path / "set")
+    alter(tmp_path / "set", "next.reward", {0: float("nan")})
+    repair(tmp_path / "set", out=tmp_path / "saved")
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.uids.tolist() == list(range(1, 8))
+    assert saved.metadata["task"] == [killed_lerobot.task(number) for number in range(1, 8)]
+
+
+def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(killed / "whole", root)
+    indices = pq.read_table(root / DATA).column("task_index").to_pylist()
+    alter(root, "task_index", {row: index + 1 for row, index in enumerate(indices)})
+    table = pa.table({"task_index": [1, 2], "task": ["walk", "run"]})
+    pq.write_table(table, root / "meta/tasks.parquet")
+    (root / EPISODES).unlink()
+    repair(root, out=tmp_path / "saved")
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.metadata["task"] == [killed_lerobot.task(number) for number in range(8)]
+    assert saved.task == "walk / run"
+
+
+def test_missing_episodes_are_told_beside_other_notes(killed: Path, tmp_path: Path) -> None:
+    shutil.copytree(killed / "whole", tmp_path / "set")
+    (tmp_path / "set" / EPISODES).unlink()
+    notes = repair(tmp_path / "set", out=tmp_path / "saved").notes
+    assert "meta/episodes was missing and was made anew from the data" in notes
+    assert len(notes) > 1
+
+
+@pytest.mark.parametrize("byte", [b"\x1c", b"\xff"])
+def test_a_header_without_end_is_no_page(tmp_path: Path, byte: bytes) -> None:
+    path = tmp_path / "endless.parquet"
+    path.write_bytes(b"PAR1" + byte * 10**6)
+    with pytest.raises(CorruptDatasetError, match="no whole row group"):
+        rebuilt_metadata(path, pa.schema([("x", pa.int64())]))
 
 
 def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:

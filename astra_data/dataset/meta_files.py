@@ -1,0 +1,134 @@
+"""The JSON files of our metadata, believed only once they fit strict models."""
+
+import re
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from astra_data.columns import Column
+from astra_data.dataset.format import DATASET_PATH, INFO_PATH, SUBSETS_PATH
+from astra_data.dataset.plain import MOST_FPS, read_object
+from astra_data.dataset.provenance import NAME
+from astra_data.errors import BadInputError, CorruptDatasetError, RecipeError
+from astra_data.recipe import Config, Count, validated
+
+_DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
+
+
+def is_data_path(pattern: object) -> bool:
+    """Tell whether `pattern` takes chunk_index and file_index and names files inside the dataset's folder."""
+    if not isinstance(pattern, str) or not _DATA_PATH.fullmatch(pattern):
+        return False
+    path = PurePosixPath(pattern)
+    return not path.is_absolute() and ".." not in path.parts
+
+
+def _data_path(pattern: str) -> str:
+    if not is_data_path(pattern):
+        raise ValueError(f"expected a path inside the dataset's folder, got {pattern!r}")
+    return pattern
+
+
+class _Open(Config):
+    """Like `Config`, but other keys are left alone: other tools add theirs."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class _Words(Config):
+    meaning: str = ""
+    unit: tuple[str, ...] = ()
+    frame: tuple[str, ...] = ()
+    role: tuple[str, ...] = ()
+    mirror: tuple[str, ...] = ()
+
+
+class _Feature(_Open):
+    dtype: Literal["float32", "int64", "bool"]
+    shape: tuple[Count]
+    names: tuple[str, ...] | None = None
+    astra: _Words | None = None
+
+
+class _Info(_Open):
+    fps: int = Field(ge=1, lt=MOST_FPS)
+    features: dict[str, _Feature]
+    total_episodes: Count
+    total_frames: Count
+    data_path: Annotated[str, AfterValidator(_data_path)]
+
+
+class _Identity(Config):
+    name: str = Field(pattern=f"^{NAME.pattern}$")
+    version: str = Field(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+$")
+    hash: str
+
+
+class _Description(_Open):
+    name: str = Field(pattern=f"^{NAME.pattern}$")
+    version: str = Field(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+$")
+    parents: tuple[_Identity, ...]
+    stage: str = Field(min_length=1)
+    config: dict[str, Any]
+    seeds: dict[str, Any]
+    environment: dict[str, Any]
+    simulator: dict[str, Any]
+    packages: dict[str, str]
+    git_commit: str | None
+    content_hash: str
+
+
+class _Subsets(_Open):
+    seed: int
+    uids: tuple[int, ...]
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """Return meta/info.json of the dataset in folder `root`, with the features of valid columns.
+
+    Raises:
+        CorruptDatasetError: it is missing or malformed; lists every fault.
+    """
+    info = _read(root / INFO_PATH, INFO_PATH, _Info)
+    faults = []
+    for name, feature in info["features"].items():
+        try:
+            Column.from_feature(name, feature)
+        except BadInputError as error:
+            faults.append(str(error))
+    if faults:
+        raise CorruptDatasetError(f"{INFO_PATH}: {' '.join(faults)}")
+    return info
+
+
+def read_description(root: Path) -> dict[str, Any]:
+    """Return meta/astra/dataset.json: all that `complete_description` writes, the content hash, and more.
+
+    Raises:
+        CorruptDatasetError: it is missing or malformed; lists every fault.
+    """
+    return _read(root / DATASET_PATH, DATASET_PATH, _Description)
+
+
+def read_subsets(root: Path) -> dict[str, Any]:
+    """Return meta/astra/subsets.json: "seed" and "uids".
+
+    Raises:
+        CorruptDatasetError: it is missing or malformed; lists every fault.
+    """
+    return _read(root / SUBSETS_PATH, SUBSETS_PATH, _Subsets)
+
+
+def _read(path: Path, name: str, model: type[BaseModel]) -> dict[str, Any]:
+    found = read_object(path)
+    if isinstance(found, str):
+        raise CorruptDatasetError(f"{name} {found}")
+    try:
+        validated(found, model, name)
+    except RecipeError as error:
+        told = str(error).replace(":\n  ", ": ").replace("\n  ", "; ")
+        raise CorruptDatasetError(told) from error
+    except RecursionError as error:
+        raise CorruptDatasetError(f"{name} is nested too deeply") from error
+    return found
