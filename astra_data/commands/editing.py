@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands.arguments import DatasetName, Out
+from astra_data.commands.arguments import DatasetName, NewName, Out
 
 
 def subset(
@@ -31,6 +31,7 @@ def subset(
             show_default=False,
         ),
     ] = None,
+    name: NewName = None,
     out: Out = None,
 ) -> None:
     """Write a random subset; with one seed, smaller subsets lie inside larger ones."""
@@ -38,7 +39,18 @@ def subset(
     from astra_data.dataset.versions import open_dataset
 
     source = open_dataset(dataset)
-    _told(write(source, episodes=episodes, percent=percent, of=of, seed=seed, stratify=stratify, out=out))
+    _told(
+        write(
+            source,
+            episodes=episodes,
+            percent=percent,
+            of=of,
+            seed=seed,
+            stratify=stratify,
+            name=name,
+            out=out,
+        )
+    )
 
 
 def merge(
@@ -52,13 +64,14 @@ def merge(
     new_uids: Annotated[
         bool, typer.Option("--new-uids", help="Give episodes whose uid is taken a new one.")
     ] = False,
+    name: NewName = None,
     out: Out = None,
 ) -> None:
     """Write the episodes of several datasets into one."""
     from astra_data.dataset.edit import merge as write
     from astra_data.dataset.versions import open_dataset
 
-    _told(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, out=out))
+    _told(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, name=name, out=out))
 
 
 def delete(
@@ -67,13 +80,14 @@ def delete(
         list[int],
         typer.Option("--episode", metavar="UID", help="An episode; may be repeated.", show_default=False),
     ],
+    name: NewName = None,
     out: Out = None,
 ) -> None:
     """Write a dataset without some of its episodes."""
     from astra_data.dataset.edit import delete as write
     from astra_data.dataset.versions import open_dataset
 
-    _told(write(open_dataset(dataset), uids, out=out))
+    _told(write(open_dataset(dataset), uids, name=name, out=out))
 
 
 def filter_(
@@ -86,6 +100,7 @@ def filter_(
     max_return: Annotated[float | None, typer.Option(help="Largest return.", show_default=False)] = None,
     min_length: Annotated[int | None, typer.Option(help="Fewest steps.", show_default=False)] = None,
     max_length: Annotated[int | None, typer.Option(help="Most steps.", show_default=False)] = None,
+    name: NewName = None,
     out: Out = None,
 ) -> None:
     """Write the episodes that meet every given condition."""
@@ -100,6 +115,7 @@ def filter_(
             max_return=max_return,
             min_length=min_length,
             max_length=max_length,
+            name=name,
             out=out,
         )
     )

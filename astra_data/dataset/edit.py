@@ -31,6 +31,7 @@ def subset(
     of: int | None = None,
     seed: int | None = None,
     stratify: str | None = None,
+    name: str | None = None,
     out: Path | None = None,
 ) -> Path:
     """Write a random subset; with one seed, smaller ones lie inside larger ones, also through several steps.
@@ -42,7 +43,8 @@ def subset(
         of: what 100 per cent are, by default all episodes of `source`.
         seed: of the permutation whose first episodes are taken, by default the one stored in `source`.
         stratify: a key of the episodes' metadata; each of its values keeps its share.
-        out: folder of the new dataset.
+        name: of the new dataset, by default that of `source`, whose next version it is.
+        out: its folder, by default its place at home.
 
     Raises:
         BadInputError: not exactly one of `episodes` and `percent`, or more episodes than there are.
@@ -63,10 +65,10 @@ def subset(
     config = {"episodes": count, "percent": percent, "of": of, "seed": chosen} | (
         {"stratify": stratify, "strata": strata} if stratify else {}
     )
-    return _write(source, set(order[:count]), stage="subset", config=config, out=out, seed=chosen)
+    return _write(source, set(order[:count]), stage="subset", config=config, name=name, out=out, seed=chosen)
 
 
-def delete(source: Dataset, uids: Sequence[int], *, out: Path | None = None) -> Path:
+def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out: Path | None = None) -> Path:
     """Write `source` without the episodes `uids`.
 
     Raises:
@@ -80,7 +82,7 @@ def delete(source: Dataset, uids: Sequence[int], *, out: Path | None = None) -> 
             f"uids lie between {min(known)} and {max(known)}: {_listed(sorted(known))}"
         )
     config = {"episodes": sorted(set(uids))}
-    return _write(source, known - set(uids), stage="delete", config=config, out=out)
+    return _write(source, known - set(uids), stage="delete", config=config, name=name, out=out)
 
 
 def filter_episodes(
@@ -91,6 +93,7 @@ def filter_episodes(
     max_return: float | None = None,
     min_length: int | None = None,
     max_length: int | None = None,
+    name: str | None = None,
     out: Path | None = None,
 ) -> Path:
     """Write the episodes of `source` that meet every given condition; both bounds belong to a range.
@@ -127,10 +130,12 @@ def filter_episodes(
         "max_length": max_length,
     }
     config = {key: value for key, value in config.items() if value is not None}
-    return _write(source, set.intersection(*met), stage="filter", config=config, out=out)
+    return _write(source, set.intersection(*met), stage="filter", config=config, name=name, out=out)
 
 
-def merge(sources: Sequence[Dataset], *, new_uids: bool = False, out: Path | None = None) -> Path:
+def merge(
+    sources: Sequence[Dataset], *, new_uids: bool = False, name: str | None = None, out: Path | None = None
+) -> Path:
     """Write the episodes of all `sources` one after another; the first gives name, version and seeds.
 
     Args:
@@ -138,7 +143,8 @@ def merge(sources: Sequence[Dataset], *, new_uids: bool = False, out: Path | Non
         new_uids: whether an episode whose uid an earlier one has gets a new one, the same in every run;
             its old one is kept as "merged_uid", and a "source_episode" in the same dataset is still named.
             Otherwise that is refused.
-        out: folder of the new dataset.
+        name: of the new dataset, by default that of `source`, whose next version it is.
+        out: its folder, by default its place at home.
 
     Raises:
         BadInputError: the datasets do not fit together; lists every difference.
@@ -160,9 +166,9 @@ def merge(sources: Sequence[Dataset], *, new_uids: bool = False, out: Path | Non
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
     description, folder = successor(
-        first, "episodes", stage="merge", config=config, out=out, parents=tuple(others)
+        first, "episodes", stage="merge", config=config, name=name, out=out, parents=tuple(others)
     )
-    with _writer(first, folder, description, first.subset_seed) as writer:
+    with DatasetWriter.like(first, folder, description) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
                 writer.add(_renamed(episode, named))
@@ -186,28 +192,18 @@ def _write(
     *,
     stage: str,
     config: Mapping[str, Any],
+    name: str | None,
     out: Path | None,
     seed: int | None = None,
 ) -> Path:
     if not kept:
         raise BadInputError(f"{source.reference}: no episode would be left of its {len(source)}")
-    description, folder = successor(source, "episodes", stage=stage, config=config, out=out)
-    with _writer(source, folder, description, source.subset_seed if seed is None else seed) as writer:
+    description, folder = successor(source, "episodes", stage=stage, config=config, name=name, out=out)
+    with DatasetWriter.like(source, folder, description, subset_seed=seed) as writer:
         for episode in source.episodes():
             if episode.uid in kept:
                 writer.add(episode)
     return folder
-
-
-def _writer(source: Dataset, folder: Path, description: Mapping[str, Any], seed: int) -> DatasetWriter:
-    return DatasetWriter(
-        folder,
-        source.schema,
-        fps=source.info["fps"],
-        task=source.task,
-        description=description,
-        subset_seed=seed,
-    )
 
 
 def _uids(source: Dataset) -> list[int]:

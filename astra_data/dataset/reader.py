@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from astra_data.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents
+from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.validate import content_faults
 from astra_data.errors import BadInputError, CorruptDatasetError
@@ -19,15 +20,15 @@ class Dataset(Contents):
     """A finished dataset of E episodes and N steps; make one with `Dataset.open`."""
 
     @classmethod
-    def open(cls, root: Path) -> "Dataset":
-        """Open the dataset in folder `root`.
+    def open(cls, root: Path | str) -> "Dataset":
+        """Open the dataset in folder `root`; `versions.open_dataset` also takes names.
 
         Raises:
-            BadInputError: there is no dataset.
+            BadInputError: there is no dataset, or one that is not ours.
             CorruptDatasetError: it is incomplete or was altered; lists what is wrong.
         """
-        if not root.is_dir():
-            raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
+        root = Path(root)
+        _refuse_others(root)
         with _explained(root):
             return cls(**vars(read_contents(root)))
 
@@ -197,6 +198,19 @@ class Dataset(Contents):
         return [Column.from_feature(name, self.features[name]) for name in names]
 
 
+def _refuse_others(root: Path) -> None:
+    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
+    if versions:
+        raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
+    if not (root / "meta").is_dir():
+        raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
+    if (root / INFO_PATH).is_file() and not (root / "meta/astra").is_dir():
+        raise BadInputError(
+            f"{root} is a LeRobot dataset without our metadata: `astra-data repair {root} --out FOLDER` "
+            "makes one of ours of it, and leaves it as it is."
+        )
+
+
 @contextmanager
 def _explained(root: Path) -> Iterator[None]:
     try:
@@ -205,5 +219,6 @@ def _explained(root: Path) -> Iterator[None]:
         fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
         raise CorruptDatasetError(
             f"{root} is incomplete or was altered: {fault}. "
-            "Restore it from a copy, or delete the folder and run the stage that wrote it again."
+            f"Restore it from a copy, run the stage that wrote it again, or save what is whole of it: "
+            f"`astra-data repair {root} --out FOLDER`."
         ) from error

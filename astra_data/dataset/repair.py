@@ -1,18 +1,15 @@
 """Save what is whole of a broken LeRobot dataset, ours or another's, into a new one."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from astra_data import columns as names
 from astra_data.columns import Column, Episode, Scalar
-from astra_data.dataset.footerless import rebuilt_metadata
 from astra_data.dataset.format import (
     DATASET_PATH,
     DEFAULT_COLUMNS,
@@ -22,31 +19,20 @@ from astra_data.dataset.format import (
     TASKS_PATH,
 )
 from astra_data.dataset.meta_files import read_description
-from astra_data.dataset.parquet import UNREADABLE, read_blocks
 from astra_data.dataset.plain import (
     MOST_FPS,
     PlainColumn,
-    Run,
-    data_files,
-    episodes_files,
-    flag_faults,
     plain_columns,
     read_object,
     read_small_table,
     read_tasks,
-    run_faults,
-    runs,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.salvage import whole_runs
 from astra_data.dataset.versions import Version, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import BadInputError, CorruptDatasetError
 
-_STRUCTURE = {
-    *(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX),
-    *(names.TIMESTAMP, names.EPISODE_UID),
-}
-"""Columns that tell where episodes begin: where they are wrong, so may be all that follows."""
 _DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
 
 
@@ -98,7 +84,7 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
     seed = _subset_seed(folder if like is None else like.root)
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
-        for uid, run in _whole_runs(folder, columns, fps, result.notes):
+        for uid, run in whole_runs(folder, columns, fps, result.notes):
             values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
             unknown += uid not in metadata
             facts = dict(metadata.get(uid, {}))
@@ -111,6 +97,14 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
         if isinstance(counted, int) and counted > result.episodes:
             lost = counted - result.episodes
             result.notes.append(f"{lost} of the {counted} episodes that {INFO_PATH} counts are lost")
+        written = read_object(folder / DATASET_PATH)
+        is_all = like is None and counted == result.episodes and len(columns) == len(info["features"])
+        if is_all and not isinstance(written, str) and written.get("content_hash") != writer.content_hash:
+            result.notes.append(
+                "a value was altered after it was written, for the content hash is another; which one "
+                "cannot be told"
+            )
+        writer.made = {"repaired": result.notes}
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
     if metadata and unknown:
@@ -203,94 +197,3 @@ def _subset_seed(folder: Path) -> int:
     subsets = read_object(folder / SUBSETS_PATH)
     seed = 0 if isinstance(subsets, str) else subsets.get("seed")
     return seed if isinstance(seed, int) else 0
-
-
-def _whole_runs(
-    folder: Path, columns: Sequence[PlainColumn], fps: int, notes: list[str]
-) -> Iterator[tuple[int, Run]]:
-    """Yield the uid and the rows of each whole episode, and note which are left out, and where it stops."""
-    lengths = _lengths(folder, notes)
-    episode = row = 0
-    uids: set[int] = set()
-    every = (run for path in data_files(folder) for run in _file_runs(path, columns, notes))
-    try:
-        for run in every:
-            found = list(run_faults(run, number=episode, row=row, fps=fps))
-            structural = [fault for name, fault in found if name in _STRUCTURE]
-            if lengths.get(episode, len(run)) != len(run):
-                structural.append(f"episode {episode} has {len(run)} frames, expected {lengths[episode]}")
-            if structural:
-                notes.append(f"stopped before episode {episode}: {'; '.join(structural)}")
-                return
-            faults = [*(fault for _, fault in found), *flag_faults(run, episode)]
-            uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
-            if uid in uids or uid < 0:
-                faults.append(f"its uid {uid} is taken or negative")
-            if faults:
-                notes.append(f"left out episode {episode}: {'; '.join(faults)}")
-            else:
-                uids.add(uid)
-                yield uid, run
-            episode, row = episode + 1, row + len(run)
-    except CorruptDatasetError as error:
-        notes.append(f"stopped before episode {episode}: {error}")
-
-
-def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
-    """Return the lengths that meta/episodes tells, as far as it can be read."""
-    lengths: dict[int, int] = {}
-    before = len(notes)
-    for path in episodes_files(folder):
-        try:
-            for block in read_blocks([path], ["episode_index", "length"]):
-                columns = block.to_pydict()
-                lengths |= zip(columns["episode_index"], columns["length"], strict=True)
-        except (CorruptDatasetError, KeyError) as error:
-            notes.append(f"meta/episodes was made anew from the data: {error}")
-    if not lengths and len(notes) == before:
-        notes.append("meta/episodes was missing and was made anew from the data")
-    return lengths
-
-
-def _file_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str]) -> Iterator[Run]:
-    wanted = [column.name for column in columns]
-    try:
-        with pq.ParquetFile(path) as file:
-            file.schema_arrow  # noqa: B018 - raises where names are no text
-    except UNREADABLE:
-        pass
-    else:
-        yield from runs(path, read_blocks([path], wanted), columns)
-        return
-    schema = pa.schema([(column.name, column.arrow_type) for column in columns])
-    metadata = rebuilt_metadata(path, schema)
-    rows: list[int] = []
-    held: Run | None = None
-    for run in runs(path, _row_groups(path, metadata, wanted, rows), columns):
-        if held is not None:
-            yield held
-        held = run
-    notes.append(
-        f"{path.parent.name}/{path.name} has no footer: {len(rows)} whole row groups were found in it"
-    )
-    # LeRobot writes one row group per episode. Where groups are cut otherwise, the last one may be.
-    if held is not None and len(held) == rows[-1]:
-        yield held
-    elif held is not None:
-        notes.append(
-            f"the last {len(held)} frames in {path.name} may be part of an episode and were left out"
-        )
-
-
-def _row_groups(
-    path: Path, metadata: pq.FileMetaData, wanted: Sequence[str], rows: list[int]
-) -> Iterator[pa.Table]:
-    """Yield row groups up to the first that cannot be read, and append their numbers of rows to `rows`."""
-    with pq.ParquetFile(path, metadata=metadata) as file:
-        for group in range(metadata.num_row_groups):
-            try:
-                table = file.read_row_group(group, columns=wanted, use_threads=False)
-            except UNREADABLE:
-                return
-            rows.append(table.num_rows)
-            yield table

@@ -93,6 +93,34 @@ class DatasetWriter:
         self._exit = ExitStack()
         self._is_open = False
 
+    @classmethod
+    def like(
+        cls,
+        source: Dataset,
+        root: Path,
+        description: Mapping[str, Any],
+        *,
+        more: Sequence[Column] = (),
+        subset_seed: int | None = None,
+    ) -> "DatasetWriter":
+        """Prepare to write to `root` a dataset like `source`, with the columns `more` besides.
+
+        The permutation of the subsets is that of `source`, but for another `subset_seed`.
+        """
+        return cls(
+            root,
+            [*source.schema, *more],
+            fps=source.info["fps"],
+            task=source.task,
+            description=description,
+            subset_seed=source.subset_seed if subset_seed is None else subset_seed,
+        )
+
+    @property
+    def content_hash(self) -> str:
+        """The hash of everything that was added so far."""
+        return self._hash.hexdigest()
+
     def __enter__(self) -> "DatasetWriter":
         """Start the hidden folder."""
         self._folder = self._exit.enter_context(atomic_folder(self.root))
@@ -153,7 +181,7 @@ class DatasetWriter:
         self._write_json(layout.INFO_PATH, info)
         self._write_json(layout.STATS_PATH, global_statistics(self._stored, self._frames, self._blocks))
         self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
-        contents = {"content_hash": self._hash.hexdigest()}
+        contents = {"content_hash": self.content_hash}
         self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
         metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}

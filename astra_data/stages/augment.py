@@ -144,14 +144,7 @@ def augment(
     )
     taken = set(source.uids.tolist())
     placed, lost = 0, 0
-    with DatasetWriter(
-        out,
-        source.schema,
-        fps=source.info["fps"],
-        task=source.task,
-        description=description,
-        subset_seed=source.subset_seed,
-    ) as writer:
+    with DatasetWriter.like(source, out, description) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
                 metadata = {**episode.metadata, "held_out": bool(held_out[index])}

@@ -86,14 +86,7 @@ def pair(
     }
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, simulating, reset_error = 0, 0.0, 0.0
-    with DatasetWriter(
-        out,
-        [*source.schema, *added],
-        fps=source.info["fps"],
-        task=source.task,
-        description=description,
-        subset_seed=source.subset_seed,
-    ) as writer:
+    with DatasetWriter.like(source, out, description, more=added) as writer:
         for episodes in _blocks(source):
             before = time.perf_counter()
             state, action, next_state = (

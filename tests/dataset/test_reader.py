@@ -1,5 +1,6 @@
 import itertools
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -177,10 +178,24 @@ def test_damage_is_told_in_one_line(
         Dataset.open(root)
     message = str(caught.value)
     assert message.startswith(f"{root} is incomplete or was altered: ")
-    assert message.endswith("or delete the folder and run the stage that wrote it again.")
+    assert message.endswith(f"or save what is whole of it: `astra-data repair {root} --out FOLDER`.")
     assert "\n" not in message
     for part in parts:
         assert part in message
+
+
+def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:
+    for version in ("1.0.0", "1.1.0"):
+        write_fake(tmp_path / f"fake/data-{version}")
+    with pytest.raises(BadInputError, match=r"holds versions .*: name one of data-1.0.0, data-1.1.0"):
+        Dataset.open(tmp_path / "fake")
+
+
+def test_a_plain_lerobot_dataset_is_not_called_damaged(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    shutil.rmtree(root / "meta/astra")
+    with pytest.raises(BadInputError, match=r"LeRobot dataset without our metadata: `astra-data repair"):
+        Dataset.open(str(root))
 
 
 def test_damage_behind_an_open_dataset_is_told_too(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import json
 import os
 import random
 import shutil
@@ -15,6 +16,7 @@ from fake_dataset import fake_episodes, write_fake
 from astra_data.dataset import Dataset
 from astra_data.dataset.check import check
 from astra_data.dataset.footerless import rebuilt_metadata
+from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.repair import repair
 from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 
@@ -308,3 +310,12 @@ def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) 
     with pytest.raises(CorruptDatasetError, match=r"meta/info\.json is missing; without it"):
         repair(root, out=tmp_path / "saved")
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+def test_an_altered_value_is_told_though_it_cannot_be_found(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    path = root / DATASET_PATH
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"content_hash": "0" * 64}))
+    result = repair(root, out=tmp_path / "out")
+    assert [note for note in result.notes if "a value was altered after it was written" in note]
+    assert Dataset.open(tmp_path / "out").description["repaired"] == result.notes
