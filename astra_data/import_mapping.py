@@ -1,5 +1,6 @@
 """Which fields of a recording become which columns, in one TOML file."""
 
+from difflib import get_close_matches
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -138,6 +139,9 @@ class ImportMapping(Config):
                 faults.append(f"column {name} has dtype {column.dtype}, expected {expected}")
             if name in (*RESERVED, DONE):
                 faults.append(f"column {name} is filled in, leave it out")
+            slip = get_close_matches(name, {*FLAGS, *FLOATS} - self.columns.keys(), n=1, cutoff=0.9)
+            if slip and name not in (*FLAGS, *FLOATS):
+                faults.append(f"column {name}: did you mean '{slip[0]}'?")
             if not name or "/" in name:
                 faults.append(f"column '{name}': expected a name without '/'")
         jump = self.split.jump

@@ -1,10 +1,11 @@
+import re
 from pathlib import Path
 
 import pytest
 from recordings import MAPPING
 
 from astra_data.errors import RecipeError
-from astra_data.import_mapping import ImportMapping
+from astra_data.import_mapping import ColumnMapping, ImportMapping, Jump, Split
 from astra_data.recipe import load_recipe
 
 
@@ -42,3 +43,18 @@ def test_each_field_is_asked_for_once(tmp_path: Path) -> None:
     mapping = load_recipe(path, ImportMapping)
     assert mapping.fields == ["x", "y", "command", "reward", "fell", "gait"]
     assert mapping.all_fields == [*mapping.fields, "trial"]
+
+
+def test_the_example_is_a_mapping_and_shows_every_key() -> None:
+    path = Path(__file__).parents[1] / "recipes/imports/example.toml"
+    load_recipe(path, ImportMapping)
+    keys = {key for model in (ImportMapping, ColumnMapping, Split, Jump) for key in model.model_fields}
+    words = set(re.findall(r"\w+", path.read_text()))
+    assert keys - words == set()
+
+
+def test_a_slip_in_a_columns_name_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace("[columns.action]", "[columns.actions]"))
+    with pytest.raises(RecipeError, match="column actions: did you mean 'action'"):
+        load_recipe(path, ImportMapping)
