@@ -1,6 +1,5 @@
 """Other people's recordings into datasets."""
 
-import hashlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from astra_data.cutting import Cut, Cutter, Tally
 from astra_data.dataset.parquet import first_line
 from astra_data.dataset.versions import place
 from astra_data.dataset.writer import DatasetWriter
+from astra_data.digest import file_digest
 from astra_data.errors import AstraDataError, BadInputError
 from astra_data.import_mapping import ImportMapping
 from astra_data.importers import csv, hdf5, json, mcap, minari, npz
@@ -238,10 +238,4 @@ def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:
     files = []
     for path in dict.fromkeys(source.path for source in sources):
         files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    identities = []
-    for file in files:
-        with file.open("rb") as stream:
-            identities.append(
-                {"name": file.name, "sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
-            )
-    return identities
+    return [{"name": file.name, "sha256": file_digest(file)} for file in files]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from astra_data.columns import Column
+from astra_data.dataset.provenance import changed_values
 from astra_data.dataset.reader import Dataset
 
 _DESCRIBED = ("name", "version", "stage", "config", "seeds", "environment", "simulator", "parents")
@@ -72,12 +73,8 @@ def _described(dataset: Dataset) -> dict[str, Any]:
 
 
 def _value_differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for key in [*a, *(key for key in b if key not in a)]:
-        before, after = a.get(key), b.get(key)
-        if isinstance(before, Mapping) and isinstance(after, Mapping):
-            yield from _value_differences(before, after, f"{prefix}{key}.")
-        elif before != after:
-            yield f"{prefix}{key}: {_told(before)}, then {_told(after)}"
+    for key, before, after in changed_values(a, b, prefix):
+        yield f"{key}: {_told(before)}, then {_told(after)}"
 
 
 def _told(value: object) -> str:

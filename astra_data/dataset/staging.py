@@ -20,6 +20,7 @@ from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import sync
 from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
+from astra_data.dataset.provenance import changed_values
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
@@ -205,7 +206,7 @@ class StagedWriter:
         text = json.dumps(self._plan, indent=1, sort_keys=True)
         if path.exists():
             before, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
-            differing = _differences(before, now)
+            differing = [key for key, *_ in changed_values(before, now)]
             if differing:
                 raise BadInputError(
                     f"{self.root}: the interrupted recording differs in {', '.join(differing)}; "
@@ -215,15 +216,3 @@ class StagedWriter:
         partial.write_text(text, encoding="utf-8")
         sync(partial)
         os.replace(partial, path)
-
-
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Return the dotted keys whose values differ."""
-    differing = []
-    for key in sorted(before.keys() | now.keys()):
-        old, new = before.get(key), now.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            differing += _differences(old, new, f"{prefix}{key}.")
-        elif old != new:
-            differing.append(f"{prefix}{key}")
-    return differing
