@@ -13,6 +13,7 @@ from astra_data.tasks import Task
 from astra_data.world import limit_command, policy_observation
 
 EncoderKind = Literal["target", "source"]
+Observed = Literal["abstract", "full"]
 
 
 @dataclass
@@ -23,6 +24,7 @@ class DeployedPolicy:
         task: what to do. policy: the networks. model: the grounding, whose encoder is ψ^s.
         target_encoder: ψ^t; where it is None, ψ^s is used.
         command_limit_m_s: of the world that the policy was trained in.
+        observed: whether it is shown φ of the target's state, or that state in full.
     """
 
     task: Task
@@ -30,6 +32,7 @@ class DeployedPolicy:
     model: GroundingModel | None = None
     target_encoder: TargetEncoder | None = None
     command_limit_m_s: float = 2.0
+    observed: Observed = "abstract"
 
     @property
     def observation_size(self) -> int:

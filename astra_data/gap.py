@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.models.grounding import GroundingModel
+from astra_data.grounding_file import Grounding
 from astra_data.seeding import generator
-from astra_data.sims.grounded import GroundedSimulator
+from astra_data.simulators import hidden_before, simulator_of, start_simulator
 from astra_data.tasks import Task
 
 HORIZONS = (1, 10, 50, 200)
@@ -18,11 +18,12 @@ _START_EVERY = 25
 
 
 @torch.no_grad()
-def gap_report(task: Task, model: GroundingModel, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
+def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
     """Replay the actions of `episodes` open loop in both simulators and compare with the target.
 
-    Replays start every 25 steps, the encoder having seen the true history so far. Errors are distances in
-    m and m/s after 1, 10, 50 and 200 steps; means and 95 % bootstrap intervals over episodes.
+    Replays start every 25 steps, a grounding with a memory having seen the true history so far. Errors
+    are distances in m and m/s after 1, 10, 50 and 200 steps; means and 95 % bootstrap intervals over
+    episodes.
     """
     windows = episodes.windows
     lengths = episodes.lengths
@@ -32,19 +33,18 @@ def gap_report(task: Task, model: GroundingModel, episodes: PairedEpisodes, *, s
         for step in range(0, length, _START_EVERY)
     ]
     episode, start = torch.tensor(pairs, device=lengths.device).T
-    _, hidden = model.encoder(model.encoder_input(windows.state, windows.goal, windows.previous_action))
-    before = torch.cat([torch.zeros_like(hidden[:, :1]), hidden[:, :-1]], dim=1)
+    before = hidden_before(grounding, windows)
     device = str(windows.state.device)
     horizons = [horizon for horizon in HORIZONS if horizon <= int(lengths.max())]
     raw = task.simulator(len(pairs), device)
     raw.reset_to(windows.state[episode, start])
-    inner = task.simulator(len(pairs), device)
-    grounded = GroundedSimulator(inner, model, inner.free)
-    grounded.reset_to(
+    grounded = simulator_of(task, grounding, len(pairs), device)
+    start_simulator(
+        grounded,
         windows.state[episode, start],
         torch.arange(len(pairs), device=lengths.device),
         windows.goal[episode, start],
-        hidden=before[episode, start],
+        hidden=None if before is None else before[episode, start],
         previous_action=windows.previous_action[episode, start],
     )
     errors: dict[str, dict[int, Tensor]] = {"raw": {}, "grounded": {}}

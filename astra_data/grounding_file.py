@@ -1,31 +1,52 @@
-"""Grounding models on disk: one safetensors file that carries weights, shape, scales and provenance."""
+"""What methods learned about a simulator, on disk: one safetensors file with its provenance."""
 
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import BadInputError
 from astra_data.models.grounding import GroundingModel, GroundingShape
+from astra_data.variation import Variation
+
+Grounding = GroundingModel | Variation
+"""A history model that corrects each step, or parameters of the simulator that were identified."""
 
 
-def save_grounding(path: Path, model: GroundingModel, episodes: PairedEpisodes) -> None:
-    """Write `model`, fitted on `episodes`, to `path`."""
-    told = {
-        "shape": asdict(model.shape),
-        "target": model.target,
-        "dataset": episodes.reference,
-        "hash": episodes.content_hash,
-    }
-    save_tensors(path, model.state_dict(), told)
+def save_grounding(path: Path, grounding: Grounding, episodes: PairedEpisodes) -> None:
+    """Write `grounding`, fitted on `episodes`, to `path`."""
+    told: dict[str, Any] = {"dataset": episodes.reference, "hash": episodes.content_hash}
+    if isinstance(grounding, Variation):
+        told |= {"kind": "variation", "variation": grounding.model_dump()}
+        save_tensors(path, {"ranges": grounding.ranges()}, told)
+    else:
+        told |= {"kind": "history", "shape": asdict(grounding.shape), "target": grounding.target}
+        save_tensors(path, grounding.state_dict(), told)
 
 
-def load_grounding(path: Path, device: str = "cpu") -> GroundingModel:
-    """Read a grounding model; its parameters are frozen."""
+def load_grounding(path: Path, device: str = "cpu") -> Grounding:
+    """Read a grounding; the parameters of its networks are frozen."""
     tensors, told = load_tensors(path)
+    if told["kind"] == "variation":
+        return Variation.of_json(told["variation"])
     shape: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in told["shape"].items()
     }
     model = GroundingModel(GroundingShape(**shape), told["target"])
     model.load_state_dict(tensors)
     return model.to(device).requires_grad_(False).eval()
+
+
+def load_history_model(path: Path, device: str | torch.device = "cpu") -> GroundingModel:
+    """Read a grounding that must be a history model.
+
+    Raises:
+        BadInputError: it is something else.
+    """
+    grounding = load_grounding(path, str(device))
+    if not isinstance(grounding, GroundingModel):
+        raise BadInputError(f"{path}: expected a history model, got identified parameters")
+    return grounding

@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 
-from astra_data.models.grounding import LossWeights
-from astra_data.world import RewardSource
+from astra_data.fitting import Fit, HistoryFit
+from astra_data.training import Learn, SimulatorPpo
+
+IN_RAW_SIMULATOR = SimulatorPpo()
 
 
 @dataclass(frozen=True)
@@ -12,20 +14,37 @@ class Method:
 
     Attributes:
         name: in recipes and folders. title: in tables and figures.
-        loss_weights: of the grounding; None where the simulator stays raw.
-        reward: where the policy's reward comes from, as the method is published.
+        fit: what it learns about the simulator from pairs; None where the simulator stays raw.
+        learn: how it learns its policy; None where there is none to learn.
         aligns: whether a target encoder is fitted for deployment.
-        trains: whether there is a policy to train.
+        initial: the method whose policy its own goes on from, if any.
+        grounded_as: the method whose grounding and alignment it uses; its own where empty.
     """
 
     name: str
     title: str
-    loss_weights: LossWeights | None = None
-    reward: RewardSource = "abstract"
+    fit: Fit | None = None
+    learn: Learn | None = IN_RAW_SIMULATOR
     aligns: bool = False
-    trains: bool = True
+    initial: str | None = None
+    grounded_as: str = ""
 
     @property
     def grounds(self) -> bool:
-        """Whether the simulator is grounded."""
-        return self.loss_weights is not None
+        """Whether something is fitted to pairs."""
+        return self.fit is not None
+
+    @property
+    def trains(self) -> bool:
+        """Whether there is a policy to train."""
+        return self.learn is not None
+
+    @property
+    def in_simulator(self) -> bool:
+        """Whether its policy is trained in the abstract simulator, so that the cures of `[plus]` apply."""
+        return isinstance(self.learn, SimulatorPpo)
+
+    @property
+    def predicts_reward(self) -> bool:
+        """Whether its grounding learns to predict the target's reward."""
+        return isinstance(self.fit, HistoryFit) and self.fit.weights.reward > 0

@@ -8,7 +8,7 @@ A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` set
 grounding and the alignment of `<method>`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from astra_data.errors import BadInputError
+from astra_data.fitting import GroundConfig
 from astra_data.methods import METHODS
 from astra_data.recipe import Config, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus
@@ -24,11 +25,13 @@ from astra_data.schedule import Item
 from astra_data.stages.align import AlignConfig, align
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
-from astra_data.stages.ground import GroundConfig, ground
+from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.report import ReportConfig, report
-from astra_data.stages.train import TrainConfig, train
+from astra_data.stages.train import train
 from astra_data.tasks import TASKS
+from astra_data.training import TrainConfig
+from astra_data.variation import Variation
 
 STAGES: dict[str, tuple[str, ...]] = {
     "collect": (),
@@ -40,6 +43,9 @@ STAGES: dict[str, tuple[str, ...]] = {
     "report": ("evaluate",),
 }
 """Each stage, in order, and the stages whose artefacts it reads."""
+
+METHOD_TABLES = {"domain_randomization": "train"}
+"""Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
 
 
 class Recipe(Config):
@@ -60,6 +66,8 @@ class Recipe(Config):
     report: ReportConfig
     plus: TrainConfig
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
+    domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
+    """What domain randomization varies; by default as the paper prints it for navigation."""
 
     @model_validator(mode="before")
     @classmethod
@@ -87,8 +95,11 @@ class Recipe(Config):
         for row in rows:
             if base_method(row) not in METHODS:
                 raise ValueError(f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}")
-            if is_plus(row) and not METHODS[base_method(row)].trains:
-                raise ValueError(f"'{row}' has nothing to train with the [plus] settings: leave out {PLUS}")
+            if is_plus(row) and not METHODS[base_method(row)].in_simulator:
+                raise ValueError(
+                    f"'{row}' trains nothing in a simulator, so the [plus] settings are without effect: "
+                    f"leave out {PLUS}"
+                )
         return rows
 
     @model_validator(mode="after")
@@ -107,6 +118,7 @@ class Reported:
     task: str
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
+    groundings: Mapping[str, str]
 
 
 def plan(
@@ -137,14 +149,18 @@ def plan(
         raise BadInputError(f"the recipe has no seed {unknown}; its seeds: {known}")
     asked = tuple(dict.fromkeys(seeds)) or recipe.seeds
     bases = tuple(dict.fromkeys(base_method(row) for row in recipe.methods))
+    groundings = tuple(dict.fromkeys(_grounded_as(base) for base in bases if METHODS[base].grounds))
+    trained = [row for row in recipe.methods if METHODS[base_method(row)].trains]
+    initial = [METHODS[base].initial for base in bases]
+    trained += [base for base in dict.fromkeys(initial) if base and base not in trained]
     items: list[Item] = []
     for seed in asked:
         items.append(_collect(recipe, folder, seed))
         items.append(_pair(recipe, folder, seed))
-        items += (_ground(recipe, folder, base, seed, device) for base in bases if METHODS[base].grounds)
-        trained = [row for row in recipe.methods if METHODS[base_method(row)].trains]
+        items += (_ground(recipe, folder, base, seed, device) for base in groundings)
         items += (_train(recipe, folder, row, seed, device) for row in trained)
-        items += (_align(recipe, folder, base, seed, device) for base in bases if METHODS[base].aligns)
+        aligned = [base for base in groundings if METHODS[base].aligns]
+        items += (_align(recipe, folder, base, seed, device) for base in aligned)
         items += (_evaluate(recipe, folder, row, seed) for row in recipe.methods)
     items.append(_report(recipe, path, folder, asked, publish))
     # Stage by stage, so that work on every seed begins before any seed is finished.
@@ -182,6 +198,7 @@ def _ground(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> 
         recipe.task,
         base,
         recipe.ground,
+        settings=_settings(recipe, base, "ground"),
         dataset=folder / dataset,
         seed=seed,
         out=folder / key,
@@ -192,19 +209,22 @@ def _ground(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> 
 
 def _train(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> Item:
     key, dataset = f"train/{row}/seed_{seed}", f"pair/seed_{seed}"
-    grounding = _grounding(row, seed)
+    grounding, base = _grounding(row, seed), base_method(row)
+    initial = METHODS[base].initial and f"train/{METHODS[base].initial}/seed_{seed}"
     call = partial(
         train,
         recipe.task,
         row,
         recipe.plus if is_plus(row) else recipe.train,
+        settings=_settings(recipe, base, "train"),
         dataset=folder / dataset,
         grounding=folder / grounding if grounding else None,
+        initial=folder / initial if initial else None,
         seed=seed,
         out=folder / key,
         device=device,
     )
-    return Item(key, _existing(dataset, grounding), call)
+    return Item(key, _existing(dataset, grounding, initial), call)
 
 
 def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> Item:
@@ -225,7 +245,7 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
     key, base = f"evaluate/{row}/seed_{seed}", base_method(row)
     policy = f"train/{row}/seed_{seed}" if METHODS[base].trains else None
     grounding = _grounding(row, seed)
-    target_encoder = f"align/{base}/seed_{seed}" if METHODS[base].aligns else None
+    target_encoder = f"align/{_grounded_as(base)}/seed_{seed}" if METHODS[base].aligns else None
     call = partial(
         evaluate,
         recipe.task,
@@ -243,9 +263,10 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
 def _report(recipe: Recipe, path: Path, folder: Path, seeds: tuple[int, ...], publish: bool) -> Item:
     inputs = tuple(f"evaluate/{row}/seed_{seed}" for row in recipe.methods for seed in seeds)
     options = "" if seeds == recipe.seeds else "".join(f" --seed {seed}" for seed in seeds)
+    groundings = {row: _grounded_as(base_method(row)) for row in recipe.methods}
     call = partial(
         report,
-        Reported(path.stem, recipe.task, recipe.methods, seeds),
+        Reported(path.stem, recipe.task, recipe.methods, seeds, groundings),
         root=folder,
         command=f"astra-data run {path}{options}",
         publish=path.parent / "results" if publish else None,
@@ -256,7 +277,17 @@ def _report(recipe: Recipe, path: Path, folder: Path, seeds: tuple[int, ...], pu
 
 def _grounding(row: str, seed: int) -> str | None:
     base = base_method(row)
-    return f"ground/{base}/seed_{seed}" if METHODS[base].grounds else None
+    return f"ground/{_grounded_as(base)}/seed_{seed}" if METHODS[base].grounds else None
+
+
+def _grounded_as(base: str) -> str:
+    return METHODS[base].grounded_as or base
+
+
+def _settings(recipe: Recipe, base: str, stage: str) -> Config | None:
+    """Return the recipe's table for a method, where it has one for `stage`."""
+    settings: Config | None = getattr(recipe, base) if METHOD_TABLES.get(base) == stage else None
+    return settings
 
 
 def _existing(*keys: str | None) -> tuple[str, ...]:

@@ -1,13 +1,36 @@
-"""Policies on disk: one safetensors file with the networks and the world that they were trained in."""
+"""Policies on disk: one safetensors file with the networks and how to put them to work."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.deployment import DeployedPolicy, Observed
+from astra_data.grounding_file import Grounding
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.grounding import GroundingModel
+from astra_data.tasks import Task
 from astra_data.training_world import WorldConfig
+from astra_data.variation import Variation
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The abstract simulator that a policy was trained in.
+
+    Attributes:
+        thinness: of the data, (height, width).
+        scatter: factor of the noise added in training, (X, X); zeros where there was none.
+        world: the switches of the training world.
+        variation: of the simulator's parameters from episode to episode.
+    """
+
+    thinness: Tensor
+    scatter: Tensor
+    world: WorldConfig
+    variation: Variation | None = None
 
 
 @dataclass(frozen=True)
@@ -16,29 +39,33 @@ class PolicyFile:
 
     Attributes:
         policy: the networks.
-        thinness: of the data that it was trained on, (height, width).
-        scatter: factor of the noise added in training, (X, X); zeros where there was none.
-        world: the switches of the training world.
+        simulation: where it was trained; None for a policy trained in the target or on data alone.
         dataset, content_hash: the dataset that everything was learned from.
+        observed: what it is shown of the target.
     """
 
     policy: ActorCritic
-    thinness: Tensor
-    scatter: Tensor
-    world: WorldConfig
+    simulation: Simulation | None
     dataset: str
     content_hash: str
+    observed: Observed = "abstract"
 
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
         tensors = {f"policy.{name}": tensor for name, tensor in self.policy.state_dict().items()}
-        tensors |= {"thinness": self.thinness, "scatter": self.scatter}
-        told = {
+        told: dict[str, Any] = {
             "shape": asdict(self.policy.shape),
-            "world": self.world.model_dump(mode="json"),
             "dataset": self.dataset,
             "hash": self.content_hash,
+            "observed": self.observed,
         }
+        if self.simulation:
+            tensors |= {"thinness": self.simulation.thinness, "scatter": self.simulation.scatter}
+            variation = self.simulation.variation
+            told["simulation"] = {
+                "world": self.simulation.world.model_dump(mode="json"),
+                "variation": variation.model_dump() if variation else None,
+            }
         save_tensors(path, tensors, told)
 
     @classmethod
@@ -51,11 +78,31 @@ class PolicyFile:
         policy.load_state_dict(
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         )
+        simulation = None
+        if said := told.get("simulation"):
+            varied = said["variation"]
+            simulation = Simulation(
+                tensors["thinness"].to(device),
+                tensors["scatter"].to(device),
+                WorldConfig(**said["world"]),
+                Variation.of_json(varied) if varied else None,
+            )
         return cls(
             policy.to(device).requires_grad_(False),
-            tensors["thinness"].to(device),
-            tensors["scatter"].to(device),
-            WorldConfig(**told["world"]),
+            simulation,
             told["dataset"],
             told["hash"],
+            told["observed"],
         )
+
+
+def deploy(task: Task, trained: PolicyFile, grounding: Grounding | None) -> DeployedPolicy:
+    """Return the policy, ready to be started in the target; its latents, if any, come from ψ^s."""
+    world = trained.simulation.world if trained.simulation else WorldConfig()
+    return DeployedPolicy(
+        task,
+        trained.policy,
+        grounding if isinstance(grounding, GroundingModel) else None,
+        command_limit_m_s=world.command_limit_m_s,
+        observed=trained.observed,
+    )

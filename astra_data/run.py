@@ -15,7 +15,7 @@ from astra_data.cores import cores
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.lock import held
-from astra_data.plan import STAGES, Recipe, plan, select, stage_of
+from astra_data.plan import METHOD_TABLES, STAGES, Recipe, plan, select, stage_of
 from astra_data.recipe import did_you_mean, load_recipe
 from astra_data.rows import base_method
 from astra_data.schedule import Item, execute
@@ -176,6 +176,7 @@ def _check_unchanged(recipe: Recipe, folder: Path) -> None:
     stale: set[str] = set()
     for stage, reads in STAGES.items():
         sections = {"task", stage} | ({"plus"} if stage == "train" else set())
+        sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
         if changed & sections or stale.intersection(reads):
             stale.add(stage)
     present = [str(folder / stage) for stage in STAGES if stage in stale - ALWAYS_NEW]

@@ -1,4 +1,4 @@
-"""What the toolkit needs of an abstract simulator; bring your own by writing these four."""
+"""What the toolkit needs of an abstract simulator."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -6,13 +6,8 @@ from typing import Protocol
 from torch import Tensor
 
 
-class AbstractSimulator(Protocol):
+class SteppedSimulator(Protocol):
     """B abstract states that can be set and stepped."""
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """What a dataset paired with this simulator records about it."""
-        ...
 
     @property
     def state(self) -> Tensor:
@@ -25,4 +20,13 @@ class AbstractSimulator(Protocol):
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the new states (B, X)."""
+        ...
+
+
+class AbstractSimulator(SteppedSimulator, Protocol):
+    """A simulator that datasets can be paired with; bring your own by writing these four."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """What a dataset paired with this simulator records about it."""
         ...

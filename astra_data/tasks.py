@@ -13,6 +13,8 @@ from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.navigation import Navigation, RewardKind
 from astra_data.recipe import did_you_mean
 from astra_data.sims.point_mass import PointMass
+from astra_data.sims.varied_point_mass import VariedPointMass
+from astra_data.variation import Variation
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,10 @@ class Task:
     def simulator(self, num_envs: int, device: str = "cpu") -> PointMass:
         """Build `num_envs` abstract simulators."""
         return PointMass(self.maze, num_envs, timestep_s=self.timestep_s, device=device)
+
+    def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedPointMass:
+        """Build `num_envs` abstract simulators whose parameters vary."""
+        return VariedPointMass(self.maze, num_envs, variation, timestep_s=self.timestep_s, device=device)
 
 
 def _roles(

@@ -6,17 +6,16 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
-from torch.nn import functional
 
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.grounding_file import Grounding
 from astra_data.mazes import FIELD_CELL_M
-from astra_data.method import Method
 from astra_data.models.grounding import GroundingModel
 from astra_data.recipe import Config, NotNegative, Positive, Share
-from astra_data.sims.grounded import GroundedSimulator
-from astra_data.sims.randomized import RandomizedSimulator
+from astra_data.simulators import hidden_before, simulator_of
 from astra_data.tasks import Task
-from astra_data.world import DataStarts, NavigationWorld, RewardSource, Simulator
+from astra_data.variation import Variation
+from astra_data.world import DataStarts, NavigationWorld, RewardSource
 
 _KERNEL_M = 0.25
 """Standard deviation of the kernel that smooths the density of the data."""
@@ -57,23 +56,29 @@ class WorldParts:
         thinness: 1 where there is no data, 0 where there is enough, on the maze's fine grid (height, width).
         scatter: factor of the state noise, (X, X).
         starts: recorded moments, if episodes may start there.
+        variation: of the simulator's parameters from episode to episode.
     """
 
     thinness: Tensor
     scatter: Tensor
     starts: DataStarts | None = None
+    variation: Variation | None = None
 
 
 @torch.no_grad()
 def world_parts(
-    task: Task, config: WorldConfig, episodes: PairedEpisodes, model: GroundingModel | None
+    task: Task,
+    config: WorldConfig,
+    episodes: PairedEpisodes,
+    grounding: Grounding | None,
+    variation: Variation | None = None,
 ) -> WorldParts:
     """Derive thinness, scatter and starts from paired episodes, as far as `config` asks for them."""
     windows = episodes.windows
     device = str(windows.state.device)
     thinness = _thinness(task, episodes.steps(windows.state)[:, :2], config.support_density)
-    if model is not None:
-        scatter = model.residual_factor
+    if isinstance(grounding, GroundingModel):
+        scatter = grounding.residual_factor
     else:
         residual = episodes.steps(windows.next_state - windows.simulated_next)
         scatter = torch.linalg.cholesky(
@@ -81,18 +86,14 @@ def world_parts(
         )
     starts = None
     if config.data_start_share > 0:
-        hidden = None
-        if model is not None:
-            inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
-            _, after = model.encoder(inputs)
-            hidden = episodes.steps(functional.pad(after[:, :-1], (0, 0, 1, 0)))
+        hidden = hidden_before(grounding, windows)
         starts = DataStarts(
             state=episodes.steps(windows.state),
             goal=episodes.steps(windows.goal),
             previous_action=episodes.steps(windows.previous_action),
-            hidden=hidden,
+            hidden=None if hidden is None else episodes.steps(hidden),
         )
-    return WorldParts(thinness, config.residual_noise * scatter, starts)
+    return WorldParts(thinness, config.residual_noise * scatter, starts, variation)
 
 
 def _thinness(task: Task, positions: Tensor, density: float) -> Tensor:
@@ -108,26 +109,20 @@ def _thinness(task: Task, positions: Tensor, density: float) -> Tensor:
 
 def training_world(
     task: Task,
-    method: Method,
     config: WorldConfig,
     parts: WorldParts,
-    model: GroundingModel | None,
+    grounding: Grounding | None,
     *,
     num_envs: int,
     device: str,
 ) -> NavigationWorld:
-    """Build the world: the task in the raw, scattered or grounded simulator."""
-    inner = task.simulator(num_envs, device)
-    simulator: Simulator = inner
-    if model is not None:
-        scatter = parts.scatter if config.residual_noise else None
-        simulator = GroundedSimulator(inner, model, inner.free, scatter=scatter)
-    elif config.residual_noise:
-        simulator = RandomizedSimulator(inner, inner.free, parts.scatter)
+    """Build the world: the task in the raw, varied, scattered or grounded simulator."""
+    scatter = parts.scatter if config.residual_noise else None
+    simulator = simulator_of(task, grounding, num_envs, device, variation=parts.variation, scatter=scatter)
     return NavigationWorld(
         task.navigation,
         simulator,
-        reward=config.reward or method.reward,
+        reward=config.reward or "abstract",
         topple=config.topple,
         risk_weight=config.risk_weight,
         command_limit_m_s=config.command_limit_m_s,

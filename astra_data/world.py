@@ -13,11 +13,9 @@ from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
 from astra_data.navigation import Navigation
 from astra_data.sims.grounded import GroundedSimulator
-from astra_data.sims.point_mass import PointMass
-from astra_data.sims.randomized import RandomizedSimulator
+from astra_data.simulators import Simulator, start_simulator, varied_within
 
 RewardSource = Literal["abstract", "predicted", "blend"]
-Simulator = PointMass | RandomizedSimulator | GroundedSimulator
 
 
 @dataclass(frozen=True)
@@ -57,11 +55,13 @@ def limit_command(action: Tensor, limit: float) -> Tensor:
 class NavigationWorld:
     """A batched environment over an abstract simulator.
 
-    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2); "blend", the
-    task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the topple head
-    and ends the episode. All randomness comes from torch's global generator.
+    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for the
+    step that reaches the goal: this simulator decides that by itself, so the task's own reward is paid;
+    "blend", the task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the
+    topple head and ends the episode. All randomness comes from torch's global generator.
 
     Attributes:
+        latent_size: Z, of the latents in the observations; 0 where there are none.
         caution: factor on the penalties for thin data and for risk; 1 unless the training ramps it up.
     """
 
@@ -110,6 +110,7 @@ class NavigationWorld:
         self.goal = torch.zeros(self.num_envs, 2, device=self.device)
         self.toppled = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.observation_size = self._observe().shape[1]
+        self.latent_size = 0 if self.grounded is None else self.grounded.latent.shape[1]
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Start the rows in `mask` (B,) anew, by default all; return observations (B, O)."""
@@ -142,10 +143,7 @@ class NavigationWorld:
         previous_action: Tensor | None = None,
     ) -> None:
         self.goal[rows] = goal
-        if isinstance(self.simulator, GroundedSimulator):
-            self.simulator.reset_to(state, rows, goal, hidden=hidden, previous_action=previous_action)
-        else:
-            self.simulator.reset_to(state, rows)
+        start_simulator(self.simulator, state, rows, goal, hidden=hidden, previous_action=previous_action)
 
     def _tensor(self, values: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(values).float().to(self.device)
@@ -168,11 +166,11 @@ class NavigationWorld:
                 self.toppled = (torch.rand_like(risk) < risk) & ~success
             else:
                 penalty = penalty + self.risk_weight * self.navigation.topple_reward * risk
+        reward = self.navigation.reward(before[:, :2], after[:, :2], self.goal, self.toppled)
         if self.reward == "predicted" and self.grounded is not None and latent is not None:
             with torch.no_grad():
-                reward = self.grounded.model.predict_reward(latent, action)
-        else:
-            reward = self.navigation.reward(before[:, :2], after[:, :2], self.goal, self.toppled)
+                predicted = self.grounded.model.predict_reward(latent, action)
+            reward = torch.where(success, reward, predicted)
         return Step(
             observation=self._observe(),
             reward=reward + self.caution * penalty,
@@ -189,6 +187,9 @@ class NavigationWorld:
         state = {"state": self.simulator.state, "goal": self.goal}
         if self.grounded is not None:
             state["hidden"] = self.grounded.hidden
+        varied = varied_within(self.simulator)
+        if varied is not None:
+            state |= {"true": varied.true_state, "parameters": varied.parameters}
         return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
@@ -201,4 +202,7 @@ class NavigationWorld:
         if self.grounded is not None:
             self.grounded.goal = state["goal"].clone()
             self.grounded.hidden = state["hidden"].clone()
+        varied = varied_within(self.simulator)
+        if varied is not None:
+            varied.true_state, varied.parameters = state["true"].clone(), state["parameters"].clone()
         return self._observe()

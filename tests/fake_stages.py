@@ -6,6 +6,7 @@ Spawned processes find them by name; nothing slow is imported.
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ class Reported:
     task: str
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
+    groundings: Mapping[str, str]
 
 
 class FakeConfig(Config):
@@ -29,8 +31,12 @@ class FakeConfig(Config):
 
 
 class FakeMethod:
-    def __init__(self, grounds: bool, aligns: bool, trains: bool) -> None:
+    def __init__(
+        self, grounds: bool, aligns: bool, trains: bool, grounded_as: str = "", initial: str | None = None
+    ) -> None:
         self.grounds, self.aligns, self.trains = grounds, aligns, trains
+        self.in_simulator = trains and initial is None
+        self.grounded_as, self.initial = grounded_as, initial
 
 
 METHODS = {
@@ -38,6 +44,8 @@ METHODS = {
     "direct_transfer": FakeMethod(grounds=False, aligns=False, trains=True),
     "nas": FakeMethod(grounds=True, aligns=False, trains=True),
     "astra": FakeMethod(grounds=True, aligns=True, trains=True),
+    "astra_again": FakeMethod(grounds=True, aligns=True, trains=True, grounded_as="astra"),
+    "fine_tuned": FakeMethod(grounds=False, aligns=False, trains=True, initial="direct_transfer"),
 }
 
 
@@ -68,13 +76,15 @@ def ground(
     method: str,
     config: FakeConfig,
     *,
+    settings: Config | None,
     dataset: Path,
     seed: int,
     out: Path,
     device: str,
     progress: Progress,
 ) -> None:
-    _write(config, out, progress, task=task, method=method, dataset=dataset, seed=seed, device=device)
+    asked = {"settings": settings, "dataset": dataset, "seed": seed, "device": device}
+    _write(config, out, progress, task=task, method=method, **asked)
 
 
 def train(
@@ -82,14 +92,17 @@ def train(
     method: str,
     config: FakeConfig,
     *,
+    settings: Config | None,
     dataset: Path,
     grounding: Path | None,
+    initial: Path | None,
     seed: int,
     out: Path,
     device: str,
     progress: Progress,
 ) -> None:
-    _write(config, out, progress, task=task, method=method, dataset=dataset, grounding=grounding, seed=seed)
+    asked = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
+    _write(config, out, progress, task=task, method=method, **asked)
 
 
 def align(

@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
+from astra_data.fitting import GroundConfig
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.collect import CollectConfig
-from astra_data.stages.ground import GroundConfig
-from astra_data.stages.train import TrainConfig
 from astra_data.tasks import TASKS
+from astra_data.training import TrainConfig
 
 TASK = "antmaze-short"
 _LONG = TASKS["antmaze-umaze"]

@@ -4,7 +4,7 @@ import torch
 
 from astra_data.checkpoint import load_tensors
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.grounding_file import load_grounding, save_grounding
+from astra_data.grounding_file import load_history_model, save_grounding
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 
 
@@ -16,7 +16,7 @@ def test_a_grounding_comes_back_frozen(tmp_path: Path) -> None:
     episodes = PairedEpisodes(empty, Windows(*[empty] * 9), "toy@data-1.0.0", "abc")
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, model, episodes)
-    loaded = load_grounding(path)
+    loaded = load_history_model(path)
     assert (loaded.shape, loaded.target) == (shape, "detach")
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
     latent, action, state = torch.randn(3, 8), torch.randn(3, 2), torch.randn(3, 4)

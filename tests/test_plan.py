@@ -31,6 +31,23 @@ def test_rows_read_what_their_method_needs(tmp_path: Path, fake_recipe: type[Rec
     assert len(items["report"].inputs) == 8
 
 
+def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = 'task = "maze"\nmethods = ["astra_again", "fine_tuned"]\nseeds = [0]\n'
+    items = {
+        item.key: item for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
+    }
+    assert {"ground/astra/seed_0", "align/astra/seed_0", "train/direct_transfer/seed_0"} <= items.keys()
+    assert "ground/astra_again/seed_0" not in items and "evaluate/direct_transfer/seed_0" not in items
+    assert items["train/fine_tuned/seed_0"].inputs == ("pair/seed_0", "train/direct_transfer/seed_0")
+    assert items["evaluate/astra_again/seed_0"].inputs == (
+        "train/astra_again/seed_0",
+        "ground/astra/seed_0",
+        "align/astra/seed_0",
+    )
+
+
 def test_every_artefact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
     seen: set[str] = set()
     for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path):
@@ -52,6 +69,11 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
         (HEAD + "[train]\nsteps = 'x'\n[plus]\nrate = 1.0", "train.steps: expected a whole number, got 'x'"),
         (HEAD.replace("astra_", "astro_"), "methods: unknown method 'astro_plus': did you mean 'astra'?"),
         (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: maze"),
+        (
+            HEAD.replace("astra_plus", "fine_tuned_plus"),
+            "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without effect: "
+            "leave out _plus",
+        ),
         (HEAD.replace("7", "0"), "recipe: expected each of seeds once, got [0, 0]"),
         (HEAD.replace("[0, 7]", "[]"), "seeds: tuple should have at least 1 item after validation, not 0"),
     ],

@@ -3,20 +3,25 @@ from pathlib import Path
 import torch
 
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policy_file import PolicyFile
+from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.training_world import WorldConfig
+from astra_data.variation import Variation
 
 
 def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
     thinness, scatter = torch.rand(6, 5), torch.randn(4, 4)
     world = WorldConfig(reward="blend", topple=True, residual_noise=0.5)
-    saved = PolicyFile(policy, thinness, scatter, world, "toy@data-1.0.0", "abc")
+    variation = Variation(friction=(0.8, 1.2))
+    simulation = Simulation(thinness, scatter, world, variation)
+    saved = PolicyFile(policy, simulation, "toy@data-1.0.0", "abc")
     saved.save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
-    assert (loaded.world, loaded.dataset, loaded.content_hash) == (world, "toy@data-1.0.0", "abc")
-    assert torch.equal(loaded.thinness, thinness)
-    assert torch.equal(loaded.scatter, scatter)
+    assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
+    assert loaded.simulation is not None
+    assert (loaded.simulation.world, loaded.simulation.variation) == (world, variation)
+    assert torch.equal(loaded.simulation.thinness, thinness)
+    assert torch.equal(loaded.simulation.scatter, scatter)
     assert loaded.policy.shape == policy.shape
     assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 8)

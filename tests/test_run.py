@@ -34,6 +34,7 @@ def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.Captur
         "method": "astra_plus",
         "dataset": str(folder / "pair/seed_0"),
         "grounding": str(folder / "ground/astra/seed_0"),
+        "initial": None,
         "seed": 0,
         "steps": 5,
     }

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.methods import METHODS
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
@@ -47,13 +46,13 @@ def model() -> GroundingModel:
 
 def test_without_switches_it_is_the_plain_simulator(episodes: PairedEpisodes, model: GroundingModel) -> None:
     config = WorldConfig()
-    for name, kind, grounding in (("direct_transfer", PointMass, None), ("astra", GroundedSimulator, model)):
+    for kind, grounding in ((PointMass, None), (GroundedSimulator, model)):
         parts = world_parts(TASK, config, episodes, grounding)
         assert not parts.scatter.any()
         assert parts.starts is None
-        world = training_world(TASK, METHODS[name], config, parts, grounding, num_envs=4, device="cpu")
+        world = training_world(TASK, config, parts, grounding, num_envs=4, device="cpu")
         assert type(world.simulator) is kind
-        assert world.reward == METHODS[name].reward
+        assert world.reward == "abstract"
         assert world.num_envs == 4
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
@@ -65,7 +64,7 @@ def test_scatter_is_what_the_simulator_does_not_explain(
 ) -> None:
     config = WorldConfig(residual_noise=2.0)
     parts = world_parts(TASK, config, episodes, None)
-    world = training_world(TASK, METHODS["nas"], config, parts, None, num_envs=1, device="cpu")
+    world = training_world(TASK, config, parts, None, num_envs=1, device="cpu")
     assert type(world.simulator) is RandomizedSimulator
     deviations = (parts.scatter @ parts.scatter.T).diagonal().sqrt()
     torch.testing.assert_close(deviations, 2 * torch.tensor([0.01, 0.02, 0.1, 0.2]), rtol=0.1, atol=0)
@@ -85,7 +84,7 @@ def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
 def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> None:
     config = WorldConfig(support_penalty=0.3)
     parts = world_parts(TASK, config, episodes, None)
-    world = training_world(TASK, METHODS["nas"], config, parts, None, num_envs=1, device="cpu")
+    world = training_world(TASK, config, parts, None, num_envs=1, device="cpu")
     assert world.thinness is not None
     torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
 
@@ -117,7 +116,7 @@ def test_a_recorded_start_is_one_of_the_recorded_moments(
     )
     config = WorldConfig(data_start_share=1.0)
     parts = world_parts(TASK, config, few, model)
-    world = training_world(TASK, METHODS["astra"], config, parts, model, num_envs=64, device="cpu")
+    world = training_world(TASK, config, parts, model, num_envs=64, device="cpu")
     world.reset()
     moments = few.steps(few.windows.state)
     assert len(moments) == 6

@@ -78,7 +78,11 @@ class PairedEpisodes:
                 goal=padded(columns[GOAL]),
                 simulated_next=padded(columns[ABSTRACT_SIMULATED_NEXT_STATE]),
                 next_state=padded(columns[ABSTRACT_NEXT_STATE]),
-                reward=padded(np.stack([columns[REWARD] * ~ended, columns[REWARD] * ended], axis=-1)),
+                reward=padded(
+                    np.stack(
+                        [columns[REWARD] * ~ended, columns[REWARD] * (ended & ~columns[SUCCESS])], axis=-1
+                    )
+                ),
                 topples_soon=padded(_soon(ended & ~columns[SUCCESS], dataset.lengths)),
                 mask=padded(np.ones(len(columns[ACTION]))),
             ),

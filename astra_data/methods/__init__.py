@@ -2,13 +2,26 @@
 
 from astra_data.errors import BadInputError
 from astra_data.method import Method
-from astra_data.methods.astra import ASTRA
+from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
+from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
 from astra_data.rows import PLUS, base_method
 
-METHODS: dict[str, Method] = {method.name: method for method in (DIRECT_TRANSFER, NAS, ASTRA, FOLLOWER)}
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        DIRECT_TRANSFER,
+        DOMAIN_RANDOMIZATION,
+        NAS,
+        ASTRA,
+        ASTRA_WITHOUT_LATENT,
+        ASTRA_WITHOUT_REWARD,
+        ASTRA_TASK_REWARD,
+        FOLLOWER,
+    )
+}
 
 
 def method_named(row: str) -> Method:

@@ -9,7 +9,7 @@ from torch import Tensor
 from astra_data.mazes import FIELD_CELL_M, Maze
 from astra_data.method import Method
 
-FOLLOWER = Method(name="follower", title="Careful follower", trains=False)
+FOLLOWER = Method(name="follower", title="Careful follower", learn=None)
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ def assemble(
     root: Path,
     command: str,
     replicates: int,
+    groundings: Mapping[str, str] | None = None,
 ) -> Results:
     """Read every artefact under `root` and summarise it.
 
@@ -59,7 +60,7 @@ def assemble(
         MissingStageError: a row has no evaluation, or other artefacts for some of its seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
-    read = Runs(recipe, root, tuple(methods), tuple(seeds))
+    read = Runs(recipe, root, tuple(methods), tuple(seeds), groundings or {})
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, methods)
     episodes = _check_alike(evaluations, task)

@@ -1,7 +1,7 @@
 """Find the artefacts of all rows and seeds of a recipe."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from astra_data.errors import BadInputError, MissingStageError
@@ -21,12 +21,14 @@ class Runs:
         root: its folder of runs.
         methods: the rows.
         seeds: the seeds of every row.
+        groundings: row → the folder of its grounding and alignment, where that is not its base's.
     """
 
     recipe: str
     root: Path
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
+    groundings: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that there is something to report."""
@@ -36,9 +38,9 @@ class Runs:
             )
 
     def owner(self, stage: str, method: str) -> str:
-        """Return the name of a row's folder: a "_plus" row shares the grounding and alignment of its base."""
+        """Return the name of a row's folder: rows may share a grounding and its alignment."""
         if stage in SHARED and not (self.root / stage / method).is_dir():
-            return base_method(method)
+            return self.groundings.get(method, base_method(method))
         return method
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:

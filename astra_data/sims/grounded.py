@@ -5,7 +5,7 @@ from torch import Tensor
 
 from astra_data.free_space import FreeSpace
 from astra_data.models.grounding import GroundingModel
-from astra_data.simulator import AbstractSimulator
+from astra_data.simulator import SteppedSimulator
 
 
 class GroundedSimulator:
@@ -20,7 +20,7 @@ class GroundedSimulator:
 
     def __init__(
         self,
-        simulator: AbstractSimulator,
+        simulator: SteppedSimulator,
         model: GroundingModel,
         free: FreeSpace,
         *,

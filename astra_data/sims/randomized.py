@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from astra_data.free_space import FreeSpace
-from astra_data.simulator import AbstractSimulator
+from astra_data.simulator import SteppedSimulator
 
 
 class RandomizedSimulator:
@@ -14,7 +14,7 @@ class RandomizedSimulator:
         state: (B, X). blocked: (B,) bool, the last step was stopped at the edge of the free space.
     """
 
-    def __init__(self, simulator: AbstractSimulator, free: FreeSpace, noise_factor: Tensor) -> None:
+    def __init__(self, simulator: SteppedSimulator, free: FreeSpace, noise_factor: Tensor) -> None:
         """Wrap `simulator`; the noise is `noise_factor` (X, X) times standard normal numbers."""
         self.simulator = simulator
         self.free = free

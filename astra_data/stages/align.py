@@ -11,7 +11,7 @@ from torch import Tensor
 
 from astra_data.checkpoint import finished_folder
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.grounding_file import load_grounding
+from astra_data.grounding_file import load_history_model
 from astra_data.models.alignment import TargetEncoder, gaussian_mmd
 from astra_data.models.grounding import GroundingModel, Windows
 from astra_data.progress import Progress
@@ -59,7 +59,7 @@ def align(
         BadInputError: an input is not there or not what was expected.
     """
     made = origin(device)
-    model = load_grounding(grounding / "grounding.safetensors", device)
+    model = load_history_model(grounding / "grounding.safetensors", device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "alignment"))

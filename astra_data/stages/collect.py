@@ -1,6 +1,7 @@
 """Collect: a behaviour in the target environment, stored as a LeRobot dataset."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -26,12 +27,11 @@ from astra_data.columns import (
 )
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
-from astra_data.deployment import DeployedPolicy
 from astra_data.digest import file_digest
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding
-from astra_data.policy_file import PolicyFile
+from astra_data.policy_file import PolicyFile, deploy
 from astra_data.progress import Progress, part
 from astra_data.recipe import Config, Count, NotNegative
 from astra_data.results.provenance import machine
@@ -174,7 +174,7 @@ def _behavior(
     trained = PolicyFile.load(files["policy"])
     model = load_grounding(files["grounding"]) if "grounding" in files else None
     encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
-    deployed = DeployedPolicy(task, trained.policy, model, encoder, trained.world.command_limit_m_s)
+    deployed = replace(deploy(task, trained, model), target_encoder=encoder)
     if deployed.observation_size != trained.policy.shape.observation_size:
         raise BadInputError(
             f"{files['policy']} sees {trained.policy.shape.observation_size} values, the task shows "

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,10 @@ from torch import Tensor
 from astra_data.checkpoint import finished_folder, save_tensors
 from astra_data.deployment import DeployedPolicy, EncoderKind
 from astra_data.errors import BadInputError
-from astra_data.grounding_file import load_grounding
+from astra_data.grounding_file import Grounding, load_grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import CarefulFollower
-from astra_data.policy_file import PolicyFile
+from astra_data.policy_file import PolicyFile, Simulation, deploy
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive
 from astra_data.results.provenance import origin
@@ -107,22 +107,18 @@ def evaluate(
     else:
         trained = PolicyFile.load(policy / "policy.safetensors")
         model = load_grounding(grounding / "grounding.safetensors") if grounding else None
-        limit = trained.world.command_limit_m_s
-        encoders: dict[EncoderKind, DeployedPolicy] = {
-            "source": DeployedPolicy(world, trained.policy, model, None, limit)
-        }
+        source = deploy(world, trained, model)
+        encoders: dict[EncoderKind, DeployedPolicy] = {"source": source}
         if target_encoder is not None:
             aligned = load_target_encoder(target_encoder / "target_encoder.safetensors")
-            encoders["target"] = DeployedPolicy(world, trained.policy, model, aligned, limit)
+            encoders["target"] = replace(source, target_encoder=aligned)
         headline = config.encoder if config.encoder in encoders else "source"
         outcomes = {}
         for kind, deployed in encoders.items():
             outcomes[kind], rate = _in_target(world, deployed, config, seed, num_threads, progress)
-        simulated = _in_simulation(world, method, trained, grounding, config, seed)
         told |= {
             "encoder": headline,
             "target": outcomes[headline].to_json(),
-            "simulated": simulated.to_json(),
             "encoders": {
                 kind: {"success": sum(outcome.success) / config.episodes}
                 for kind, outcome in outcomes.items()
@@ -131,10 +127,11 @@ def evaluate(
             "dataset_version": trained.dataset,
             "dataset_hash": trained.content_hash,
         }
-        tensors |= {
-            "target.position": outcomes[headline].position,
-            "simulated.position": simulated.position,
-        }
+        tensors["target.position"] = outcomes[headline].position
+        if trained.simulation is not None:
+            simulated = _in_simulation(world, trained, trained.simulation, model, config, seed)
+            told["simulated"] = simulated.to_json()
+            tensors["simulated.position"] = simulated.position
     start_goal = _starts_and_goals(world, config, seed)
     with finished_folder(out) as folder:
         save_tensors(folder / "trajectories.safetensors", tensors | start_goal, {})
@@ -193,19 +190,16 @@ def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str
 
 @torch.no_grad()
 def _in_simulation(
-    task: Task, method: str, trained: PolicyFile, grounding: Path | None, config: EvaluateConfig, seed: int
+    task: Task,
+    trained: PolicyFile,
+    simulation: Simulation,
+    grounding: Grounding | None,
+    config: EvaluateConfig,
+    seed: int,
 ) -> Outcome:
     """Run the policy in its training world, from the task's starts, with the world's own latents."""
-    model = load_grounding(grounding / "grounding.safetensors") if grounding else None
-    world = training_world(
-        task,
-        method_named(method),
-        trained.world,
-        WorldParts(trained.thinness, trained.scatter),
-        model,
-        num_envs=config.episodes,
-        device="cpu",
-    )
+    parts = WorldParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
+    world = training_world(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
     policy = trained.policy
     torch.manual_seed(derive(seed, "simulated evaluation"))
     observation = world.reset()

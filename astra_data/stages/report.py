@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -73,6 +73,10 @@ class Reported(Protocol):
     def seeds(self) -> Iterable[int]:
         """Seeds of every row."""
 
+    @property
+    def groundings(self) -> Mapping[str, str]:
+        """Row → the method whose grounding and alignment it uses, where that is not its own."""
+
 
 def report(
     recipe: Reported,
@@ -105,6 +109,7 @@ def report(
         root=root,
         command=command,
         replicates=config.bootstrap_replicates,
+        groundings=recipe.groundings,
     )
     progress(0.5, f"{len(results.methods)} rows, {len(results.seeds)} seeds")
     images = {name: png(figure) for name, figure in _figures(results, root, config).items()}

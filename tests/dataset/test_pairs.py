@@ -69,17 +69,19 @@ def test_episodes_are_padded_at_the_end(episodes: PairedEpisodes) -> None:
         for values in (episodes.target_state, windows.state, windows.next_state, windows.simulated_next):
             assert torch.equal(values[episode, :length, 0], expected)
             assert (values[episode, length:] == 0).all()
-        assert torch.equal(windows.reward[episode, :length].sum(-1), -expected)
         assert windows.mask[episode].tolist() == [1.0] * length + [0.0] * (30 - length)
-    assert torch.equal(episodes.steps(windows.reward).sum(-1), -episodes.steps(windows.state)[:, 0])
     assert len(episodes.steps(windows.goal)) == sum(LENGTHS)
 
 
-def test_rewards_of_steps_that_end_the_task_stand_apart(episodes: PairedEpisodes) -> None:
-    final = episodes.windows.reward[..., 1].nonzero()
-    assert len(final) > 0
-    assert (episodes.windows.reward[..., 0][tuple(final.T)] == 0).all()
-    assert (final[:, 1] == episodes.lengths[final[:, 0]] - 1).all()
+def test_rewards_of_steps_that_end_the_task_badly_stand_apart(episodes: PairedEpisodes) -> None:
+    going_on, ending = episodes.windows.reward.unbind(-1)
+    assert ending.nonzero().tolist() == [[3, LENGTHS[3] - 1]]
+    for episode, length in enumerate(LENGTHS):
+        expected = -torch.tensor([label(episode, step) for step in range(length)])
+        shown = (going_on + ending)[episode, :length]
+        assert torch.equal(shown[:-1], expected[:-1])
+        # The step that fulfils the task is the simulator's to reward.
+        assert shown[-1] == (0.0 if episode == 2 else expected[-1])
 
 
 def test_only_the_last_second_before_a_bad_end_topples_soon(episodes: PairedEpisodes) -> None:

@@ -1,23 +1,48 @@
 import pytest
 
 from astra_data.errors import BadInputError
+from astra_data.fitting import HistoryFit
 from astra_data.methods import METHODS, method_named
+from astra_data.models.grounding import LossWeights
+from astra_data.training import SimulatorPpo
+
+
+def weights(name: str) -> LossWeights | None:
+    fit = METHODS[name].fit
+    return fit.weights if isinstance(fit, HistoryFit) else None
+
+
+def reward(name: str) -> str:
+    learn = METHODS[name].learn
+    assert isinstance(learn, SimulatorPpo)
+    return learn.reward
 
 
 def test_methods_are_known_by_their_names() -> None:
     assert all(name == method.name for name, method in METHODS.items())
     assert method_named("astra_plus") is method_named("astra") is METHODS["astra"]
-    with pytest.raises(BadInputError, match="unknown method 'astro'; known: direct_transfer, nas, astra"):
+    with pytest.raises(BadInputError, match="unknown method 'astro'; known: direct_transfer, "):
         method_named("astro")
 
 
 def test_what_the_rows_of_the_paper_differ_in() -> None:
-    weights = {name: method.loss_weights for name, method in METHODS.items()}
-    assert weights["direct_transfer"] is None
-    assert weights["nas"] is not None
-    assert (weights["nas"].latent, weights["nas"].reward, weights["nas"].state) == (0.0, 0.0, 1.0)
-    assert weights["astra"] is not None
-    assert min(vars(weights["astra"]).values()) > 0
-    assert [name for name, method in METHODS.items() if method.aligns] == ["astra"]
+    assert weights("direct_transfer") is None
+    assert weights("nas") == LossWeights(0.0, 0.0, 1.0)
+    assert weights("astra") == LossWeights(0.1, 1.0, 1.0)
+    assert weights("astra_without_latent") == LossWeights(0.0, 1.0, 1.0)
+    assert weights("astra_without_reward") == LossWeights(0.1, 0.0, 1.0)
+    assert {name for name, method in METHODS.items() if method.aligns} == {
+        "astra",
+        "astra_without_reward",
+        "astra_task_reward",
+    }
     assert [name for name, method in METHODS.items() if not method.trains] == ["follower"]
-    assert METHODS["astra"].reward == "predicted"
+    assert [reward(name) for name in ("direct_transfer", "nas", "astra")] == ["abstract"] * 2 + ["predicted"]
+    assert [reward(name) for name in ("astra_without_reward", "astra_task_reward")] == ["abstract"] * 2
+
+
+def test_what_a_method_borrows_is_there() -> None:
+    for method in METHODS.values():
+        assert METHODS[method.grounded_as or method.name].fit == method.fit
+        assert method.initial is None or METHODS[method.initial].trains
+        assert not method.predicts_reward or method.grounds

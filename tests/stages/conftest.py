@@ -49,7 +49,7 @@ def trained(grounded: Path, paired: Path) -> Path:
     out = paired.with_name("train")
     inputs = {"dataset": paired, "grounding": grounded}
     with short_task():
-        train(TASK, "astra", TRAIN, **inputs, seed=0, out=out, device="cpu", progress=silent)
+        train(TASK, "astra", TRAIN, **inputs, seed=0, out=out, device="cpu", progress=silent)  # type: ignore[arg-type]
     return out
 
 

@@ -6,13 +6,14 @@ import pytest
 import torch
 from small_run import GROUND
 
+from astra_data import fitting as stage
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
-from astra_data.grounding_file import load_grounding
+from astra_data.fitting import telemetry
+from astra_data.grounding_file import load_history_model
 from astra_data.models.grounding import LossWeights
 from astra_data.progress import Progress, silent
-from astra_data.stages import ground as stage
-from astra_data.stages.ground import ground, telemetry
+from astra_data.stages.ground import ground
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
@@ -64,7 +65,7 @@ def test_the_artefact_is_complete(grounded: Path) -> None:
 
 
 def test_where_there_is_nothing_to_explain_r2_is_unknown(grounded: Path, paired: Path) -> None:
-    model, episodes = load_grounding(grounded / "grounding.safetensors"), PairedEpisodes.load(paired)
+    model, episodes = load_history_model(grounded / "grounding.safetensors"), PairedEpisodes.load(paired)
     windows = episodes.windows
     perfect = replace(windows, simulated_next=windows.next_state, reward=torch.zeros_like(windows.reward))
     weights = LossWeights()
@@ -75,7 +76,7 @@ def test_where_there_is_nothing_to_explain_r2_is_unknown(grounded: Path, paired:
 
 
 def test_the_residual_is_the_scatter_on_held_out_episodes(grounded: Path, paired: Path) -> None:
-    model = load_grounding(grounded / "grounding.safetensors")
+    model = load_history_model(grounded / "grounding.safetensors")
     _, held_out = PairedEpisodes.load(paired).split(GROUND.held_out_share, 0)
     windows = held_out.windows
     latent, _ = model.encoder(model.encoder_input(windows.state, windows.goal, windows.previous_action))

@@ -1,7 +1,7 @@
 import json
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -47,6 +47,7 @@ class FakeRecipe:
     task: str = "antmaze-u"
     methods: tuple[str, ...] = ROWS
     seeds: tuple[int, ...] = SEEDS
+    groundings: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_json(path: Path, values: object) -> None:

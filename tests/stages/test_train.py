@@ -5,11 +5,12 @@ import pytest
 import torch
 from small_run import TRAIN
 
+from astra_data import training as stage
 from astra_data.errors import BadInputError
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress, silent
-from astra_data.stages import train as stage
-from astra_data.stages.train import TrainConfig, train
+from astra_data.stages.train import train
+from astra_data.training import TrainConfig
 
 SWITCHES = {
     "topple": True,
@@ -51,7 +52,7 @@ def test_the_artefact_is_complete(trained: Path) -> None:
     policy = PolicyFile.load(trained / "policy.safetensors")
     assert policy.dataset == "antmaze-short-random-seed0@data-2.0.0"
     assert policy.policy.memory is None
-    assert not policy.scatter.any()
+    assert policy.simulation is not None and not policy.simulation.scatter.any()
 
 
 def test_success_is_null_while_no_episode_has_ended(task: str, paired: Path, tmp_path: Path) -> None:
@@ -103,8 +104,10 @@ def test_after_an_interruption_it_goes_on(
     assert seen == pytest.approx([5 / 6, 1.0])
     assert resumed == expected
     policy = PolicyFile.load(out / "policy.safetensors")
-    assert policy.world.model_dump() == policy.world.model_dump() | SWITCHES
-    assert torch.linalg.matrix_rank(policy.scatter) == 4
+    assert policy.simulation is not None
+    world = policy.simulation.world.model_dump()
+    assert world == world | SWITCHES
+    assert torch.linalg.matrix_rank(policy.simulation.scatter) == 4
 
 
 def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: Path) -> None:

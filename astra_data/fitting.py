@@ -1,0 +1,220 @@
+"""Fit: what a method is given to learn about its simulator from pairs, and the way of the history models."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.grounding_file import Grounding
+from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
+from astra_data.progress import Progress
+from astra_data.recipe import Config, Count, Positive, Share
+from astra_data.seeding import derive
+from astra_data.tasks import Task
+
+_CHECKPOINT_EVERY = 250
+
+
+class GroundConfig(Config):
+    """How the grounding model is fitted. The paper prints none of these."""
+
+    updates: Count = 1500
+    """Gradient updates in all."""
+    batch_windows: Count = 48
+    """Windows per update."""
+    window: Count = 100
+    """Steps per window, in backpropagation through time."""
+    learning_rate: Positive = 1e-3
+    """At the start; falls to zero along a half cosine."""
+    gradient_norm: Positive = 1.0
+    """Gradients are clipped to this norm."""
+    target: TargetKind = "ema"
+    """Where the next latent of the latent loss comes from; "online" is the printed loss, unbounded below."""
+    ema_rate: Share = 0.01
+    """Share by which the slow encoder of "ema" follows, per update."""
+    latent_size: Count = 64
+    """Z, also the size of the encoder's memory."""
+    position_octaves: int = 4
+    """Sines and cosines of the position from 16 m down by halves; 0 for the bare position."""
+    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    """Share of the episodes on which nothing is fitted but the residual's scatter, unless the dataset sets
+    some aside itself."""
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What a method has to learn about its simulator from.
+
+    Attributes:
+        task: the task. config: the recipe's `[ground]`.
+        settings: the method's own table of the recipe, if it has one.
+        training: paired episodes to fit. held_out: those that only measure.
+        seed: of all randomness. device: of the networks.
+        folder: for checkpoints and further files; what is left in it becomes part of the artefact.
+        progress: told the share done and the rate.
+    """
+
+    task: Task
+    config: GroundConfig
+    settings: Config | None
+    training: PairedEpisodes
+    held_out: PairedEpisodes
+    seed: int
+    device: str
+    folder: Path
+    progress: Progress
+
+
+Fit = Callable[[Fitting], tuple[Grounding, dict[str, Any]]]
+"""Returns what was learned, and figures that say how well and how fast."""
+
+
+@dataclass(frozen=True)
+class HistoryFit:
+    """Fit a history model with these weights of its losses (paper, Section IV-A)."""
+
+    weights: LossWeights
+
+    def __call__(self, fitting: Fitting) -> tuple[GroundingModel, dict[str, Any]]:
+        """Return the model and its telemetry."""
+        config, training = fitting.config, fitting.training
+        torch.manual_seed(derive(fitting.seed, "grounding"))
+        windows = training.windows
+        model = GroundingModel(
+            GroundingShape(
+                state_size=windows.state.shape[-1],
+                action_size=windows.action.shape[-1],
+                goal_size=windows.goal.shape[-1],
+                latent_size=config.latent_size,
+                position_octaves=config.position_octaves,
+            ),
+            config.target,
+        ).to(fitting.device)
+        model.set_scales(
+            {
+                "state": training.steps(windows.state),
+                "goal": training.steps(windows.goal),
+                "correction": training.steps(windows.next_state - windows.simulated_next),
+                "reward": training.steps(windows.reward),
+            }
+        )
+        metrics = _optimise(model, self.weights, fitting)
+        _fit_residual(model, fitting.held_out)
+        return model, metrics
+
+
+def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:
+    config, folder = fitting.config, fitting.folder
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
+    epochs: list[dict[str, float | None]] = []
+    seconds, first = 0.0, 0
+    checkpoint = folder / "checkpoint.safetensors"
+    if checkpoint.exists():
+        tensors, told = load_tensors(checkpoint)
+        state = unflatten(tensors)
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        schedule.load_state_dict(told["schedule"])
+        epochs, seconds, first = told["epochs"], told["seconds"], told["update"]
+    began = time.perf_counter() - seconds
+    for update in range(first, config.updates):
+        torch.manual_seed(derive(fitting.seed, f"grounding update {update}"))
+        windows, _ = fitting.training.draw_windows(config.batch_windows, config.window)
+        loss, parts = model.losses(windows, weights)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm)
+        optimizer.step()
+        schedule.step()
+        model.update_target(config.ema_rate)
+        done = update + 1
+        seconds = time.perf_counter() - began
+        if done % _CHECKPOINT_EVERY == 0 or done == config.updates:
+            losses = {f"loss_{name}": float(value.detach()) for name, value in parts.items()}
+            epochs.append({"step": done, **losses, **telemetry(model, fitting.held_out, weights)})
+            state = {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
+            told = {
+                "update": done,
+                "seconds": seconds,
+                "epochs": epochs,
+                "schedule": {k: v for k, v in schedule.state_dict().items() if not k.startswith("_get")},
+            }
+            save_tensors(checkpoint, flatten(state), told)
+        if done % 10 == 0:
+            rate = done * config.batch_windows / seconds
+            note = f"{rate:,.0f} windows/s"
+            explained = epochs[-1]["r2_state"] if epochs else None
+            if explained is not None:
+                note += f"  held-out R² of the correction {explained:.3f}"
+            fitting.progress(done / config.updates, note)
+    return {
+        "windows_per_second": config.updates * config.batch_windows / seconds,
+        "wall_seconds": seconds,
+        "parameters": sum(parameter.numel() for parameter in parameters),
+        "epochs": epochs,
+    }
+
+
+@torch.no_grad()
+def telemetry(
+    model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights
+) -> dict[str, float | None]:
+    """Return what falling losses do not show, on `episodes`.
+
+    R² of each head that is trained (of the correction: of the simulator's error that it removes), None where
+    there is nothing to explain, as in a perfect simulator; the mean standard deviation of the latent's
+    entries, and the latent's effective rank (exponential of the entropy of the covariance's normalised
+    eigenvalues).
+    """
+    windows = episodes.windows
+    inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
+    latent, _ = model.encoder(inputs)
+    mask = windows.mask.bool()
+    corrected = model.correct(latent, windows.action, windows.simulated_next)
+    wrong = ((corrected - windows.next_state) / model.correction_std)[mask].square().sum()
+    raw = ((windows.simulated_next - windows.next_state) / model.correction_std)[mask].square().sum()
+    figures = {"r2_state": _explained(wrong, raw)}
+    if weights.reward > 0:
+        predicted = model.predict_reward_parts(latent, windows.action)[mask]
+        for part, name in enumerate(("r2_reward", "r2_final_reward")):
+            figures[name] = _r2(predicted[:, part], windows.reward[mask][:, part])
+    if weights.latent > 0:
+        mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
+        both = mask[:, :-1] & mask[:, 1:]
+        figures["r2_latent"] = _r2(mean[both], latent[:, 1:][both])
+    samples = latent[mask]
+    eigenvalues = torch.linalg.eigvalsh(torch.cov(samples.T)).clamp_min(1e-12)
+    shares = eigenvalues / eigenvalues.sum()
+    figures["latent_std"] = float(samples.std(0).mean())
+    figures["latent_rank"] = float(torch.exp(-(shares * shares.log()).sum()))
+    return figures
+
+
+def _r2(predicted: Tensor, true: Tensor) -> float | None:
+    return _explained((predicted - true).square().sum(), (true - true.mean(0)).square().sum())
+
+
+def _explained(residual: Tensor, total: Tensor) -> float | None:
+    return float(1.0 - residual / total) if total > 0 else None
+
+
+@torch.no_grad()
+def _fit_residual(model: GroundingModel, held_out: PairedEpisodes) -> None:
+    """Fit the Gaussian scatter of the target around the correction, on episodes not trained on."""
+    windows = held_out.windows
+    inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
+    latent, _ = model.encoder(inputs)
+    residual = held_out.steps(
+        windows.next_state - model.correct(latent, windows.action, windows.simulated_next)
+    )
+    covariance = torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=residual.device)
+    model.residual_factor.copy_(torch.linalg.cholesky(covariance))

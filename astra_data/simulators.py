@@ -1,0 +1,88 @@
+"""The simulators of a task: raw, scattered, varied, or as a grounding makes it."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from astra_data.grounding_file import Grounding
+from astra_data.models.grounding import GroundingModel, Windows
+from astra_data.sims.grounded import GroundedSimulator
+from astra_data.sims.point_mass import PointMass
+from astra_data.sims.randomized import RandomizedSimulator
+from astra_data.sims.varied_point_mass import VariedPointMass
+from astra_data.tasks import Task
+from astra_data.variation import Variation
+
+Simulator = PointMass | VariedPointMass | RandomizedSimulator | GroundedSimulator
+
+
+def simulator_of(
+    task: Task,
+    grounding: Grounding | None,
+    num_envs: int,
+    device: str,
+    *,
+    variation: Variation | None = None,
+    scatter: Tensor | None = None,
+) -> Simulator:
+    """Build `num_envs` abstract simulators.
+
+    Args:
+        task: whose.
+        grounding: what a method learned about the simulator, if anything.
+        num_envs: B.
+        device: torch device.
+        variation: of its parameters from episode to episode, where there is no grounding.
+        scatter: factor (X, X) of noise that is added after each step.
+    """
+    if isinstance(grounding, Variation):
+        variation = grounding
+    inner: PointMass | VariedPointMass
+    if variation is None:
+        inner = task.simulator(num_envs, device)
+    else:
+        inner = task.varied_simulator(num_envs, variation, device)
+    if isinstance(grounding, GroundingModel):
+        return GroundedSimulator(inner, grounding, inner.free, scatter=scatter)
+    return inner if scatter is None else RandomizedSimulator(inner, inner.free, scatter)
+
+
+@torch.no_grad()
+def hidden_before(grounding: Grounding | None, windows: Windows) -> Tensor | None:
+    """Return the hidden states (E, T, H) of the histories before each step of `windows`, from their starts.
+
+    None where the grounding remembers nothing.
+    """
+    if not isinstance(grounding, GroundingModel):
+        return None
+    inputs = grounding.encoder_input(windows.state, windows.goal, windows.previous_action)
+    _, after = grounding.encoder(inputs)
+    return functional.pad(after[:, :-1], (0, 0, 1, 0))
+
+
+def start_simulator(
+    simulator: Simulator,
+    state: Tensor,
+    rows: Tensor,
+    goal: Tensor,
+    *,
+    hidden: Tensor | None = None,
+    previous_action: Tensor | None = None,
+) -> None:
+    """Begin episodes in `rows` (n,) at `state` (n, X) with `goal` (n, G).
+
+    `hidden` (n, H) and `previous_action` (n, A) are of the history before `state`, by default none.
+    """
+    if isinstance(simulator, GroundedSimulator):
+        simulator.reset_to(state, rows, goal, hidden=hidden, previous_action=previous_action)
+    else:
+        simulator.reset_to(state, rows)
+    varied = varied_within(simulator)
+    if varied is not None:
+        varied.redraw(rows)
+
+
+def varied_within(simulator: Simulator) -> VariedPointMass | None:
+    """Return the simulator with varying parameters inside `simulator`, if there is one."""
+    inner = simulator.simulator if isinstance(simulator, RandomizedSimulator) else simulator
+    return inner if isinstance(inner, VariedPointMass) else None

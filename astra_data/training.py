@@ -1,0 +1,164 @@
+"""Training: what a method is given to learn a policy from, and the way that most methods take.
+
+That way is PPO in the abstract simulator, raw, varied, or as the method's grounding makes it (Algorithm 2).
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from astra_data.batched import BatchedEnv
+from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.grounding_file import Grounding
+from astra_data.learners.ppo import Ppo, PpoConfig
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policy_file import PolicyFile, Simulation
+from astra_data.progress import Progress
+from astra_data.recipe import Config, Count
+from astra_data.seeding import derive
+from astra_data.tasks import Task
+from astra_data.training_world import WorldConfig, training_world, world_parts
+from astra_data.variation import Variation
+from astra_data.world import NavigationWorld, RewardSource
+
+_CHECKPOINT_EVERY = 20
+
+
+class TrainConfig(WorldConfig, PpoConfig):
+    """How policies are trained: PPO's settings, the world's switches, and the sizes below."""
+
+    num_envs: Count = 256
+    """Worlds stepped side by side."""
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    """Of actor and critic."""
+    memory_size: int = 64
+    """Of the policy's own GRU, where no grounding provides a latent."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a method has to learn a policy from.
+
+    Attributes:
+        task: the task. config: the recipe's `[train]`, or `[plus]`.
+        settings: the method's own table of the recipe, if it has one.
+        episodes: paired. grounding: what the method's fit gave, if it fits anything.
+        initial: the policy that the method goes on from, if it names one.
+        seed: of all randomness. device: of the networks.
+        folder: for checkpoints; what is left in it becomes part of the artefact.
+        progress: told the share done, the rate and the figure that matters.
+        num_threads: of the target's physics, for methods that train in the target; None is one per core.
+    """
+
+    task: Task
+    config: TrainConfig
+    settings: Config | None
+    episodes: PairedEpisodes
+    grounding: Grounding | None
+    initial: PolicyFile | None
+    seed: int
+    device: str
+    folder: Path
+    progress: Progress
+    num_threads: int | None = None
+
+
+Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]
+"""Returns the policy and its learning curve."""
+
+
+class ResumableEnv(BatchedEnv, Protocol):
+    """A world that a training can be resumed in."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return everything that a later `load_state_dict` needs to go on from here."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
+        """Go on from `state`; return the observations (B, O)."""
+        ...
+
+
+@dataclass(frozen=True)
+class SimulatorPpo:
+    """Train by PPO in the abstract simulator.
+
+    Attributes:
+        reward: where the reward comes from, unless the recipe says.
+        variation: of the simulator's parameters from episode to episode, unless a grounding is a variation
+            or the method's own settings are one.
+    """
+
+    reward: RewardSource = "abstract"
+    variation: Variation | None = None
+
+    def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        """Return the policy and its learning curve."""
+        config, device = training.config, training.device
+        world = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
+        world = world.model_copy(update={"reward": world.reward or self.reward})
+        settings = training.settings
+        variation = settings if isinstance(settings, Variation) else self.variation
+        parts = world_parts(training.task, world, training.episodes, training.grounding, variation)
+        env = training_world(
+            training.task, world, parts, training.grounding, num_envs=config.num_envs, device=device
+        )
+        torch.manual_seed(derive(training.seed, "policy"))
+        policy = ActorCritic(
+            ActorCriticShape(
+                observation_size=env.observation_size,
+                action_size=env.action_size,
+                memory_size=0 if env.latent_size else config.memory_size,
+                hidden_sizes=config.hidden_sizes,
+            )
+        ).to(device)
+        ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
+        curve = optimise(ppo, env, config.ramp, training)
+        simulation = Simulation(parts.thinness, parts.scatter, world, parts.variation)
+        episodes = training.episodes
+        return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
+
+
+def optimise(ppo: Ppo, env: ResumableEnv, ramp: float, training: Training) -> dict[str, Any]:
+    """Train to the end, from the checkpoint in the folder if there is one; return the learning curve."""
+    folder, device = training.folder, training.device
+    points: list[dict[str, float | None]] = []
+    seconds = 0.0
+    checkpoint = folder / "checkpoint.safetensors"
+    if checkpoint.exists():
+        tensors, told = load_tensors(checkpoint)
+        state = unflatten(tensors)
+        world = {name: values.to(device) for name, values in state["world"].items()}
+        ppo.load_state_dict(state["ppo"], env.load_state_dict(world))
+        points, seconds = told["points"], told["seconds"]
+    began, first = time.perf_counter() - seconds, ppo.steps
+    while not ppo.done:
+        if isinstance(env, NavigationWorld):
+            env.caution = min(1.0, ppo.steps / (ppo.config.total_steps * ramp)) if ramp else 1.0
+        metrics = ppo.iterate()
+        # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
+        known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
+        points.append({"steps": ppo.steps, **known})
+        seconds = time.perf_counter() - began
+        rate = ppo.steps / seconds
+        recent = [point["success"] for point in points[-10:] if point["success"] is not None]
+        success = f"{fmean(recent):.2f}" if recent else "unknown yet"
+        note = f"{rate:,.0f} steps/s  success of training episodes {success}"
+        training.progress(ppo.steps / ppo.config.total_steps, note)
+        if len(points) % _CHECKPOINT_EVERY == 0:
+            state = {"ppo": ppo.state_dict(), "world": env.state_dict()}
+            save_tensors(checkpoint, flatten(state), {"points": points, "seconds": seconds})
+    return {
+        "steps_per_second": ppo.steps / max(seconds, 1e-9),
+        "simulator_steps_per_second": (ppo.steps - first) / max(ppo.world_seconds, 1e-9),
+        "wall_seconds": seconds,
+        "points": points,
+    }

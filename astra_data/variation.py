@@ -1,0 +1,67 @@
+"""Variation: how the parameters of the planar point mass differ from episode to episode."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import torch
+from pydantic import AfterValidator
+from torch import Tensor
+
+from astra_data.recipe import Config
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"expected the lower end first, got {list(ends)}")
+    return ends
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+
+
+class Variation(Config):
+    """Ranges of the parameters of an episode, drawn uniformly; by default all are the plain simulator's.
+
+    In this simulator friction, action scale and timestep all lengthen or shorten the way of a command, so
+    trajectories tell their product only.
+    """
+
+    friction: Range = (1.0, 1.0)
+    """Factor on the speed that a command gives."""
+    action_scale: Range = (0.0, 0.0)
+    """Share by which commands are too long."""
+    action_noise: Range = (0.0, 0.0)
+    """Standard deviation of Gaussian noise on commands, in m/s."""
+    position_noise_m: Range = (0.0, 0.0)
+    """Half width of the uniform noise on shown positions."""
+    velocity_noise_m_s: Range = (0.0, 0.0)
+    """Half width of the uniform noise on shown velocities."""
+    heading_bias_deg: Range = (0.0, 0.0)
+    """Commands are turned by this angle."""
+    timestep_scale: Range = (1.0, 1.0)
+    """Factor on the control period."""
+
+    @classmethod
+    def of_json(cls, ranges: Mapping[str, Sequence[float]]) -> "Variation":
+        """Return what `model_dump` gave, after a way through JSON."""
+        return cls(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
+
+    def ranges(self) -> Tensor:
+        """Return lower and upper end of every parameter, (P, 2), in the order of `PARAMETERS`."""
+        return torch.tensor([getattr(self, name) for name in PARAMETERS])
+
+    def draw(self, count: int, device: torch.device | str = "cpu") -> Tensor:
+        """Draw the parameters (count, P) of as many episodes, from torch's global generator."""
+        low, high = self.ranges().to(device).unbind(-1)
+        return low + (high - low) * torch.rand(count, len(low), device=device)
+
+    def normal(self, parameters: Tensor) -> Tensor:
+        """Map parameters (..., P) to -1 at the lower and 1 at the upper end of their ranges, (..., P)."""
+        low, high = self.ranges().to(parameters.device).unbind(-1)
+        middle, half = (low + high) / 2, (high - low) / 2
+        # A parameter that does not vary tells nothing: it is 0.
+        return torch.where(half > 0, (parameters - middle) / half.clamp_min(1e-9), 0.0)
+
+
+PARAMETERS = tuple(Variation.model_fields)
+"""The names of the parameters, in the order of their columns."""

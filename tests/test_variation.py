@@ -1,0 +1,32 @@
+import pytest
+import torch
+from pydantic import ValidationError
+
+from astra_data.variation import PARAMETERS, Variation
+
+
+def test_parameters_are_drawn_uniformly_from_their_ranges() -> None:
+    torch.manual_seed(0)
+    variation = Variation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    drawn = dict(zip(PARAMETERS, variation.draw(20_000).unbind(-1), strict=True))
+    assert (drawn["timestep_scale"] == 1.0).all() and (drawn["action_noise"] == 0.0).all()
+    for name, (low, high) in {"friction": (0.8, 1.2), "heading_bias_deg": (-5.0, 5.0)}.items():
+        assert low <= float(drawn[name].min()) and float(drawn[name].max()) <= high
+        quarters = torch.quantile(drawn[name], torch.tensor([0.25, 0.5, 0.75]))
+        width = high - low
+        expected = torch.tensor([low + width / 4, low + width / 2, low + 3 * width / 4])
+        torch.testing.assert_close(quarters, expected, atol=0.02 * width, rtol=0)
+
+
+def test_normal_parameters_are_between_minus_one_and_one() -> None:
+    variation = Variation(friction=(0.8, 1.2), action_scale=(0.1, 0.1))
+    ends = variation.ranges().T
+    torch.testing.assert_close(variation.normal(ends)[:, 0], torch.tensor([-1.0, 1.0]))
+    assert variation.normal(ends)[:, 1:].abs().max() == 0.0
+
+
+def test_it_survives_json_and_refuses_an_upside_down_range() -> None:
+    variation = Variation(friction=(0.8, 1.2))
+    assert Variation.of_json({name: list(ends) for name, ends in variation.model_dump().items()}) == variation
+    with pytest.raises(ValidationError, match="expected the lower end first"):
+        Variation(friction=(1.2, 0.8))
