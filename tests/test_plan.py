@@ -71,8 +71,8 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
         (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: maze"),
         (
             HEAD.replace("astra_plus", "fine_tuned_plus"),
-            "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without effect: "
-            "leave out _plus",
+            "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without "
+            "effect: leave out _plus",
         ),
         (HEAD.replace("7", "0"), "recipe: expected each of seeds once, got [0, 0]"),
         (HEAD.replace("[0, 7]", "[]"), "seeds: tuple should have at least 1 item after validation, not 0"),
