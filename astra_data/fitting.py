@@ -13,7 +13,7 @@ from torch import Tensor
 from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
-from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
+from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind, Windows
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive, Share
 from astra_data.seeding import derive
@@ -180,9 +180,7 @@ def telemetry(
     latent, _ = model.encoder(inputs)
     mask = windows.mask.bool()
     corrected = model.correct(latent, windows.action, windows.simulated_next)
-    wrong = ((corrected - windows.next_state) / model.correction_std)[mask].square().sum()
-    raw = ((windows.simulated_next - windows.next_state) / model.correction_std)[mask].square().sum()
-    figures = {"r2_state": _explained(wrong, raw)}
+    figures = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
     if weights.reward > 0:
         predicted = model.predict_reward_parts(latent, windows.action)[mask]
         for part, name in enumerate(("r2_reward", "r2_final_reward")):
@@ -197,6 +195,26 @@ def telemetry(
     figures["latent_std"] = float(samples.std(0).mean())
     figures["latent_rank"] = float(torch.exp(-(shares * shares.log()).sum()))
     return figures
+
+
+def correction_r2(corrected: Tensor, windows: Windows, std: Tensor) -> float | None:
+    """Return the share of the simulator's squared error, in units of `std` (X,), that a correction removes.
+
+    `corrected` (B, T, X) is what the correction makes of the simulated next states of `windows`. None where
+    there is nothing to explain.
+    """
+    mask = windows.mask.bool()
+    wrong, raw = (
+        ((landed - windows.next_state) / std)[mask].square().sum()
+        for landed in (corrected, windows.simulated_next)
+    )
+    return _explained(wrong, raw)
+
+
+def scatter_factor(residual: Tensor) -> Tensor:
+    """Return the factor (X, X) of the Gaussian noise that scatters like `residual` (N, X)."""
+    covariance = torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=residual.device)
+    return torch.as_tensor(torch.linalg.cholesky(covariance))
 
 
 def _r2(predicted: Tensor, true: Tensor) -> float | None:
@@ -216,5 +234,4 @@ def _fit_residual(model: GroundingModel, held_out: PairedEpisodes) -> None:
     residual = held_out.steps(
         windows.next_state - model.correct(latent, windows.action, windows.simulated_next)
     )
-    covariance = torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=residual.device)
-    model.residual_factor.copy_(torch.linalg.cholesky(covariance))
+    model.residual_factor.copy_(scatter_factor(residual))

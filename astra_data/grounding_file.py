@@ -10,10 +10,11 @@ from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.models.grounding import GroundingModel, GroundingShape
+from astra_data.models.residual import ResidualModel, ResidualShape
 from astra_data.variation import Variation
 
-Grounding = GroundingModel | Variation
-"""A history model that corrects each step, or parameters of the simulator that were identified."""
+Grounding = GroundingModel | ResidualModel | Variation
+"""A model that corrects each step, with latents or without, or identified parameters of the simulator."""
 
 
 def save_grounding(path: Path, grounding: Grounding, episodes: PairedEpisodes) -> None:
@@ -22,6 +23,9 @@ def save_grounding(path: Path, grounding: Grounding, episodes: PairedEpisodes) -
     if isinstance(grounding, Variation):
         told |= {"kind": "variation", "variation": grounding.model_dump()}
         save_tensors(path, {"ranges": grounding.ranges()}, told)
+    elif isinstance(grounding, ResidualModel):
+        told |= {"kind": "residual", "shape": asdict(grounding.shape)}
+        save_tensors(path, grounding.state_dict(), told)
     else:
         told |= {"kind": "history", "shape": asdict(grounding.shape), "target": grounding.target}
         save_tensors(path, grounding.state_dict(), told)
@@ -35,7 +39,11 @@ def load_grounding(path: Path, device: str = "cpu") -> Grounding:
     shape: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in told["shape"].items()
     }
-    model = GroundingModel(GroundingShape(**shape), told["target"])
+    model: GroundingModel | ResidualModel
+    if told["kind"] == "residual":
+        model = ResidualModel(ResidualShape(**shape))
+    else:
+        model = GroundingModel(GroundingShape(**shape), told["target"])
     model.load_state_dict(tensors)
     return model.to(device).requires_grad_(False).eval()
 
@@ -48,5 +56,5 @@ def load_history_model(path: Path, device: str | torch.device = "cpu") -> Ground
     """
     grounding = load_grounding(path, str(device))
     if not isinstance(grounding, GroundingModel):
-        raise BadInputError(f"{path}: expected a history model, got identified parameters")
+        raise BadInputError(f"{path}: expected a history model, got a grounding without latents")
     return grounding

@@ -6,6 +6,8 @@ from torch.nn import functional
 
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, Windows
+from astra_data.models.residual import ResidualModel
+from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.randomized import RandomizedSimulator
@@ -13,7 +15,7 @@ from astra_data.sims.varied_point_mass import VariedPointMass
 from astra_data.tasks import Task
 from astra_data.variation import Variation
 
-Simulator = PointMass | VariedPointMass | RandomizedSimulator | GroundedSimulator
+Simulator = PointMass | VariedPointMass | RandomizedSimulator | GroundedSimulator | AugmentedSimulator
 
 
 def simulator_of(
@@ -44,20 +46,36 @@ def simulator_of(
         inner = task.varied_simulator(num_envs, variation, device)
     if isinstance(grounding, GroundingModel):
         return GroundedSimulator(inner, grounding, inner.free, scatter=scatter)
+    if isinstance(grounding, ResidualModel):
+        return AugmentedSimulator(inner, grounding, inner.free, scatter=scatter)
     return inner if scatter is None else RandomizedSimulator(inner, inner.free, scatter)
 
 
 @torch.no_grad()
-def hidden_before(grounding: Grounding | None, windows: Windows) -> Tensor | None:
-    """Return the hidden states (E, T, H) of the histories before each step of `windows`, from their starts.
+def hidden_before(grounding: Grounding | None, windows: Windows, every: int = 1) -> Tensor | None:
+    """Return the hidden states (E, ceil(T / every), H) of the histories before every so many-th step.
 
-    None where the grounding remembers nothing.
+    Histories begin where `windows` do. None where the grounding remembers nothing.
     """
+    if isinstance(grounding, ResidualModel):
+        return _memory_before(grounding, windows, every)
     if not isinstance(grounding, GroundingModel):
         return None
     inputs = grounding.encoder_input(windows.state, windows.goal, windows.previous_action)
     _, after = grounding.encoder(inputs)
-    return functional.pad(after[:, :-1], (0, 0, 1, 0))
+    return functional.pad(after[:, :-1], (0, 0, 1, 0))[:, ::every]
+
+
+def _memory_before(model: ResidualModel, windows: Windows, every: int) -> Tensor:
+    memory = model.initial_memory(len(windows.state))
+    before = []
+    for first in range(0, windows.state.shape[1], every):
+        before.append(memory)
+        steps = slice(first, first + every)
+        _, memory = model.correct(
+            windows.state[:, steps], windows.action[:, steps], windows.simulated_next[:, steps], memory
+        )
+    return torch.stack(before, dim=1)
 
 
 def start_simulator(
@@ -75,6 +93,8 @@ def start_simulator(
     """
     if isinstance(simulator, GroundedSimulator):
         simulator.reset_to(state, rows, goal, hidden=hidden, previous_action=previous_action)
+    elif isinstance(simulator, AugmentedSimulator):
+        simulator.reset_to(state, rows, hidden)
     else:
         simulator.reset_to(state, rows)
     varied = varied_within(simulator)

@@ -8,9 +8,11 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.fitting import scatter_factor
 from astra_data.grounding_file import Grounding
 from astra_data.mazes import FIELD_CELL_M
 from astra_data.models.grounding import GroundingModel
+from astra_data.models.residual import ResidualModel
 from astra_data.recipe import Config, NotNegative, Positive, Share
 from astra_data.simulators import hidden_before, simulator_of
 from astra_data.tasks import Task
@@ -19,6 +21,10 @@ from astra_data.world import DataStarts, NavigationWorld, RewardSource
 
 _KERNEL_M = 0.25
 """Standard deviation of the kernel that smooths the density of the data."""
+
+_MEMORY_EVERY = 10
+"""Of recorded steps, episodes start only from so many-th where the memory of an LSTM has to be kept for each:
+of 100 k steps it would take 300 MB."""
 
 
 class WorldConfig(Config):
@@ -75,23 +81,22 @@ def world_parts(
 ) -> WorldParts:
     """Derive thinness, scatter and starts from paired episodes, as far as `config` asks for them."""
     windows = episodes.windows
-    device = str(windows.state.device)
     thinness = _thinness(task, episodes.steps(windows.state)[:, :2], config.support_density)
-    if isinstance(grounding, GroundingModel):
+    if isinstance(grounding, GroundingModel | ResidualModel):
         scatter = grounding.residual_factor
     else:
         residual = episodes.steps(windows.next_state - windows.simulated_next)
-        scatter = torch.linalg.cholesky(
-            torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=device)
-        )
+        scatter = scatter_factor(residual)
     starts = None
     if config.data_start_share > 0:
-        hidden = hidden_before(grounding, windows)
+        every = _MEMORY_EVERY if isinstance(grounding, ResidualModel) else 1
+        moments = windows.mask[:, ::every].bool()
+        hidden = hidden_before(grounding, windows, every)
         starts = DataStarts(
-            state=episodes.steps(windows.state),
-            goal=episodes.steps(windows.goal),
-            previous_action=episodes.steps(windows.previous_action),
-            hidden=None if hidden is None else episodes.steps(hidden),
+            state=windows.state[:, ::every][moments],
+            goal=windows.goal[:, ::every][moments],
+            previous_action=windows.previous_action[:, ::every][moments],
+            hidden=None if hidden is None else hidden[moments],
         )
     return WorldParts(thinness, config.residual_noise * scatter, starts, variation)
 

@@ -12,6 +12,7 @@ from astra_data.batched import Step
 from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
 from astra_data.navigation import Navigation
+from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.simulators import Simulator, start_simulator, varied_within
 
@@ -24,7 +25,7 @@ class DataStarts:
 
     Attributes:
         state: φ(s_i), (N, X). goal: (N, G). previous_action: a_{i-1}, (N, A).
-        hidden: the encoder's hidden state before s_i, (N, Z); None where there is no encoder.
+        hidden: the grounding's memory before s_i, (N, H); None where it remembers nothing.
     """
 
     state: Tensor
@@ -185,8 +186,8 @@ class NavigationWorld:
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything that a later `load_state_dict` needs to go on from here."""
         state = {"state": self.simulator.state, "goal": self.goal}
-        if self.grounded is not None:
-            state["hidden"] = self.grounded.hidden
+        if isinstance(self.simulator, GroundedSimulator | AugmentedSimulator):
+            state["hidden"] = self.simulator.hidden
         varied = varied_within(self.simulator)
         if varied is not None:
             state |= {"true": varied.true_state, "parameters": varied.parameters}
@@ -195,13 +196,13 @@ class NavigationWorld:
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
         """Go on from `state`; return the observations (B, O)."""
         self.goal = state["goal"].clone()
-        if isinstance(self.simulator, GroundedSimulator):
+        if isinstance(self.simulator, GroundedSimulator | AugmentedSimulator):
             self.simulator.simulator.reset_to(state["state"])
+            self.simulator.hidden = state["hidden"].clone()
         else:
             self.simulator.reset_to(state["state"])
         if self.grounded is not None:
             self.grounded.goal = state["goal"].clone()
-            self.grounded.hidden = state["hidden"].clone()
         varied = varied_within(self.simulator)
         if varied is not None:
             varied.true_state, varied.parameters = state["true"].clone(), state["parameters"].clone()

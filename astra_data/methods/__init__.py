@@ -7,6 +7,7 @@ from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
+from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {
@@ -15,6 +16,7 @@ METHODS: dict[str, Method] = {
         DIRECT_TRANSFER,
         DOMAIN_RANDOMIZATION,
         NAS,
+        NAS_GOLEMO,
         ASTRA,
         ASTRA_WITHOUT_LATENT,
         ASTRA_WITHOUT_REWARD,

@@ -1,0 +1,118 @@
+"""NAS as Golemo et al. (2018) built it: an LSTM that adds to each simulated state what it lacks.
+
+The policy sees no latent, so it has a memory of its own; its reward is the task's own on corrected states.
+"""
+
+import time
+from typing import Any
+
+import torch
+
+from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.fitting import Fitting, correction_r2, scatter_factor
+from astra_data.method import Method
+from astra_data.models.residual import ResidualModel, ResidualShape
+from astra_data.recipe import Config, Count, Positive
+from astra_data.seeding import derive, generator
+
+
+class GolemoConfig(Config):
+    """How the residual model is fitted; the defaults are the authors'."""
+
+    epochs: Count = 5
+    """Passes over the training episodes; each update takes one whole episode."""
+    hidden_size: Count = 128
+    """Of each layer of the LSTM."""
+    layers: Count = 3
+    """Of the LSTM."""
+    learning_rate: Positive = 1e-3
+    """Of Adam, constant."""
+
+
+def fit_residual(fitting: Fitting) -> tuple[ResidualModel, dict[str, Any]]:
+    """Fit the residual model to whole episodes; return it and its telemetry.
+
+    The squared error is of residuals divided by their deviation in the training episodes.
+    """
+    config = fitting.settings if isinstance(fitting.settings, GolemoConfig) else GolemoConfig()
+    training, windows = fitting.training, fitting.training.windows
+    torch.manual_seed(derive(fitting.seed, "grounding"))
+    states, actions = windows.state.shape[-1], windows.action.shape[-1]
+    shape = ResidualShape(states, actions, config.hidden_size, config.layers)
+    model = ResidualModel(shape).to(fitting.device)
+    model.set_scales(
+        training.steps(windows.state), training.steps(windows.next_state - windows.simulated_next)
+    )
+    metrics = _optimise(model, config, fitting)
+    held_out = fitting.held_out
+    residual = held_out.windows.next_state - _corrected(model, held_out)
+    model.residual_factor.copy_(scatter_factor(held_out.steps(residual)))
+    return model, metrics
+
+
+def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> dict[str, Any]:
+    optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+    episodes, count = fitting.training, len(fitting.training)
+    points: list[dict[str, float | None]] = []
+    seconds = 0.0
+    checkpoint = fitting.folder / "checkpoint.safetensors"
+    if checkpoint.exists():
+        tensors, told = load_tensors(checkpoint)
+        state = unflatten(tensors)
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        points, seconds = told["epochs"], told["seconds"]
+    began = time.perf_counter() - seconds
+    for epoch in range(len(points), config.epochs):
+        order = generator(fitting.seed, f"grounding epoch {epoch}").permutation(count)
+        losses = 0.0
+        for index, episode in enumerate(order.tolist()):
+            losses += _update(model, optimizer, episodes.select(torch.tensor([episode]))) / count
+            done = epoch * count + index + 1
+            rate = done / (time.perf_counter() - began)
+            note = f"{rate:,.0f} episodes/s"
+            if points and (explained := points[-1]["r2_state"]) is not None:
+                note += f"  held-out R² of the correction {explained:.3f}"
+            fitting.progress(done / (config.epochs * count), note)
+        seconds = time.perf_counter() - began
+        points.append({"step": done, "loss_state": losses, "r2_state": _r2(model, fitting.held_out)})
+        state = {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
+        save_tensors(checkpoint, flatten(state), {"epochs": points, "seconds": seconds})
+    return {
+        "windows_per_second": config.epochs * count / seconds,
+        "wall_seconds": seconds,
+        "parameters": sum(parameter.numel() for parameter in model.parameters()),
+        "epochs": points,
+    }
+
+
+def _update(model: ResidualModel, optimizer: torch.optim.Optimizer, episode: PairedEpisodes) -> float:
+    """Learn from one episode; return the loss."""
+    steps, windows = slice(int(episode.lengths)), episode.windows
+    corrected, _ = model.correct(
+        windows.state[:, steps],
+        windows.action[:, steps],
+        windows.simulated_next[:, steps],
+        model.initial_memory(1),
+    )
+    loss = ((corrected - windows.next_state[:, steps]) / model.correction_std).square().mean()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return float(loss.detach())
+
+
+@torch.no_grad()
+def _corrected(model: ResidualModel, episodes: PairedEpisodes) -> torch.Tensor:
+    """Return the corrected next states (E, T, X) along the true ones."""
+    windows = episodes.windows
+    memory = model.initial_memory(len(episodes))
+    return model.correct(windows.state, windows.action, windows.simulated_next, memory)[0]
+
+
+def _r2(model: ResidualModel, episodes: PairedEpisodes) -> float | None:
+    return correction_r2(_corrected(model, episodes), episodes.windows, model.correction_std)
+
+
+NAS_GOLEMO = Method(name="nas_golemo", title="NAS (Golemo et al.)", fit=fit_residual)

@@ -1,0 +1,101 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.fitting import Fitting, GroundConfig, correction_r2
+from astra_data.methods.nas_golemo import GolemoConfig, fit_residual
+from astra_data.models.grounding import Windows
+from astra_data.models.residual import ResidualModel
+from astra_data.progress import silent
+from astra_data.tasks import TASKS
+
+CONFIG = GolemoConfig(epochs=12, hidden_size=16, layers=2, learning_rate=0.01)
+STEPS = 40
+
+
+def episodes(count: int, lacking: Tensor, action: Tensor) -> PairedEpisodes:
+    """Return episodes of random states in which the simulator's next states lack `lacking` (E, T, 4)."""
+    state, simulated = torch.randn(2, count, STEPS, 4)
+    mask = torch.ones(count, STEPS)
+    mask[0, 25:] = 0.0
+    windows = Windows(
+        state=state,
+        action=action,
+        previous_action=torch.zeros(count, STEPS, 2),
+        goal=torch.zeros(count, STEPS, 2),
+        simulated_next=simulated,
+        next_state=simulated + lacking,
+        reward=torch.zeros(count, STEPS, 2),
+        topples_soon=torch.zeros(count, STEPS),
+        mask=mask,
+    )
+    return PairedEpisodes(torch.zeros(count, STEPS, 29), windows, "toy@data-1.0.0", "0")
+
+
+def fitting(both: PairedEpisodes, folder: Path, config: GolemoConfig = CONFIG) -> Fitting:
+    training, held_out = both.select(torch.arange(24)), both.select(torch.arange(24, len(both)))
+    task = TASKS["antmaze-umaze"]
+    return Fitting(task, GroundConfig(), config, training, held_out, 0, "cpu", folder, silent)
+
+
+def explained(model: ResidualModel, held_out: PairedEpisodes, *, forgets: bool) -> float:
+    windows = held_out.windows
+    steps = [windows.state, windows.action, windows.simulated_next]
+    if forgets:
+        steps = [one.flatten(0, 1).unsqueeze(1) for one in steps]
+    memory = model.initial_memory(len(steps[0]))
+    corrected = model.correct(steps[0], steps[1], steps[2], memory)[0].detach()
+    share = correction_r2(corrected.view_as(windows.state), windows, model.correction_std)
+    assert share is not None
+    return share
+
+
+def test_learns_a_constant_offset_and_how_what_is_left_scatters(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    offset = torch.tensor([0.3, -0.2, 0.0, 1.0])
+    noise = torch.tensor([0.1, 0.1, 0.02, 0.2]) * torch.randn(48, STEPS, 4)
+    given = fitting(episodes(48, offset + noise, torch.randn(48, STEPS, 2)), tmp_path)
+    model, metrics = fit_residual(given)
+    windows = given.held_out.windows
+    memory = model.initial_memory(len(windows.state))
+    corrected, _ = model.correct(windows.state, windows.action, windows.simulated_next, memory)
+    added = (corrected - windows.simulated_next).detach().mean((0, 1))
+    assert added.tolist() == pytest.approx(offset.tolist(), abs=0.05)
+    scatter = (model.residual_factor @ model.residual_factor.T).diagonal().sqrt()
+    assert scatter.tolist() == pytest.approx([0.1, 0.1, 0.02, 0.2], rel=0.25)
+    assert [point["step"] for point in metrics["epochs"]] == [24 * (epoch + 1) for epoch in range(12)]
+    assert metrics["epochs"][-1]["r2_state"] == pytest.approx(
+        explained(model, given.held_out, forgets=False), abs=1e-6
+    )
+
+
+def test_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    action = torch.randn(32, STEPS, 2)
+    lacking = torch.zeros(32, STEPS, 4)
+    lacking[:, 2:, :2] = 0.1 * action[:, :-2]
+    lacking[..., 2:] = 0.01 * torch.randn(32, STEPS, 2)
+    given = fitting(episodes(32, lacking, action), tmp_path)
+    # Scales apart, the last two entries are noise: compare the first two alone.
+    model, _ = fit_residual(given)
+    model.correction_std[2:] = 1e6
+    assert explained(model, given.held_out, forgets=False) > 0.8
+    assert explained(model, given.held_out, forgets=True) < 0.2
+
+
+def test_what_lies_beyond_an_episodes_end_teaches_nothing(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    both = episodes(32, torch.randn(32, STEPS, 4), torch.randn(32, STEPS, 2))
+    config = GolemoConfig(epochs=1, hidden_size=4, layers=1)
+    models = []
+    for name in ("zeros", "numbers"):
+        (tmp_path / name).mkdir()
+        models.append(fit_residual(fitting(both, tmp_path / name, config))[0])
+        both.windows.next_state[0, 25:] = 100.0
+        both = replace(both)
+    for ours, theirs in zip(models[0].parameters(), models[1].parameters(), strict=True):
+        assert torch.equal(ours, theirs)
