@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -14,7 +16,7 @@ STEPS, COUNT = 11, 3
 def history_model() -> GroundingModel:
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     with torch.no_grad():
-        model.correction[-1].weight.normal_(std=0.05)
+        list(model.correction.parameters())[-2].normal_(std=0.05)
     return model
 
 
@@ -28,7 +30,9 @@ def residual_model() -> ResidualModel:
 @pytest.mark.parametrize("every", [1, 4])
 @pytest.mark.parametrize("make", [history_model, residual_model])
 @torch.no_grad()
-def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(make: type[Grounding], every: int) -> None:
+def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
+    make: Callable[[], Grounding], every: int
+) -> None:
     torch.manual_seed(0)
     grounding = make()
     goal, action = torch.randn(COUNT, 2), 2 * torch.rand(COUNT, STEPS, 2) - 1

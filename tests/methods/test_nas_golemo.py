@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -96,6 +95,5 @@ def test_what_lies_beyond_an_episodes_end_teaches_nothing(tmp_path: Path) -> Non
         (tmp_path / name).mkdir()
         models.append(fit_residual(fitting(both, tmp_path / name, config))[0])
         both.windows.next_state[0, 25:] = 100.0
-        both = replace(both)
     for ours, theirs in zip(models[0].parameters(), models[1].parameters(), strict=True):
         assert torch.equal(ours, theirs)

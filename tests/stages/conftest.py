@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
+from small_run import ALIGN, COLLECT, GOLEMO, GROUND, TASK, TRAIN, short_task
 
 from astra_data.progress import silent
 from astra_data.stages.align import align
@@ -41,6 +41,15 @@ def grounded(paired: Path) -> Path:
     out = paired.with_name("ground")
     with short_task():
         ground(TASK, "astra", GROUND, dataset=paired, seed=0, out=out, device="cpu", progress=silent)
+    return out
+
+
+@pytest.fixture(scope="session")
+def augmented(paired: Path) -> Path:
+    out = paired.with_name("ground_nas_golemo")
+    made = {"settings": GOLEMO, "dataset": paired, "seed": 0, "device": "cpu", "progress": silent}
+    with short_task():
+        ground(TASK, "nas_golemo", GROUND, **made, out=out)  # type: ignore[arg-type]
     return out
 
 

@@ -6,12 +6,14 @@ from typing import Any
 
 import pytest
 import torch
+from small_run import TRAIN
 from torch import Tensor
 
 from astra_data.checkpoint import load_tensors
 from astra_data.errors import BadInputError
 from astra_data.progress import silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.stages.train import train
 from astra_data.tasks import TASKS
 
 CONFIG = EvaluateConfig(episodes=3)
@@ -77,6 +79,18 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
         assert len(paths[name].unique(dim=0)) == CONFIG.episodes
     assert torch.equal(followed["start"], followed["target.position"][:, 0])
     assert torch.equal(paths["start"], paths["target.position"][:, 0])
+
+
+def test_a_policy_from_an_augmented_simulator_is_tested_in_both_worlds(
+    task: str, paired: Path, augmented: Path, tmp_path: Path
+) -> None:
+    made = {"dataset": paired, "grounding": augmented, "seed": 0, "device": "cpu", "progress": silent}
+    train(task, "nas_golemo", TRAIN, **made, out=tmp_path / "train")  # type: ignore[arg-type]
+    inputs = {"policy": tmp_path / "train", "grounding": augmented}
+    told, paths = make(task, "nas_golemo", tmp_path / "evaluate", inputs)
+    assert told["encoder"] == "source"
+    for world in ("target", "simulated"):
+        check_outcome(told[world], paths[f"{world}.position"])
 
 
 def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_run import GROUND
+from small_run import GOLEMO, GROUND
 
 from astra_data import fitting as stage
 from astra_data.dataset.pairs import PairedEpisodes
@@ -107,6 +107,37 @@ def test_after_an_interruption_it_goes_on(
         20,
         30,
     ]
+
+
+def test_whole_episodes_go_on_after_an_interruption(
+    task: str, paired: Path, augmented: Path, tmp_path: Path
+) -> None:
+    seen: list[float] = []
+
+    def progress(fraction: float, note: str) -> None:
+        seen.append(fraction)
+        if len(seen) == 9:  # of six episodes an epoch
+            raise Stopped
+
+    out = tmp_path / "ground"
+    inputs = {"settings": GOLEMO, "dataset": paired, "seed": 0, "device": "cpu", "progress": progress}
+    with pytest.raises(Stopped):
+        ground(task, "nas_golemo", GROUND, **inputs, out=out)  # type: ignore[arg-type]
+    ground(task, "nas_golemo", GROUND, **inputs, out=out)  # type: ignore[arg-type]
+    assert seen[9] == pytest.approx(7 / 18)
+    assert {file.name for file in out.iterdir()} == {
+        "config.json",
+        "gap.json",
+        "grounding.safetensors",
+        "metrics.json",
+    }
+    for name in ("grounding.safetensors", "gap.json", "config.json"):
+        assert (out / name).read_bytes() == (augmented / name).read_bytes()
+    assert json.loads((out / "config.json").read_text()) == GOLEMO.model_dump()
+    epochs = [json.loads((folder / "metrics.json").read_text())["epochs"] for folder in (out, augmented)]
+    assert epochs[0] == epochs[1]
+    with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
+        load_history_model(out / "grounding.safetensors")
 
 
 def test_methods_without_a_grounding_and_raw_datasets_are_refused(
