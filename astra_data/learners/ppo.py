@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's GAE.
+"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
 
 One iteration collects a stretch of steps from every environment and makes a few passes over it. Whole
 stretches are kept together, so the same code trains policies with and without memory. Every iteration
@@ -11,7 +11,11 @@ import time
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from astra_data.batched import BatchedEnv
@@ -75,6 +79,7 @@ class Ppo:
         self.world_seconds = 0.0
         self._iteration = 0
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
+        self._loss = _ppo_loss(policy, config)
         torch.manual_seed(derive(seed, "first reset"))
         self._observation = env.reset()
         device = self._observation.device
@@ -166,11 +171,7 @@ class Ppo:
                 for name in ("value", following, "reward", "done", "terminated")
             ),
         )
-        rollout |= {
-            "advantage": advantage.squeeze(-1),
-            "value_target": target.squeeze(-1),
-            "hidden": first_hidden,
-        }
+        rollout |= {"advantage": advantage, "value_target": target, "hidden": first_hidden}
         return rollout, {
             "success": succeeded / finished if finished else math.nan,
             "episodes": finished,
@@ -189,7 +190,10 @@ class Ppo:
                 features = policy.remember_sequence(
                     batch["observation"], batch["previous_action"], batch["hidden"], batch["start"]
                 )
-                total = loss(policy, config, features, batch)
+                learned = ("action", "action_log_prob", "advantage", "value_target")
+                columns = {"features": features} | {name: batch[name] for name in learned}
+                losses = self._loss(TensorDict(columns, batch_size=features.shape[:2]))
+                total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
                 self._optimizer.zero_grad()
                 total.backward()
                 nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
@@ -219,21 +223,31 @@ class Ppo:
         self._observation = observation
 
 
-def loss(policy: ActorCritic, config: PpoConfig, features: Tensor, batch: dict[str, Tensor]) -> Tensor:
-    """Return the clipped loss of actor and critic (Schulman et al. 2017, equations 7 and 9).
+def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> ClipPPOLoss:
+    actor = ProbabilisticActor(
+        TensorDictModule(_Policy(policy), in_keys=["features"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"tanh_loc": False},
+    )
+    critic = ValueOperator(policy.critic, in_keys=["features"])
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=config.clip,
+        entropy_coeff=config.entropy_weight,
+        critic_coeff=config.value_weight,
+        loss_critic_type="l2",
+    )
+    loss.set_keys(value_target="value_target", advantage="advantage", sample_log_prob="action_log_prob")
+    return loss
 
-    Args:
-        policy: the networks.
-        config: clip and weights.
-        features: for actor and critic, (B, T, F).
-        batch: "action" (B, T, A); its "action_log_prob", "advantage" and "value_target", (B, T).
-    """
-    mean, std = policy.policy(features)
-    normal = torch.distributions.Normal(mean, std, validate_args=False)
-    log_prob: Tensor = normal.log_prob(batch["action"]).sum(-1)
-    ratio = (log_prob - batch["action_log_prob"]).exp()
-    clipped = ratio.clamp(1.0 - config.clip, 1.0 + config.clip)
-    gain = torch.minimum(ratio * batch["advantage"], clipped * batch["advantage"]).mean()
-    wrong = (policy.value(features) - batch["value_target"]).square().mean()
-    entropy: Tensor = normal.entropy().sum(-1).mean()
-    return config.value_weight * wrong - gain - config.entropy_weight * entropy
+
+class _Policy(nn.Module):
+    def __init__(self, policy: ActorCritic) -> None:
+        super().__init__()
+        self.actor, self.log_std = policy.actor, policy.log_std
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        mean = torch.tanh(self.actor(features))
+        return mean, self.log_std.exp().expand_as(mean)

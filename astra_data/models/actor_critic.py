@@ -74,7 +74,12 @@ class ActorCritic(nn.Module):
         if self.memory is None:
             return observation
         inputs = torch.cat([observation, previous_action], dim=-1)
-        return torch.cat([observation, self.memory.pieces(inputs, hidden, start)], dim=-1)
+        keep = 1.0 - start.unsqueeze(-1)
+        states = []
+        for step in range(inputs.shape[1]):
+            hidden = self.memory.step(inputs[:, step], hidden * keep[:, step])
+            states.append(hidden)
+        return torch.cat([observation, self.memory.latent(torch.stack(states, dim=1))], dim=-1)
 
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (..., A) of the action for `features` (..., F)."""

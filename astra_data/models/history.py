@@ -6,8 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from astra_data.models.gru import gru
-
 
 def mlp(sizes: tuple[int, ...]) -> nn.Sequential:
     """Build linear layers of `sizes` with ELU between them."""
@@ -60,17 +58,6 @@ class HistoryEncoder(nn.Module):
         start = None if hidden is None else hidden.unsqueeze(0)
         states, _ = self.recurrence(functional.elu(self.embedding(inputs)), start)
         return self.latent(states), states
-
-    def pieces(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
-        """Encode `inputs` (B, T, I) that begin anew where `start` (B, T) is 1; return latents (B, T, Z).
-
-        `hidden` (B, Z) is from before the first step.
-        """
-        ((to_gates, from_hidden, bias, hidden_bias),) = self.recurrence.all_weights
-        # Step by step in memory: the loop over them then works on contiguous pieces.
-        embedded = functional.elu(self.embedding(inputs.transpose(0, 1).contiguous()))
-        gates = functional.linear(embedded, to_gates, bias)
-        return self.latent(gru(gates, hidden, start.T, from_hidden, hidden_bias)).transpose(0, 1)
 
     def step(self, inputs: Tensor, hidden: Tensor) -> Tensor:
         """Take in one step `inputs` (B, I); return the next hidden state (B, Z)."""

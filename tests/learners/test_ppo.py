@@ -4,15 +4,11 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
 from toy_worlds import ConstantReward, GoToZero, Recall
 
 from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, unflatten
-from astra_data.learners.ppo import Ppo, PpoConfig, loss
+from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 
 
@@ -115,35 +111,3 @@ def test_without_finished_episodes_success_is_unknown() -> None:
 
 def test_fewer_environments_than_minibatches_are_enough() -> None:
     train(ppo(GoToZero(2), 2, horizon=5, minibatches=4))
-
-
-def test_the_loss_is_torchrls() -> None:
-    torch.manual_seed(0)
-    policy = ActorCritic(ActorCriticShape(observation_size=3, action_size=2, hidden_sizes=(8,)))
-    config = PpoConfig(clip=0.1, entropy_weight=0.3, value_weight=0.7)
-    seen = {
-        "features": torch.randn(4, 5, 3),
-        "action": torch.randn(4, 5, 2),
-        "action_log_prob": torch.randn(4, 5) - 3.0,
-        "advantage": torch.randn(4, 5),
-        "value_target": torch.randn(4, 5),
-    }
-    actor = ProbabilisticActor(
-        TensorDictModule(policy.policy, in_keys=["features"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-        distribution_kwargs={"tanh_loc": False},
-    )
-    other = ClipPPOLoss(
-        actor,
-        ValueOperator(policy.critic, in_keys=["features"]),
-        clip_epsilon=config.clip,
-        entropy_coeff=config.entropy_weight,
-        critic_coeff=config.value_weight,
-        loss_critic_type="l2",
-    )
-    other.set_keys(sample_log_prob="action_log_prob")
-    columns = seen | {name: seen[name].unsqueeze(-1) for name in ("advantage", "value_target")}
-    parts = other(TensorDict(columns, batch_size=(4, 5)))
-    expected = parts["loss_objective"] + parts["loss_critic"] + parts["loss_entropy"]
-    torch.testing.assert_close(loss(policy, config, seen["features"], seen), expected)
