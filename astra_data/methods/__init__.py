@@ -7,6 +7,7 @@ from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
+from astra_data.methods.rma import RMA
 from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {
@@ -14,6 +15,7 @@ METHODS: dict[str, Method] = {
     for method in (
         DIRECT_TRANSFER,
         DOMAIN_RANDOMIZATION,
+        RMA,
         NAS,
         ASTRA,
         ASTRA_WITHOUT_LATENT,
