@@ -1,7 +1,7 @@
 """Rapid motor adaptation (Kumar et al. 2021): policies that act on extrinsics.
 
-Extrinsics are what matters of the parameters of a world. The teacher is told the parameters and encodes them; the student estimates the same extrinsics from what it
-has seen and done.
+Extrinsics are what matters of a world's parameters. The teacher is told the parameters and encodes them; the
+student estimates the same extrinsics from what it has seen and done.
 """
 
 from dataclasses import dataclass, fields
