@@ -45,12 +45,12 @@ def correlation(student: Student, *, shuffled: bool) -> float:
 
 
 def test_a_student_recovers_what_its_history_shows() -> None:
-    learner = begin(64, 25)
+    learner = begin(64, 15)
     untrained = abs(correlation(learner.student, shuffled=False))
     points = []
     while not learner.done:
         points.append(learner.iterate())
-    assert correlation(learner.student, shuffled=False) > 0.95 > untrained
+    assert correlation(learner.student, shuffled=False) > 0.9 > untrained
     assert abs(correlation(learner.student, shuffled=True)) < 0.3
     assert points[0]["r2_extrinsics"] < 0.5 < points[-1]["r2_extrinsics"] <= 1.0
     assert points[-1].keys() == {"success", "episodes", "reward", "r2_extrinsics"}
