@@ -100,10 +100,10 @@ class Adaptation:
         finished = succeeded = rewarded = 0.0
         errors, true = [], []
         for _ in range(self.rollout_steps):
-            extrinsics, estimate = self._learn()
-            errors.append(estimate - extrinsics)
+            extrinsics, features = self._learn()
+            errors.append(features[:, -extrinsics.shape[1] :] - extrinsics)
             true.append(extrinsics)
-            done, success, reward = self._act(estimate)
+            done, success, reward = self._act(features)
             finished += float(done.sum())
             succeeded += float(success.sum())
             rewarded += float(reward.mean())
@@ -118,24 +118,22 @@ class Adaptation:
         }
 
     def _learn(self) -> tuple[Tensor, Tensor]:
-        """Take in the current observations and update; return true and estimated extrinsics (B, E)."""
-        size = self.student.shape.observation_size
+        """Take in the current observations and update; return true extrinsics (B, E), features (B, F)."""
+        shape = self.student.shape
         with torch.no_grad():
             extrinsics = self.teacher.extrinsics(self._observation)
-        seen = self._observation[:, :size]
+        seen = self._observation[:, : shape.observation_size]
         features, self._hidden = self.student.remember(seen, self._previous_action, self._hidden)
-        estimate = features[:, size:]
-        loss = functional.mse_loss(estimate, extrinsics)
+        loss = functional.mse_loss(features[:, -shape.extrinsics_size :], extrinsics)
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()
-        return extrinsics, estimate.detach()
+        return extrinsics, features.detach()
 
     @torch.no_grad()
-    def _act(self, estimate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _act(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Take the student's step; return what is done, what succeeded and the rewards, (B,) each."""
-        size = self.student.shape.observation_size
-        action, _ = self.student.policy(torch.cat([self._observation[:, :size], estimate], dim=-1))
+        action, _ = self.student.policy(features)
         began = time.perf_counter()
         step = self.env.step(action)
         self.world_seconds += time.perf_counter() - began

@@ -4,10 +4,11 @@ Extrinsics are what matters of a world's parameters. The teacher is told the par
 student estimates the same extrinsics from what it has seen and done.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.history import mlp
@@ -21,8 +22,7 @@ class AdaptiveShape(ActorCriticShape):
     """Sizes of teacher and student.
 
     Attributes:
-        observation_size: O, of what the student sees, too. extrinsics_size: E.
-        history_length: H, steps that the student's estimate looks back.
+        extrinsics_size: E. history_length: H, steps that the student's estimate looks back.
     """
 
     extrinsics_size: int = 8
@@ -30,12 +30,14 @@ class AdaptiveShape(ActorCriticShape):
 
     @property
     def feature_size(self) -> int:
-        """F, of what actor and critic see: an observation and extrinsics."""
-        return self.observation_size + self.extrinsics_size
+        """F, of what actor and critic see: observation, memory and extrinsics."""
+        return super().feature_size + self.extrinsics_size
 
 
 class Teacher(ActorCritic):
     """Actor and critic that are told their world's parameters: the last P values of what they observe."""
+
+    shape: AdaptiveShape
 
     def __init__(self, shape: AdaptiveShape, parameter_count: int) -> None:
         super().__init__(shape)
@@ -47,66 +49,78 @@ class Teacher(ActorCritic):
         return torch.as_tensor(self.encoder(told[..., self.shape.observation_size :]))
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the features (B, F) for `observation` (B, O + P); there is no memory."""
-        return self._features(observation), hidden
+        """Take in one step `observation` (B, O + P); return features (B, F) and the next hidden (B, M)."""
+        seen = observation[:, : self.shape.observation_size]
+        features, hidden = super().remember(seen, previous_action, hidden)
+        return torch.cat([features, self.extrinsics(observation)], dim=-1), hidden
 
     def remember_sequence(
         self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
     ) -> Tensor:
-        """Return the features (B, T, F) for `observation` (B, T, O + P)."""
-        return self._features(observation)
+        """Return the features (B, T, F) of `observation` (B, T, O + P); see `ActorCritic`."""
+        seen = observation[..., : self.shape.observation_size]
+        features = super().remember_sequence(seen, previous_action, hidden, start)
+        return torch.cat([features, self.extrinsics(observation)], dim=-1)
 
-    def _features(self, told: Tensor) -> Tensor:
-        return torch.cat([told[..., : self.shape.observation_size], self.extrinsics(told)], dim=-1)
+
+class HistoryEstimate(nn.Module):
+    """Estimate extrinsics from H rows of I values each, by the convolutions of Kumar et al. 2021."""
+
+    def __init__(self, row_size: int, length: int, extrinsics_size: int) -> None:
+        super().__init__()
+        self.length = length
+        self.embedding = nn.Linear(row_size, 32)
+        self.convolutions = nn.Sequential(
+            nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(), nn.Conv1d(32, 32, 5)
+        )
+        moments = (length - SHORTEST_HISTORY) // 4 + 1
+        self.head = nn.Linear(32 * moments, extrinsics_size)
+
+    def forward(self, history: Tensor) -> Tensor:
+        """Return extrinsics (B, E), in [-1, 1], for `history` (B, H * I), the newest row last."""
+        embedded = functional.elu(self.embedding(history.unflatten(-1, (self.length, -1))))
+        seen = functional.elu(self.convolutions(embedded.transpose(1, 2)))
+        return torch.tanh(self.head(seen.flatten(1)))
 
 
 class Student(ActorCritic):
     """Actor and critic with extrinsics that are estimated from the last H observations and actions.
 
-    The hidden state (B, H * (O + A)) holds them: in each row an observation and the action before it, the
-    newest last, zeros for what was before the start. The convolutions are those of Kumar et al. 2021.
+    The hidden state is the memory (B, M) and, after it, the history (B, H * (O + A)): in each row an
+    observation and the action before it, the newest last, zeros for what was before the start.
     """
 
     shape: AdaptiveShape
 
     def __init__(self, shape: AdaptiveShape) -> None:
         super().__init__(shape)
-        self.embedding = nn.Linear(shape.observation_size + shape.action_size, 32)
-        self.convolutions = nn.Sequential(
-            nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(), nn.Conv1d(32, 32, 5)
-        )
-        moments = (shape.history_length - SHORTEST_HISTORY) // 4 + 1
-        self.head = nn.Linear(32 * moments, shape.extrinsics_size)
+        row_size = shape.observation_size + shape.action_size
+        self.adaptation = HistoryEstimate(row_size, shape.history_length, shape.extrinsics_size)
 
     @classmethod
     def of_teacher(cls, teacher: Teacher) -> "Student":
-        """Return a student with the frozen actor and critic of `teacher`, and an untrained estimate."""
-        own = {field.name: getattr(teacher.shape, field.name) for field in fields(AdaptiveShape)}
-        student = cls(AdaptiveShape(**own)).to(teacher.log_std.device)
-        for name in ("actor", "critic"):
-            getattr(student, name).load_state_dict(getattr(teacher, name).state_dict())
-            getattr(student, name).requires_grad_(False)
-        student.log_std.data.copy_(teacher.log_std.data)
-        student.log_std.requires_grad_(False)
+        """Return a student with the teacher's frozen memory, actor and critic, and an untrained estimate."""
+        student = cls(teacher.shape).to(teacher.log_std.device)
+        shared = student.state_dict().keys() & teacher.state_dict().keys()
+        student.load_state_dict({name: teacher.state_dict()[name] for name in shared}, strict=False)
+        student.requires_grad_(False)
+        student.adaptation.requires_grad_(True)
         return student
 
-    def estimate(self, hidden: Tensor) -> Tensor:
-        """Return the extrinsics (B, E), in [-1, 1], that the last steps `hidden` tell of."""
-        rows = hidden.unflatten(-1, (self.shape.history_length, -1))
-        embedded = nn.functional.elu(self.embedding(rows)).transpose(1, 2)
-        seen = nn.functional.elu(self.convolutions(embedded)).flatten(1)
-        return torch.tanh(self.head(seen))
-
     def initial_hidden(self, count: int) -> Tensor:
-        """Return the history (count, H * (O + A)) at the start of an episode: nothing."""
-        size = self.shape.history_length * self.embedding.in_features
-        return torch.zeros(count, size, device=self.log_std.device)
+        """Return memory and history (count, M + H * (O + A)) at the start of an episode: nothing."""
+        shape = self.shape
+        history = shape.history_length * (shape.observation_size + shape.action_size)
+        return torch.zeros(count, shape.memory_size + history, device=self.log_std.device)
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one step; return the features (B, F) and the history that ends with it."""
+        """Take in one step; return the features (B, F), the estimate last, and the next hidden."""
+        memory, history = hidden.tensor_split([self.shape.memory_size], dim=-1)
+        features, memory = super().remember(observation, previous_action, memory)
         newest = torch.cat([observation, previous_action], dim=-1)
-        hidden = torch.cat([hidden[:, newest.shape[1] :], newest], dim=-1)
-        return torch.cat([observation, self.estimate(hidden)], dim=-1), hidden
+        history = torch.cat([history[:, newest.shape[1] :], newest], dim=-1)
+        features = torch.cat([features, self.adaptation(history)], dim=-1)
+        return features, torch.cat([memory, history], dim=-1)
 
     def remember_sequence(
         self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
