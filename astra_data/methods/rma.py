@@ -1,7 +1,7 @@
 """Rapid motor adaptation: infer the simulator's parameters online (Section V-A; after Kumar et al. 2021).
 
 The parameters and their ranges are those that the paper prints for COMPASS. Its "position noise (±0.03m)" is
-read as uniform noise of up to that half width, its control timestep of 0.015 to 0.025 s as a quarter more
+read as uniform noise of that half width, its control timestep of 0.015 to 0.025 s as a quarter more
 or less than the simulator's own. Kumar et al.'s policy has no memory; ours has that of every policy of a raw
 simulator, and differs from domain randomization in the parameters that vary and in the extrinsics alone.
 Without it, a million steps taught it nothing on the Long Maze, where others then begin to succeed.
@@ -65,7 +65,7 @@ RMA = Method(
             friction=(0.8, 1.2),
             action_scale=(-0.1, 0.1),
             action_noise=(0.05, 0.05),
-            position_noise_m=(0.0, 0.03),
+            position_noise_m=(0.03, 0.03),
             velocity_noise_m_s=(0.0, 0.02),
             heading_bias_deg=(-5.0, 5.0),
             timestep_scale=(0.75, 1.25),
