@@ -92,7 +92,7 @@ class Adaptation:
         Returns:
             "success" of the "episodes" that ended, NaN where none did; the mean "reward" of a step;
             "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
-            the start of episodes, when nothing has been seen.
+            the start of episodes, when nothing has been seen; NaN where nothing varies.
         """
         torch.manual_seed(derive(self.seed, f"adaptation {self._iteration}"))
         for group in self._optimizer.param_groups:
@@ -109,12 +109,13 @@ class Adaptation:
             rewarded += float(reward.mean())
         self.steps += self.env.num_envs * self.rollout_steps
         self._iteration += 1
-        variance = torch.cat(true).var(0, correction=0).sum()
+        error = float(torch.cat(errors).square().mean(0).sum())
+        variance = float(torch.cat(true).var(0, correction=0).sum())
         return {
             "success": succeeded / finished if finished else math.nan,
             "episodes": finished,
             "reward": rewarded / self.rollout_steps,
-            "r2_extrinsics": float(1.0 - torch.cat(errors).square().mean(0).sum() / variance),
+            "r2_extrinsics": 1.0 - error / variance if variance else math.nan,
         }
 
     def _learn(self) -> tuple[Tensor, Tensor]:
