@@ -18,6 +18,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from astra_data.errors import BadInputError
 from astra_data.fitting import GroundConfig
+from astra_data.learners.rma import RmaConfig
 from astra_data.methods import METHODS
 from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.recipe import Config, did_you_mean
@@ -45,7 +46,11 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """Each stage, in order, and the stages whose artefacts it reads."""
 
-METHOD_TABLES = {"domain_randomization": "train", "nas_golemo": "ground"}
+METHOD_TABLES = {
+    "domain_randomization": "train",
+    "rma": "train",
+    "nas_golemo": "ground",
+}
 """Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
 
 
@@ -71,6 +76,8 @@ class Recipe(Config):
     """What domain randomization varies; by default as the paper prints it for navigation."""
     nas_golemo: GolemoConfig = GolemoConfig()
     """How the residual model of Golemo et al. is fitted."""
+    rma: RmaConfig = RmaConfig()
+    """How the student of rapid motor adaptation learns."""
 
     @model_validator(mode="before")
     @classmethod

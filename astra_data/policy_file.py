@@ -10,6 +10,7 @@ from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.deployment import DeployedPolicy, Observed
 from astra_data.grounding_file import Grounding
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.adaptation import AdaptiveShape, Student
 from astra_data.models.grounding import GroundingModel
 from astra_data.tasks import Task
 from astra_data.training_world import WorldConfig
@@ -54,6 +55,7 @@ class PolicyFile:
         """Write the policy to `path`."""
         tensors = {f"policy.{name}": tensor for name, tensor in self.policy.state_dict().items()}
         told: dict[str, Any] = {
+            "kind": "adaptive" if isinstance(self.policy, Student) else "actor_critic",
             "shape": asdict(self.policy.shape),
             "dataset": self.dataset,
             "hash": self.content_hash,
@@ -73,7 +75,10 @@ class PolicyFile:
         """Read a policy; its parameters are frozen."""
         tensors, told = load_tensors(path)
         told["shape"]["hidden_sizes"] = tuple(told["shape"]["hidden_sizes"])
-        policy = ActorCritic(ActorCriticShape(**told["shape"]))
+        if told.get("kind") == "adaptive":
+            policy: ActorCritic = Student(AdaptiveShape(**told["shape"]))
+        else:
+            policy = ActorCritic(ActorCriticShape(**told["shape"]))
         prefix = "policy."
         policy.load_state_dict(
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

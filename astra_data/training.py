@@ -87,6 +87,35 @@ class ResumableEnv(BatchedEnv, Protocol):
         ...
 
 
+class Learner(Protocol):
+    """A training in progress, such as `Ppo`."""
+
+    steps: int
+    world_seconds: float
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps in all."""
+        ...
+
+    @property
+    def done(self) -> bool:
+        """Whether all steps are done."""
+        ...
+
+    def iterate(self) -> dict[str, float]:
+        """Take a stretch of steps and learn; return "success", NaN if unknown, and other figures."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything but the world's own state."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
+        """Go on from `state`, with the world already set back and showing `observation` (B, O)."""
+        ...
+
+
 @dataclass(frozen=True)
 class SimulatorPpo:
     """Train by PPO in the abstract simulator.
@@ -102,15 +131,8 @@ class SimulatorPpo:
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
-        config, device = training.config, training.device
-        world = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
-        world = world.model_copy(update={"reward": world.reward or self.reward})
-        settings = training.settings
-        variation = settings if isinstance(settings, Variation) else self.variation
-        parts = world_parts(training.task, world, training.episodes, training.grounding, variation)
-        env = training_world(
-            training.task, world, parts, training.grounding, num_envs=config.num_envs, device=device
-        )
+        config = training.config
+        env, simulation = self.world(training)
         torch.manual_seed(derive(training.seed, "policy"))
         policy = ActorCritic(
             ActorCriticShape(
@@ -119,46 +141,74 @@ class SimulatorPpo:
                 memory_size=0 if env.latent_size else config.memory_size,
                 hidden_sizes=config.hidden_sizes,
             )
-        ).to(device)
+        ).to(training.device)
         ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
         curve = optimise(ppo, env, config.ramp, training)
-        simulation = Simulation(parts.thinness, parts.scatter, world, parts.variation)
         episodes = training.episodes
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
+    def world(
+        self, training: Training, *, tells_parameters: bool = False
+    ) -> tuple[NavigationWorld, Simulation]:
+        """Return the world to train in, and what a policy file says of it."""
+        config, settings = training.config, training.settings
+        switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
+        switches = switches.model_copy(update={"reward": switches.reward or self.reward})
+        variation = settings if isinstance(settings, Variation) else self.variation
+        parts = world_parts(training.task, switches, training.episodes, training.grounding, variation)
+        env = training_world(
+            training.task,
+            switches,
+            parts,
+            training.grounding,
+            num_envs=config.num_envs,
+            device=training.device,
+            tells_parameters=tells_parameters,
+        )
+        return env, Simulation(parts.thinness, parts.scatter, switches, parts.variation)
 
-def optimise(ppo: Ppo, env: ResumableEnv, ramp: float, training: Training) -> dict[str, Any]:
-    """Train to the end, from the checkpoint in the folder if there is one; return the learning curve."""
+
+def optimise(
+    learner: Learner,
+    env: ResumableEnv,
+    ramp: float,
+    training: Training,
+    checkpoint_name: str = "checkpoint.safetensors",
+) -> dict[str, Any]:
+    """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
+
+    The checkpoint of the end is left in the folder, for what comes after.
+    """
     folder, device = training.folder, training.device
     points: list[dict[str, float | None]] = []
     seconds = 0.0
-    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint = folder / checkpoint_name
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
         world = {name: values.to(device) for name, values in state["world"].items()}
-        ppo.load_state_dict(state["ppo"], env.load_state_dict(world))
+        learner.load_state_dict(state["learner"], env.load_state_dict(world))
         points, seconds = told["points"], told["seconds"]
-    began, first = time.perf_counter() - seconds, ppo.steps
-    while not ppo.done:
+    began, first = time.perf_counter() - seconds, learner.steps
+    while not learner.done:
         if isinstance(env, NavigationWorld):
-            env.caution = min(1.0, ppo.steps / (ppo.config.total_steps * ramp)) if ramp else 1.0
-        metrics = ppo.iterate()
+            env.caution = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
+        metrics = learner.iterate()
         # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
-        points.append({"steps": ppo.steps, **known})
+        points.append({"steps": learner.steps, **known})
         seconds = time.perf_counter() - began
-        rate = ppo.steps / seconds
+        rate = learner.steps / seconds
         recent = [point["success"] for point in points[-10:] if point["success"] is not None]
         success = f"{fmean(recent):.2f}" if recent else "unknown yet"
         note = f"{rate:,.0f} steps/s  success of training episodes {success}"
-        training.progress(ppo.steps / ppo.config.total_steps, note)
-        if len(points) % _CHECKPOINT_EVERY == 0:
-            state = {"ppo": ppo.state_dict(), "world": env.state_dict()}
+        training.progress(learner.steps / learner.total_steps, note)
+        if len(points) % _CHECKPOINT_EVERY == 0 or learner.done:
+            state = {"learner": learner.state_dict(), "world": env.state_dict()}
             save_tensors(checkpoint, flatten(state), {"points": points, "seconds": seconds})
     return {
-        "steps_per_second": ppo.steps / max(seconds, 1e-9),
-        "simulator_steps_per_second": (ppo.steps - first) / max(ppo.world_seconds, 1e-9),
+        "steps_per_second": learner.steps / max(seconds, 1e-9),
+        "simulator_steps_per_second": (learner.steps - first) / max(learner.world_seconds, 1e-9),
         "wall_seconds": seconds,
         "points": points,
     }

@@ -120,8 +120,12 @@ def training_world(
     *,
     num_envs: int,
     device: str,
+    tells_parameters: bool = False,
 ) -> NavigationWorld:
-    """Build the world: the task in the raw, varied, scattered or grounded simulator."""
+    """Build the world: the task in the raw, varied, scattered or grounded simulator.
+
+    With `tells_parameters`, observations end with the normalised parameters of a simulator that varies.
+    """
     scatter = parts.scatter if config.residual_noise else None
     simulator = simulator_of(task, grounding, num_envs, device, variation=parts.variation, scatter=scatter)
     return NavigationWorld(
@@ -134,4 +138,5 @@ def training_world(
         thinness=config.support_penalty * parts.thinness,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,
+        tells_parameters=tells_parameters,
     )

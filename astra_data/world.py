@@ -63,6 +63,7 @@ class NavigationWorld:
 
     Attributes:
         latent_size: Z, of the latents in the observations; 0 where there are none.
+        parameter_count: P, of the parameters in the observations; 0 where they are not told.
         caution: factor on the penalties for thin data and for risk; 1 unless the training ramps it up.
     """
 
@@ -80,6 +81,7 @@ class NavigationWorld:
         thinness: Tensor | None = None,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
+        tells_parameters: bool = False,
     ) -> None:
         """Put the task into `simulator`.
 
@@ -93,6 +95,7 @@ class NavigationWorld:
             thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width).
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
+            tells_parameters: end observations with the parameters of a simulator that varies, normalised.
         """
         self.navigation = navigation
         self.simulator = simulator
@@ -110,6 +113,8 @@ class NavigationWorld:
         self.num_envs = len(simulator.state)
         self.goal = torch.zeros(self.num_envs, 2, device=self.device)
         self.toppled = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._told = varied_within(simulator) if tells_parameters else None
+        self.parameter_count = 0 if self._told is None else self._told.parameters.shape[1]
         self.observation_size = self._observe().shape[1]
         self.latent_size = 0 if self.grounded is None else self.grounded.latent.shape[1]
 
@@ -181,7 +186,10 @@ class NavigationWorld:
 
     def _observe(self) -> Tensor:
         latent = None if self.grounded is None else self.grounded.latent
-        return policy_observation(self.navigation.maze, self.simulator.state, self.goal, latent)
+        observation = policy_observation(self.navigation.maze, self.simulator.state, self.goal, latent)
+        if self._told is None:
+            return observation
+        return torch.cat([observation, self._told.variation.normal(self._told.parameters)], dim=-1)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything that a later `load_state_dict` needs to go on from here."""

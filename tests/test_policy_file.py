@@ -3,6 +3,7 @@ from pathlib import Path
 import torch
 
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.adaptation import AdaptiveShape, Student
 from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.training_world import WorldConfig
 from astra_data.variation import Variation
@@ -30,3 +31,14 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     features = torch.randn(4, 11)
     assert torch.equal(loaded.policy.policy(features)[0], policy.policy(features)[0])
     assert torch.equal(loaded.policy.value(features), policy.value(features))
+
+
+def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
+    student = Student(AdaptiveShape(3, 2, hidden_sizes=(16, 8), extrinsics_size=4, history_length=44))
+    PolicyFile(student, None, "toy@data-1.0.0", "abc").save(tmp_path / "policy.safetensors")
+    loaded = PolicyFile.load(tmp_path / "policy.safetensors").policy
+    assert isinstance(loaded, Student)
+    assert loaded.shape == student.shape
+    step = torch.randn(4, 3), torch.randn(4, 2), torch.randn_like(student.initial_hidden(4))
+    for one, other in zip(loaded.remember(*step), student.remember(*step), strict=True):
+        assert torch.equal(one, other)

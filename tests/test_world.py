@@ -6,6 +6,8 @@ from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.navigation import Navigation
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
+from astra_data.sims.varied_point_mass import VariedPointMass
+from astra_data.variation import Variation
 from astra_data.world import DataStarts, NavigationWorld, limit_command, policy_observation
 
 TASK = Navigation(U_MAZE, horizon=700)
@@ -122,3 +124,20 @@ def test_caution_scales_the_penalties() -> None:
         rewards.append(float(one.step(torch.tensor([[1.0, 0.0]])).reward))
     assert one.simulator.state[0].tolist() == pytest.approx([-3.975, 4.0, 0.5, 0.0], abs=1e-5)
     assert [rewards[0] - reward for reward in rewards] == pytest.approx([0.0, 0.25, 1.0], abs=1e-5)
+
+
+def test_parameters_of_the_episode_are_told_where_asked_for() -> None:
+    variation = Variation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    simulator = VariedPointMass(U_MAZE, 4, variation, timestep_s=0.05)
+    assert NavigationWorld(TASK, simulator).observation_size == 8
+    telling = NavigationWorld(TASK, simulator, tells_parameters=True)
+    assert (telling.observation_size, telling.parameter_count) == (8 + 7, 7)
+    before = telling.reset()
+    torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
+    torch.testing.assert_close(before[:, 13], simulator.parameters[:, 5] / 5.0)
+    assert not before[:, [9, 10, 11, 12, 14]].any()  # these do not vary
+    assert torch.equal(telling.step(torch.ones(4, 2)).observation[:, 8:], before[:, 8:])
+    after = telling.reset(torch.tensor([True, False, False, False]))
+    assert (after[0, [8, 13]] != before[0, [8, 13]]).all()
+    assert torch.equal(after[1:, 8:], before[1:, 8:])
+    assert torch.equal(telling.load_state_dict(telling.state_dict()), after)

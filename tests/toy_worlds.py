@@ -89,3 +89,20 @@ class Recall(_World):
         reward = action[:, 0].clamp(-1.0, 1.0) * sign * (age == 2)
         self.state = torch.stack([sign, age + 1], dim=1)
         return self.outcome(reward, age == 2)
+
+
+class Slope(_World):
+    """A ramp rises by a hidden slope each step; the last value of an observation tells the slope.
+
+    Actions do nothing. Height and slope have zero mean, so that one height alone tells little.
+    """
+
+    observation_size = 2
+
+    def draw(self) -> Tensor:
+        height, slope = torch.randn(self.num_envs), torch.rand(self.num_envs) * 2 - 1
+        return torch.stack([height, slope], dim=1)
+
+    def step(self, action: Tensor) -> Step:
+        self.state = torch.stack([self.state[:, 0] + 0.02 * self.state[:, 1], self.state[:, 1]], dim=1)
+        return self.outcome(torch.zeros(self.num_envs), torch.zeros(self.num_envs, dtype=torch.bool))

@@ -90,9 +90,14 @@ class Ppo:
         self._age = torch.randint(horizon, (env.num_envs,), device=device)
 
     @property
+    def total_steps(self) -> int:
+        """Environment steps in all."""
+        return self.config.total_steps
+
+    @property
     def done(self) -> bool:
         """Whether all steps are done."""
-        return self.steps >= self.config.total_steps
+        return self.steps >= self.total_steps
 
     def iterate(self) -> dict[str, float]:
         """Collect one stretch and learn from it.
@@ -102,7 +107,7 @@ class Ppo:
             mean "reward" of a step; the mean "std" of the actions.
         """
         torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
-        share_left = 1.0 - self.steps / self.config.total_steps
+        share_left = 1.0 - self.steps / self.total_steps
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * share_left
         rollout, metrics = self._collect()

@@ -8,6 +8,7 @@ from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
+from astra_data.methods.rma import RMA
 from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {
@@ -15,6 +16,7 @@ METHODS: dict[str, Method] = {
     for method in (
         DIRECT_TRANSFER,
         DOMAIN_RANDOMIZATION,
+        RMA,
         NAS,
         NAS_GOLEMO,
         ASTRA,

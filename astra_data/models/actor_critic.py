@@ -24,6 +24,11 @@ class ActorCriticShape:
     hidden_sizes: tuple[int, ...] = (64, 64)
     initial_log_std: float = -0.5
 
+    @property
+    def feature_size(self) -> int:
+        """F, of what actor and critic see."""
+        return self.observation_size + self.memory_size
+
 
 class ActorCritic(nn.Module):
     """Tanh-bounded Gaussian mean with a state-independent deviation, and a value.
@@ -34,7 +39,6 @@ class ActorCritic(nn.Module):
     def __init__(self, shape: ActorCriticShape) -> None:
         super().__init__()
         self.shape = shape
-        features = shape.observation_size
         self.memory: HistoryEncoder | None = None
         if shape.memory_size:
             self.memory = HistoryEncoder(
@@ -42,9 +46,8 @@ class ActorCritic(nn.Module):
                 embedding_size=shape.embedding_size,
                 latent_size=shape.memory_size,
             )
-            features += shape.memory_size
-        self.actor = mlp((features, *shape.hidden_sizes, shape.action_size))
-        self.critic = mlp((features, *shape.hidden_sizes, 1))
+        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, shape.action_size))
+        self.critic = mlp((shape.feature_size, *shape.hidden_sizes, 1))
         self.log_std = nn.Parameter(torch.full((shape.action_size,), shape.initial_log_std))
         for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
             layers = [layer for layer in network if isinstance(layer, nn.Linear)]

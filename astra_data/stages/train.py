@@ -77,4 +77,5 @@ def train(
         policy.save(folder / "policy.safetensors")
         (folder / "curve.json").write_text(json.dumps(made | curve, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
-        (folder / "checkpoint.safetensors").unlink(missing_ok=True)
+        for checkpoint in folder.glob("*checkpoint.safetensors"):
+            checkpoint.unlink()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from astra_data.checkpoint import load_tensors
 from astra_data.errors import BadInputError
+from astra_data.learners.rma import RmaConfig
 from astra_data.progress import silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.train import train
@@ -116,6 +117,18 @@ def test_an_episode_ends_with_its_success(
         assert (told[world]["success"], told[world]["steps"]) == ([1.0] * 3, [1.0] * 3)
     assert told["encoders"] == {"source": {"success": 1.0}}
     assert min(told["target"]["return"]) > 9.0  # the bonus, and a step's progress
+
+
+def test_a_student_is_tested_in_the_target_and_in_its_varied_simulator(
+    task: str, paired: Path, tmp_path: Path
+) -> None:
+    settings = RmaConfig(history_length=40, adaptation_steps=64)
+    policy = tmp_path / "policy"
+    inputs = {"dataset": paired, "grounding": None, "settings": settings}
+    train(task, "rma", TRAIN, **inputs, seed=0, out=policy, device="cpu", progress=silent)  # type: ignore[arg-type]
+    told, paths = make(task, "rma", tmp_path / "out", {"policy": policy})
+    for world in ("target", "simulated"):
+        check_outcome(told[world], paths[f"{world}.position"])
 
 
 def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> None:

@@ -7,10 +7,13 @@ from small_run import TRAIN
 
 from astra_data import training as stage
 from astra_data.errors import BadInputError
+from astra_data.learners.rma import RmaConfig
+from astra_data.methods import METHODS
+from astra_data.models.adaptation import Student
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress, silent
 from astra_data.stages.train import train
-from astra_data.training import TrainConfig
+from astra_data.training import SimulatorPpo, TrainConfig
 
 SWITCHES = {
     "topple": True,
@@ -18,6 +21,8 @@ SWITCHES = {
     "support_penalty": 0.1,
     "data_start_share": 0.5,
 }
+RMA = RmaConfig(history_length=40, adaptation_steps=64 * 4)
+"""Four iterations after the six of `TRAIN`."""
 
 
 def make(
@@ -29,7 +34,7 @@ def make(
     config: TrainConfig = TRAIN,
     progress: Progress = silent,
 ) -> bytes:
-    inputs = {"dataset": dataset, "grounding": grounding}
+    inputs = {"dataset": dataset, "grounding": grounding, "settings": RMA if method == "rma" else None}
     train(task, method, config, **inputs, seed=0, out=out, device="cpu", progress=progress)  # type: ignore[arg-type]
     return (out / "policy.safetensors").read_bytes()
 
@@ -114,6 +119,47 @@ def test_after_an_interruption_it_goes_on(
     world = policy.simulation.world.model_dump()
     assert world == world | SWITCHES
     assert torch.linalg.matrix_rank(policy.simulation.scatter) == 4
+
+
+def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Path, tmp_path: Path) -> None:
+    make(task, "rma", paired, None, tmp_path / "train")
+    assert {file.name for file in (tmp_path / "train").iterdir()} == {
+        "config.json",
+        "curve.json",
+        "policy.safetensors",
+    }
+    curve = json.loads((tmp_path / "train" / "curve.json").read_text())
+    assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
+    adaptation = curve["adaptation"]["points"]
+    assert [point["steps"] for point in adaptation] == [64 * (index + 1) for index in range(4)]
+    assert adaptation[0].keys() == {"steps", "success", "episodes", "reward", "r2_extrinsics"}
+    file = PolicyFile.load(tmp_path / "train" / "policy.safetensors")
+    assert isinstance(file.policy, Student)
+    assert file.policy.shape.observation_size == 8  # position, velocity, goal, relative goal
+    assert file.policy.shape.history_length == 40
+    learn = METHODS["rma"].learn
+    assert isinstance(learn, SimulatorPpo) and learn.variation is not None
+    assert file.simulation is not None and file.simulation.variation == learn.variation
+
+
+@pytest.mark.parametrize("share", [0.45, 0.85], ids=["teacher", "student"])
+def test_rma_goes_on_after_an_interruption_in_either_phase(
+    share: float, task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 2)
+    expected = make(task, "rma", paired, None, tmp_path / "whole")
+
+    def stop_at_share(fraction: float, note: str) -> None:
+        if fraction > share:
+            raise Stopped
+
+    out = tmp_path / "interrupted"
+    with pytest.raises(Stopped):
+        make(task, "rma", paired, None, out, progress=stop_at_share)
+    seen: list[float] = []
+    resumed = make(task, "rma", paired, None, out, progress=lambda done, note: seen.append(done))
+    assert seen == pytest.approx([tenth / 10 for tenth in range(5 if share < 0.6 else 9, 11)])
+    assert resumed == expected
 
 
 def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: Path) -> None:
