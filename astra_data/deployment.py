@@ -49,17 +49,26 @@ class DeployedPolicy:
         latent_size = self.model.shape.latent_size if self.model is not None else 0
         self._encoder_hidden = torch.zeros(count, latent_size)
 
-    @torch.no_grad()
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
         abstract = self.task.abstraction(state)
-        latent = None
-        if self.model is not None:
-            encoder: TargetEncoder | GroundingModel = self.target_encoder or self.model
-            seen = state if self.target_encoder is not None else abstract
-            inputs = encoder.encoder_input(seen, goal, self._previous_action)
-            self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
-            latent = encoder.encoder.latent(self._encoder_hidden)
+        if self.target_encoder is None:
+            return self.act_in_simulator(abstract, goal)
+        return self._act(abstract, goal, self._latent(self.target_encoder, state, goal))
+
+    def act_in_simulator(self, abstract: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for abstract states (B, X) and goals (B, G); latents come from ψ^s."""
+        latent = None if self.model is None else self._latent(self.model, abstract, goal)
+        return self._act(abstract, goal, latent)
+
+    @torch.no_grad()
+    def _latent(self, encoder: TargetEncoder | GroundingModel, seen: Tensor, goal: Tensor) -> Tensor:
+        inputs = encoder.encoder_input(seen, goal, self._previous_action)
+        self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
+        return encoder.encoder.latent(self._encoder_hidden)
+
+    @torch.no_grad()
+    def _act(self, abstract: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
         observation = policy_observation(self.task.maze, abstract, goal, latent)
         features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
         output, std = self.policy.policy(features)

@@ -4,7 +4,6 @@ That way is PPO in the abstract simulator, raw, varied, or as the method's groun
 """
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 from astra_data.training_world import WorldConfig, training_world, world_parts
 from astra_data.variation import Variation
@@ -131,15 +131,15 @@ def optimise(ppo: Ppo, env: ResumableEnv, ramp: float, training: Training) -> di
     """Train to the end, from the checkpoint in the folder if there is one; return the learning curve."""
     folder, device = training.folder, training.device
     points: list[dict[str, float | None]] = []
-    seconds = 0.0
+    spent: dict[str, float] | None = None
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
         world = {name: values.to(device) for name, values in state["world"].items()}
         ppo.load_state_dict(state["ppo"], env.load_state_dict(world))
-        points, seconds = told["points"], told["seconds"]
-    began, first = time.perf_counter() - seconds, ppo.steps
+        points, spent = told["points"], told["spent"]
+    stopwatch, first = Stopwatch(spent), ppo.steps
     while not ppo.done:
         if isinstance(env, NavigationWorld):
             env.caution = min(1.0, ppo.steps / (ppo.config.total_steps * ramp)) if ramp else 1.0
@@ -147,18 +147,17 @@ def optimise(ppo: Ppo, env: ResumableEnv, ramp: float, training: Training) -> di
         # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
         points.append({"steps": ppo.steps, **known})
-        seconds = time.perf_counter() - began
-        rate = ppo.steps / seconds
+        rate = ppo.steps / stopwatch.seconds
         recent = [point["success"] for point in points[-10:] if point["success"] is not None]
         success = f"{fmean(recent):.2f}" if recent else "unknown yet"
         note = f"{rate:,.0f} steps/s  success of training episodes {success}"
         training.progress(ppo.steps / ppo.config.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0:
             state = {"ppo": ppo.state_dict(), "world": env.state_dict()}
-            save_tensors(checkpoint, flatten(state), {"points": points, "seconds": seconds})
+            save_tensors(checkpoint, flatten(state), {"points": points, "spent": stopwatch.spent()})
     return {
-        "steps_per_second": ppo.steps / max(seconds, 1e-9),
+        "steps_per_second": ppo.steps / stopwatch.seconds,
         "simulator_steps_per_second": (ppo.steps - first) / max(ppo.world_seconds, 1e-9),
-        "wall_seconds": seconds,
+        **stopwatch.spent(),
         "points": points,
     }
