@@ -52,24 +52,27 @@ class DeployedPolicy:
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
         abstract = self.task.abstraction(state)
-        if self.target_encoder is None:
-            return self.act_in_simulator(abstract, goal)
-        return self._act(abstract, goal, self._latent(self.target_encoder, state, goal))
+        seen = abstract if self.target_encoder is None else state
+        latent = self._latent(self.target_encoder or self.model, seen, goal)
+        return self._act(policy_observation(self.task.maze, abstract, goal, latent))
 
     def act_in_simulator(self, abstract: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for abstract states (B, X) and goals (B, G); latents come from ψ^s."""
-        latent = None if self.model is None else self._latent(self.model, abstract, goal)
-        return self._act(abstract, goal, latent)
+        latent = self._latent(self.model, abstract, goal)
+        return self._act(policy_observation(self.task.maze, abstract, goal, latent))
 
     @torch.no_grad()
-    def _latent(self, encoder: TargetEncoder | GroundingModel, seen: Tensor, goal: Tensor) -> Tensor:
+    def _latent(
+        self, encoder: TargetEncoder | GroundingModel | None, seen: Tensor, goal: Tensor
+    ) -> Tensor | None:
+        if encoder is None:
+            return None
         inputs = encoder.encoder_input(seen, goal, self._previous_action)
         self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
         return encoder.encoder.latent(self._encoder_hidden)
 
     @torch.no_grad()
-    def _act(self, abstract: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
-        observation = policy_observation(self.task.maze, abstract, goal, latent)
+    def _act(self, observation: Tensor) -> Tensor:
         features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
         output, std = self.policy.policy(features)
         if self._generator is not None:

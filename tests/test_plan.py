@@ -41,7 +41,6 @@ def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(
     assert items["evaluate/follower/seed_7"].inputs == ("ground/nas/seed_7",)
     assert items["evaluate/nas_plus/seed_7"].inputs == ("train/nas_plus/seed_7", "ground/nas/seed_7")
     assert items["evaluate/astra/seed_7"].inputs[-1] == "ground/nas/seed_7"
-    assert items["evaluate/astra/seed_7"].call.keywords["reference"] == tmp_path / "ground/nas/seed_7"
 
 
 def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
