@@ -3,15 +3,15 @@
 The house, from the ground up; a file uses only what is below it or beside it, never what is above:
 
 words       errors  extras  columns  layouts  seeding  recipe  rows  batched  simulator  progress  statistics
-            digest  lock  cores
+            digest  lock  cores  stopwatch
 knowledge   geometry  mazes  free_space  navigation  ant  physics  abstraction  checkpoint  models/
             recording  import_mapping  conversion  variation
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
 exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
 learning    tasks  simulators  world  target_world  training_world  policy_file  deployment  behaviors
-            suboptimal  gap  mismatch  gymnasium_faces  pairing  relocation  fitting  training  method
-            learners/
+            suboptimal  gap  mismatch  outcome  gymnasium_faces  pairing  relocation  fitting  training
+            method  learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
 roof        plan  schedule  display  inspection_page  run  commands/  cli

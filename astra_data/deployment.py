@@ -49,18 +49,30 @@ class DeployedPolicy:
         latent_size = self.model.shape.latent_size if self.model is not None else 0
         self._encoder_hidden = torch.zeros(count, latent_size)
 
-    @torch.no_grad()
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
         abstract = self.task.abstraction(state)
-        latent = None
-        if self.model is not None:
-            encoder: TargetEncoder | GroundingModel = self.target_encoder or self.model
-            seen = state if self.target_encoder is not None else abstract
-            inputs = encoder.encoder_input(seen, goal, self._previous_action)
-            self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
-            latent = encoder.encoder.latent(self._encoder_hidden)
-        observation = policy_observation(self.task.maze, abstract, goal, latent)
+        seen = abstract if self.target_encoder is None else state
+        latent = self._latent(self.target_encoder or self.model, seen, goal)
+        return self._act(policy_observation(self.task.maze, abstract, goal, latent))
+
+    def act_in_simulator(self, abstract: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for abstract states (B, X) and goals (B, G); latents come from ψ^s."""
+        latent = self._latent(self.model, abstract, goal)
+        return self._act(policy_observation(self.task.maze, abstract, goal, latent))
+
+    @torch.no_grad()
+    def _latent(
+        self, encoder: TargetEncoder | GroundingModel | None, seen: Tensor, goal: Tensor
+    ) -> Tensor | None:
+        if encoder is None:
+            return None
+        inputs = encoder.encoder_input(seen, goal, self._previous_action)
+        self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
+        return encoder.encoder.latent(self._encoder_hidden)
+
+    @torch.no_grad()
+    def _act(self, observation: Tensor) -> Tensor:
         features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
         output, std = self.policy.policy(features)
         if self._generator is not None:

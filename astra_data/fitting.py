@@ -1,6 +1,5 @@
 """Fit: what a method is given to learn about its simulator from pairs, and the way of the history models."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeig
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive, Share
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 
 _CHECKPOINT_EVERY = 250
@@ -116,7 +116,7 @@ def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
     optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
     epochs: list[dict[str, float | None]] = []
-    seconds, first = 0.0, 0
+    spent, first = None, 0
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
@@ -124,8 +124,8 @@ def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         schedule.load_state_dict(told["schedule"])
-        epochs, seconds, first = told["epochs"], told["seconds"], told["update"]
-    began = time.perf_counter() - seconds
+        epochs, spent, first = told["epochs"], told["spent"], told["update"]
+    stopwatch = Stopwatch(spent)
     for update in range(first, config.updates):
         torch.manual_seed(derive(fitting.seed, f"grounding update {update}"))
         windows, _ = fitting.training.draw_windows(config.batch_windows, config.window)
@@ -137,28 +137,27 @@ def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
         schedule.step()
         model.update_target(config.ema_rate)
         done = update + 1
-        seconds = time.perf_counter() - began
         if done % _CHECKPOINT_EVERY == 0 or done == config.updates:
             losses = {f"loss_{name}": float(value.detach()) for name, value in parts.items()}
             epochs.append({"step": done, **losses, **telemetry(model, fitting.held_out, weights)})
             state = {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
             told = {
                 "update": done,
-                "seconds": seconds,
+                "spent": stopwatch.spent(),
                 "epochs": epochs,
                 "schedule": {k: v for k, v in schedule.state_dict().items() if not k.startswith("_get")},
             }
             save_tensors(checkpoint, flatten(state), told)
         if done % 10 == 0:
-            rate = done * config.batch_windows / seconds
+            rate = done * config.batch_windows / stopwatch.seconds
             note = f"{rate:,.0f} windows/s"
             explained = epochs[-1]["r2_state"] if epochs else None
             if explained is not None:
                 note += f"  held-out R² of the correction {explained:.3f}"
             fitting.progress(done / config.updates, note)
     return {
-        "windows_per_second": config.updates * config.batch_windows / seconds,
-        "wall_seconds": seconds,
+        "windows_per_second": config.updates * config.batch_windows / stopwatch.seconds,
+        **stopwatch.spent(),
         "parameters": sum(parameter.numel() for parameter in parameters),
         "epochs": epochs,
     }

@@ -22,7 +22,7 @@ from astra_data.learners.rma import RmaConfig
 from astra_data.methods import METHODS
 from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.recipe import Config, did_you_mean
-from astra_data.rows import PLUS, base_method, is_plus
+from astra_data.rows import PLUS, base_method, is_plus, reference_of
 from astra_data.schedule import Item
 from astra_data.stages.align import AlignConfig, align
 from astra_data.stages.collect import CollectConfig, collect
@@ -254,7 +254,7 @@ def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> I
 def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
     key, base = f"evaluate/{row}/seed_{seed}", base_method(row)
     policy = f"train/{row}/seed_{seed}" if METHODS[base].trains else None
-    grounding = _grounding(row, seed)
+    grounding, reference = _grounding(row, seed), _grounding(reference_of(recipe.methods) or row, seed)
     target_encoder = f"align/{_grounded_as(base)}/seed_{seed}" if METHODS[base].aligns else None
     call = partial(
         evaluate,
@@ -264,10 +264,11 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
         policy=folder / policy if policy else None,
         grounding=folder / grounding if grounding else None,
         target_encoder=folder / target_encoder if target_encoder else None,
+        reference=folder / reference if reference else None,
         seed=seed,
         out=folder / key,
     )
-    return Item(key, _existing(policy, grounding, target_encoder), call)
+    return Item(key, _existing(policy, grounding, target_encoder, reference), call)
 
 
 def _report(recipe: Recipe, path: Path, folder: Path, seeds: tuple[int, ...], publish: bool) -> Item:
@@ -301,4 +302,4 @@ def _settings(recipe: Recipe, base: str, stage: str) -> Config | None:
 
 
 def _existing(*keys: str | None) -> tuple[str, ...]:
-    return tuple(key for key in keys if key is not None)
+    return tuple(dict.fromkeys(key for key in keys if key is not None))

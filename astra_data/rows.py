@@ -1,5 +1,7 @@
 """Rows of the results: a method by its name, or followed by `_plus`, trained with the `[plus]` settings."""
 
+from collections.abc import Iterable
+
 PLUS = "_plus"
 
 
@@ -11,3 +13,11 @@ def is_plus(row: str) -> bool:
 def base_method(row: str) -> str:
     """Return the name of a row's method: `astra` of "astra" and of "astra_plus"."""
     return row.removesuffix(PLUS)
+
+
+def reference_of(rows: Iterable[str]) -> str | None:
+    """Return the method in whose grounded simulator all `rows` are tested: NAS, the plainest, if among them.
+
+    Otherwise they have none in common, and each is tested in its own.
+    """
+    return "nas" if "nas" in map(base_method, rows) else None

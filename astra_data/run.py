@@ -85,7 +85,9 @@ def run_stage(
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device, publish=publish)
     items = _selected(recipe, planned, stage, method)
-    reads = [key for item in items if not _finished(item, folder) for key in item.inputs]
+    # The report takes the seeds that are there, and says itself which rows have none.
+    to_make = [item for item in items if stage != "report" and not _finished(item, folder)]
+    reads = [key for item in to_make for key in item.inputs]
     missing = next((key for key in reads if not (folder / key).is_dir()), None)
     if missing:
         option = "" if root == RUNS else f" --root {root}"

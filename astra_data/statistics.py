@@ -1,4 +1,4 @@
-"""How a few seeds are summarised: mean and spread, interquartile mean, intervals, who beats whom.
+"""How a few seeds are summarised: mean and spread, interquartile mean, intervals, comparisons, correlations.
 
 Follows "Deep reinforcement learning at the edge of the statistical precipice" (Agarwal et al., 2021) by means
 of its own library, rliable. One score per seed and task; resampling is over seeds, within each task.
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from rliable import library, metrics  # type: ignore[import-untyped]
+from scipy.stats import rankdata
 
 from astra_data.errors import BadInputError
 
@@ -57,6 +58,19 @@ class Comparison:
     high: float | None
 
 
+@dataclass(frozen=True)
+class Correlation:
+    """A coefficient of correlation.
+
+    Attributes:
+        value: in [-1, 1]. low: lower end of its 95 % interval. high: upper end.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
 def summarise(scores: Floats, *, replicates: int = REPLICATES) -> Summary:
     """Summarise the `scores` (seeds,) or (seeds, tasks) of one row.
 
@@ -85,6 +99,29 @@ def probability_of_improvement(scores: Floats, others: Floats, *, replicates: in
         return Comparison(probability, None, None)
     low, high = _interval((matrix, other_matrix), metrics.probability_of_improvement, replicates)
     return Comparison(probability, low, high)
+
+
+def correlation(
+    first: Floats, second: Floats, *, ranks: bool = False, replicates: int = REPLICATES
+) -> Correlation | None:
+    """Correlate `first` (N,) with `second` (N,): Pearson's coefficient, or of `ranks`, Spearman's.
+
+    The interval resamples the N pairs. None where there are fewer than three, or one side does not vary.
+    """
+    if len(first) < 3 or not np.ptp(first) or not np.ptp(second):
+        return None
+    draws = np.random.default_rng(0).integers(len(first), size=(replicates, len(first)))
+    every = np.concatenate([np.arange(len(first))[None], draws])
+    pairs = [values[every] for values in (first, second)]
+    if ranks:
+        pairs = [rankdata(values, axis=1) for values in pairs]
+    one, other = (values - values.mean(axis=1, keepdims=True) for values in pairs)
+    scale = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
+    # A resample in which one side does not vary has no correlation.
+    scale[np.any([np.ptp(values, axis=1) == 0 for values in pairs], axis=0)] = np.nan
+    value, *resampled = (one * other).sum(axis=1) / scale
+    low, high = np.nanquantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Correlation(float(value), float(low), float(high))
 
 
 def _matrix(scores: Floats) -> Floats:

@@ -4,7 +4,6 @@ That way is PPO in the abstract simulator, raw, varied, or as the method's groun
 """
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 from astra_data.training_world import WorldConfig, training_world, world_parts
 from astra_data.variation import Variation
@@ -181,15 +181,15 @@ def optimise(
     """
     folder, device = training.folder, training.device
     points: list[dict[str, float | None]] = []
-    seconds = 0.0
+    spent: dict[str, float] | None = None
     checkpoint = folder / checkpoint_name
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
         world = {name: values.to(device) for name, values in state["world"].items()}
         learner.load_state_dict(state["learner"], env.load_state_dict(world))
-        points, seconds = told["points"], told["seconds"]
-    began, first = time.perf_counter() - seconds, learner.steps
+        points, spent = told["points"], told["spent"]
+    stopwatch, first = Stopwatch(spent), learner.steps
     while not learner.done:
         if isinstance(env, NavigationWorld):
             env.caution = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
@@ -197,18 +197,17 @@ def optimise(
         # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
         points.append({"steps": learner.steps, **known})
-        seconds = time.perf_counter() - began
-        rate = learner.steps / seconds
+        rate = learner.steps / stopwatch.seconds
         recent = [point["success"] for point in points[-10:] if point["success"] is not None]
         success = f"{fmean(recent):.2f}" if recent else "unknown yet"
         note = f"{rate:,.0f} steps/s  success of training episodes {success}"
         training.progress(learner.steps / learner.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0 or learner.done:
             state = {"learner": learner.state_dict(), "world": env.state_dict()}
-            save_tensors(checkpoint, flatten(state), {"points": points, "seconds": seconds})
+            save_tensors(checkpoint, flatten(state), {"points": points, "spent": stopwatch.spent()})
     return {
-        "steps_per_second": learner.steps / max(seconds, 1e-9),
+        "steps_per_second": learner.steps / stopwatch.seconds,
         "simulator_steps_per_second": (learner.steps - first) / max(learner.world_seconds, 1e-9),
-        "wall_seconds": seconds,
+        **stopwatch.spent(),
         "points": points,
     }

@@ -126,12 +126,14 @@ def evaluate(
     policy: Path | None,
     grounding: Path | None,
     target_encoder: Path | None,
+    reference: Path | None,
     seed: int,
     out: Path,
     progress: Progress,
     num_threads: int,
 ) -> None:
     asked = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
+    asked["reference"] = reference
     _write(config, out, progress, task=task, method=method, seed=seed, num_threads=num_threads, **asked)
 
 

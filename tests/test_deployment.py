@@ -14,28 +14,34 @@ STATE, GOAL = torch.randn(3, 6, 29), torch.randn(3, 2)
 GOALS = GOAL[:, None].expand(3, 6, 2)
 
 
-def run(deployed: DeployedPolicy) -> Tensor:
-    """Return the actions (B, T, A) for the states above."""
+def run(deployed: DeployedPolicy, *, in_simulator: bool = False) -> Tensor:
+    """Return the actions (B, T, A) for the states above, or for φ of them."""
     deployed.start(3)
-    return torch.stack([deployed.act(STATE[:, step], GOAL) for step in range(6)], dim=1)
+    act = deployed.act_in_simulator if in_simulator else deployed.act
+    states = TASK.abstraction(STATE) if in_simulator else STATE
+    return torch.stack([act(states[:, step], GOAL) for step in range(6)], dim=1)
 
 
 def previous(actions: Tensor) -> Tensor:
     return torch.cat([torch.zeros(3, 1, 2), actions[:, :-1]], dim=1)
 
 
-@pytest.mark.parametrize("aligned", [False, True])
+@pytest.mark.parametrize(
+    ("aligned", "in_simulator"), [(False, False), (True, False), (False, True), (True, True)]
+)
 @torch.no_grad()
-def test_latents_are_those_of_the_whole_history(aligned: bool) -> None:
+def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: bool) -> None:
+    """Only target states are for ψ^t; ψ^s encodes abstract ones, wherever they come from."""
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     target = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
     policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)  # actions of some size
-    actions = run(DeployedPolicy(TASK, policy, model, target if aligned else None))
+    deployed = DeployedPolicy(TASK, policy, model, target if aligned else None)
+    actions = run(deployed, in_simulator=in_simulator)
     abstract = STATE[..., [0, 1, 15, 16]]
-    if aligned:
+    if aligned and not in_simulator:
         latent, _ = target.encoder(target.encoder_input(STATE, GOALS, previous(actions)))
     else:
         latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import matplotlib
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ from matplotlib.figure import Figure
 
 from astra_data.figures import (
     Curve,
+    Foretold,
     OpenLoop,
     Panel,
     coverage,
@@ -15,6 +18,7 @@ from astra_data.figures import (
     method_title,
     open_loop_error,
     png,
+    predictive_validity,
     success_bars,
     trajectories,
 )
@@ -76,16 +80,17 @@ def test_success_bars_show_bars_seeds_and_intervals() -> None:
     }
     figure = success_bars(scores, intervals, {"nas": 0.9, "astra_plus": 0.95})
     axes = figure.axes[0]
-    assert [bar.get_height() for bar in axes.patches] == [0.3, 0.8, 1.0]  # type: ignore[attr-defined]
+    assert [bar.get_width() for bar in axes.patches] == [0.3, 0.8, 1.0]  # type: ignore[attr-defined]
     assert [bool(bar.get_hatch()) for bar in axes.patches] == [False, True, False]
     assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [method_colour(row) for row in scores]
     dots = [line for line in axes.lines if line.get_marker() == "o"]
-    assert [sorted(np.asarray(line.get_ydata())) for line in dots] == [[0.2, 0.3, 0.4], [0.8], [1.0]]
+    assert [sorted(np.asarray(line.get_xdata())) for line in dots] == [[0.2, 0.3, 0.4], [0.8], [1.0]]
     assert sum(line.get_marker() == "D" for line in axes.lines) == 2
     assert not any(line.get_clip_on() for line in axes.lines if line.get_marker() in ("o", "D"))
     assert sum(line.get_marker() == "None" for line in axes.lines) == 1  # one interval
-    labels = [label.get_text() for label in axes.get_xticklabels()]
-    assert labels == ["NAS", "ASTRA+", "Careful\nfollower\n(ceiling)"]
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == ["NAS", "ASTRA+", "Careful follower (ceiling)"]
+    assert axes.yaxis_inverted()  # the first row on top
     assert [text.get_text() for text in axes.texts] == ["0.30", "0.80", "1.00"]
     assert "in its own simulator" in legend(figure)
 
@@ -96,17 +101,49 @@ def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
             Curve(np.array([0.0, 100.0]), np.array([0.0, 1.0])),
             Curve(np.array([0.0, 50.0, 200.0]), np.array([np.nan, 0.5, 0.5])),
         ],
+        "nas_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
         "astra_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
     }
     figure = learning_curves(curves)
-    plain, plus = figure.axes
-    assert legend(figure) == ["NAS", "ASTRA+"]
-    assert (len(plain.collections), len(plus.collections)) == (1, 0)  # a band needs two seeds
-    (nas,), (astra,) = plain.lines, plus.lines
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["NAS", "ASTRA"]
+    first, second = figure.axes
+    assert legend(figure) == ["without the [plus] settings", "with them"]
+    assert (len(first.collections), len(second.collections)) == (1, 0)  # a band needs two seeds
+    (nas, nas_plus), (astra,) = first.lines, second.lines
+    assert nas_plus.get_linestyle() == "--"
     assert (nas.get_linestyle(), astra.get_linestyle()) == ("-", "--")
     steps, success = np.asarray(nas.get_xdata()), np.asarray(nas.get_ydata())
     assert (steps[0], steps[-1]) == (50.0, 100.0)
     assert (success[0], success[-1]) == pytest.approx((0.5, 0.75))
+
+
+def test_many_rows_get_a_panel_each_and_readable_bars() -> None:
+    rows = [f"method_{number}" for number in range(14)]
+    curve = Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))
+    figure = learning_curves({row: [curve] for row in rows})
+    drawn = [axes for axes in figure.axes if axes.axison]
+    assert [axes.get_title(loc="left") for axes in drawn] == [f"Method {number}" for number in range(14)]
+    assert not figure.legends
+    bars = success_bars(dict.fromkeys(rows, np.ones(10)), dict.fromkeys(rows, (1.0, 0.9, 1.0)), {})
+    bars.draw_without_rendering()
+    labels = [label.get_window_extent() for label in bars.axes[0].get_yticklabels()]
+    assert all(upper.y0 > lower.y1 for upper, lower in pairwise(labels))
+    assert min(label.x0 for label in labels) >= 0
+
+
+def test_validity_draws_a_dot_per_policy_in_its_rows_colour() -> None:
+    returns = {"nas": np.array([[1.0, 2.0], [3.0, 4.0]]), "astra_plus": np.array([[5.0], [6.0]])}
+    figure = predictive_validity([Foretold("Raw simulator", returns), Foretold("Grounded", {})])
+    raw, grounded = figure.axes
+    assert (raw.get_title(loc="left"), grounded.get_title(loc="left")) == ("Raw simulator", "Grounded")
+    assert legend(figure) == ["NAS", "ASTRA+"]
+    equal, nas, astra = raw.lines
+    assert equal.get_linestyle() == "--"
+    assert [np.asarray(axis).tolist() for axis in nas.get_data()] == [[1.0, 2.0], [3.0, 4.0]]
+    assert [line.get_color() for line in (nas, astra)] == [method_colour("nas"), method_colour("astra_plus")]
+    assert nas.get_marker() != astra.get_marker()
+    assert len(grounded.lines) == 1
+    assert png(figure).startswith(b"\x89PNG")
 
 
 def test_trajectories_draw_a_panel_per_row_with_crosses_where_episodes_fail() -> None:

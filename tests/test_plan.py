@@ -31,6 +31,18 @@ def test_rows_read_what_their_method_needs(tmp_path: Path, fake_recipe: type[Rec
     assert len(items["report"].inputs) == 8
 
 
+def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = HEAD.replace('"astra_plus"', '"nas_plus"')
+    items = {
+        item.key: item for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
+    }
+    assert items["evaluate/follower/seed_7"].inputs == ("ground/nas/seed_7",)
+    assert items["evaluate/nas_plus/seed_7"].inputs == ("train/nas_plus/seed_7", "ground/nas/seed_7")
+    assert items["evaluate/astra/seed_7"].inputs[-1] == "ground/nas/seed_7"
+
+
 def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
     tmp_path: Path, fake_recipe: type[Recipe]
 ) -> None:

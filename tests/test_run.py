@@ -117,6 +117,11 @@ def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> Non
     )
 
 
+def test_a_report_does_not_wait_for_every_seed(recipe: Path, tmp_path: Path) -> None:
+    run_stage(recipe, "report", root=tmp_path)
+    assert asked(tmp_path / "r/report")["seeds"] == [0]
+
+
 def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, tmp_path: Path) -> None:
     text, folder = recipe.read_text(), tmp_path / "r"
     run(recipe, root=tmp_path, jobs=2)

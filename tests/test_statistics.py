@@ -1,8 +1,12 @@
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.stats import bootstrap, pearsonr, spearmanr
 
 from astra_data.errors import BadInputError
-from astra_data.statistics import Summary, probability_of_improvement, summarise
+from astra_data.statistics import Summary, correlation, probability_of_improvement, summarise
 
 
 def test_summary_of_five_seeds_is_the_one_worked_out_by_hand() -> None:
@@ -63,6 +67,37 @@ def test_probability_of_improvement_counts_pairs(
     comparison = probability_of_improvement(np.array(scores), np.array(others), replicates=100)
     assert comparison.probability == probability
     assert (comparison.low is None) == (len(scores) == 1)
+
+
+@pytest.mark.parametrize(("ranks", "reference"), [(False, pearsonr), (True, spearmanr)])
+def test_correlations_are_those_of_scipy(ranks: bool, reference: Callable[..., Any]) -> None:
+    generator = np.random.default_rng(0)
+    first = generator.integers(0, 6, 30).astype(float)  # with ties
+    second = np.exp(first) + generator.normal(0, 30, 30)
+    found = correlation(first, second, ranks=ranks)
+    assert found is not None
+    assert found.value == pytest.approx(reference(first, second).statistic)
+    expected = bootstrap(
+        (first, second),
+        lambda *pairs: reference(*pairs).statistic,
+        paired=True,
+        vectorized=False,
+        n_resamples=500,
+        method="percentile",
+        rng=generator,
+    ).confidence_interval
+    assert (found.low, found.high) == pytest.approx(tuple(expected), abs=0.05)
+    assert correlation(first, second, ranks=ranks) == found
+
+
+def test_what_does_not_vary_correlates_with_nothing() -> None:
+    two, three = np.array([1.0, 2.0]), np.array([0.1, 0.1, 0.3])
+    assert correlation(two, two) is None
+    assert correlation(three, np.full(3, 0.1)) is correlation(np.full(3, 0.1), three) is None
+    # Nor do the resamples in which chance left no variation.
+    found = correlation(three, three)
+    assert found is not None
+    assert [found.low, found.high] == pytest.approx([1.0, 1.0])
 
 
 @pytest.mark.parametrize("scores", [[], [0.1, np.nan]])

@@ -4,6 +4,7 @@ style         colours, titles and roles of the methods; fonts and lines
 scores        success_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
 coverage      coverage: which positions or velocities a dataset holds
+validity      predictive_validity: returns in the simulators against those in the target
 open_loop     open_loop_error: how fast a simulator drifts from the target
 """
 
@@ -12,10 +13,12 @@ from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.figures.scores import Curve, learning_curves, success_bars
 from astra_data.figures.style import ROLES, method_colour, method_title, png
+from astra_data.figures.validity import Foretold, predictive_validity
 
 __all__ = [
     "ROLES",
     "Curve",
+    "Foretold",
     "OpenLoop",
     "Panel",
     "coverage",
@@ -25,6 +28,7 @@ __all__ = [
     "method_title",
     "open_loop_error",
     "png",
+    "predictive_validity",
     "success_bars",
     "trajectories",
 ]

@@ -8,15 +8,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from astra_data.figures.style import FAINT, INK, ROLES, method_colour, method_title, style
-from astra_data.rows import is_plus
+from astra_data.rows import base_method, is_plus
 
 Floats = NDArray[np.float64]
 
 CURVE_POINTS = 200
 """Points at which curves of different seeds are brought together."""
+
+PANELS_ACROSS = 4
+"""Most panels of learning curves side by side."""
 
 
 @dataclass(frozen=True)
@@ -45,19 +49,21 @@ def success_bars(
         simulated: mean success of a row in the simulator it was trained in, where there is one.
     """
     with style():
-        figure = Figure(figsize=(max(6.4, 1.0 + 1.0 * len(scores)), 3.7), layout="constrained")
+        figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(scores)), layout="constrained")
         axes = figure.add_subplot()
         for place, (method, seeds) in enumerate(scores.items()):
             _bar(axes, place, method, seeds, intervals[method])
             if method in simulated:
-                (diamond,) = axes.plot(place, simulated[method], "D", mfc="white", mec=INK, ms=5, zorder=5)
+                (diamond,) = axes.plot(simulated[method], place, "D", mfc="white", mec=INK, ms=5, zorder=5)
                 diamond.set_clip_on(False)
-        axes.set_xticks(range(len(scores)), [_tick_label(method) for method in scores])
-        axes.tick_params(axis="x", length=0, pad=19)
-        axes.set_xlim(-0.6, len(scores) - 0.4)
-        axes.set_ylim(0, 1.04)
-        axes.set_yticks(np.linspace(0, 1, 6))
-        axes.set_ylabel("success rate in the target")
+        axes.set_yticks(range(len(scores)), [_tick_label(method) for method in scores])
+        axes.tick_params(axis="y", length=0)
+        axes.set_ylim(len(scores) - 0.4, -0.6)
+        axes.set_xlim(0, 1)
+        axes.set_xticks(np.linspace(0, 1, 6))
+        axes.set_xlabel("success rate in the target")
+        axes.grid(visible=False, axis="y")
+        axes.grid(visible=True, axis="x")
         handles = [
             Patch(fc=FAINT, ec="none", label="interquartile mean over seeds"),
             Line2D([], [], color=INK, lw=1.6, label="95 % interval"),
@@ -74,53 +80,66 @@ def success_bars(
 def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
     """Draw success of the training episodes over steps: mean over seeds, band from the worst to the best.
 
-    Rows with the [plus] settings have a panel of their own.
+    Each method has a panel; with the [plus] settings it is dashed.
 
     Args:
         curves: each row's seeds, at least one.
     """
     with style():
-        panels = sorted({is_plus(method) for method in curves})
-        figure = Figure(figsize=(2.2 + 3.6 * len(panels), 3.7), layout="constrained")
-        grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+        panels = list(dict.fromkeys(map(base_method, curves)))
+        columns = min(len(panels), PANELS_ACROSS)
+        lines = -(-len(panels) // columns)
+        figure = Figure(figsize=(0.6 + 2.1 * max(columns, 2), 0.6 + 1.7 * lines), layout="constrained")
+        every = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        for axes, base in zip(every, panels, strict=False):
+            axes.set_title(method_title(base), loc="left")
+        for axes in every[len(panels) :]:
+            axes.set_axis_off()
+        for axes in every[max(0, len(panels) - columns) : len(panels)]:
+            axes.tick_params(labelbottom=True)
         for method, seeds in curves.items():
-            axes = grid[panels.index(is_plus(method))]
+            axes = every[panels.index(base_method(method))]
             steps, success = _on_one_grid(seeds)
             colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
             if len(seeds) > 1:
                 low, high = success.min(axis=0), success.max(axis=0)
                 axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
-            axes.plot(steps, success.mean(axis=0), dashes, color=colour, label=method_title(method))
-        for axes in grid:
-            axes.set_ylim(-0.02, 1.02)
-            axes.set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
-            axes.set_xlabel("simulator steps")
-            axes.xaxis.set_major_formatter(_steps_label)
-        grid[0].set_ylabel("success of training episodes, from all starts")
-        figure.legend(loc="outside right center", handlelength=2.4)
+            axes.plot(steps, success.mean(axis=0), dashes, color=colour)
+        every[0].set_ylim(-0.02, 1.02)
+        every[0].set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
+        every[0].xaxis.set_major_formatter(_steps_label)
+        every[0].xaxis.set_major_locator(MaxNLocator(4))
+        figure.supxlabel("steps of training")
+        figure.supylabel("success of training episodes, from all starts")
+        if any(map(is_plus, curves)):
+            handles = [
+                Line2D([], [], color=INK, label="without the [plus] settings"),
+                Line2D([], [], color=INK, ls="--", label="with them"),
+            ]
+            figure.legend(handles=handles, loc="outside upper center", ncols=2, handlelength=2.4)
         return figure
 
 
 def _bar(axes: Axes, place: int, method: str, seeds: Floats, interval: tuple[float, float, float]) -> None:
     iqm, low, high = interval
     hatch = "////" if is_plus(method) else None
-    axes.bar(
-        place, iqm, width=0.64, color=method_colour(method), ec=(1, 1, 1, 0.4), lw=0, hatch=hatch, zorder=2
+    axes.barh(
+        place, iqm, height=0.68, color=method_colour(method), ec=(1, 1, 1, 0.4), lw=0, hatch=hatch, zorder=2
     )
     if np.isfinite(low):
-        axes.plot([place, place], [low, high], color=INK, lw=1.6, zorder=3)
-    spread = np.linspace(-0.2, 0.2, len(seeds)) if len(seeds) > 1 else np.zeros(1)
+        axes.plot([low, high], [place, place], color=INK, lw=1.6, zorder=3)
+    spread = np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1)
     # Not clipped: the axis would cut what lies on 0 in half.
-    (dots,) = axes.plot(place + spread, seeds, "o", mfc="white", mec=INK, mew=0.9, ms=4.5, zorder=4)
+    (dots,) = axes.plot(seeds, place + spread, "o", mfc="white", mec=INK, mew=0.9, ms=3.5, zorder=4)
     dots.set_clip_on(False)
-    # Under the axis, where neither dots nor diamonds can cover the number.
+    # Beyond the axis, where neither dots nor diamonds can cover the number.
     axes.annotate(
         f"{iqm:.2f}",
-        (place, 0),
-        xytext=(0, -5),
+        (1, place),
+        xytext=(10, 0),
         textcoords="offset points",
-        ha="center",
-        va="top",
+        ha="left",
+        va="center",
         fontweight="bold",
         fontsize=9.5,
         annotation_clip=False,
@@ -128,8 +147,8 @@ def _bar(axes: Axes, place: int, method: str, seeds: Floats, interval: tuple[flo
 
 
 def _tick_label(method: str) -> str:
-    label = method_title(method).replace(" ", "\n", 1)
-    return f"{label}\n({ROLES[method]})" if method in ROLES else label
+    title = method_title(method)
+    return f"{title} ({ROLES[method]})" if method in ROLES else title
 
 
 def _on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:

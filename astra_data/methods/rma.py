@@ -52,7 +52,8 @@ class TeacherThenStudent(SimulatorPpo):
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )
         curve["adaptation"] = optimise(adaptation, env, 0.0, phase_2, "adaptation_checkpoint.safetensors")
-        curve["wall_seconds"] += curve["adaptation"]["wall_seconds"]
+        for spent in ("wall_seconds", "cpu_seconds"):
+            curve[spent] += curve["adaptation"][spent]
         episodes = training.episodes
         return PolicyFile(adaptation.student, simulation, episodes.reference, episodes.content_hash), curve
 

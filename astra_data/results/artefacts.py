@@ -23,6 +23,8 @@ class Artefact(BaseModel):
 
     wall_seconds: float | None = None
     """How long the stage ran, in s."""
+    cpu_seconds: float | None = None
+    """Of all its threads, in s."""
     git_commit: str | None = None
     """Of the code, ending in "-dirty" where it was changed since."""
     packages: dict[str, str | None] = Field(default_factory=dict)
@@ -63,7 +65,11 @@ class Evaluation(Artefact):
     target_steps_per_second: float | None = None
     target: Outcomes
     simulated: Outcomes | None = None
-    """None for a row that was in no simulator."""
+    """In the simulator that the policy was trained in; None for a row that was in none."""
+    raw: Outcomes | None = None
+    """In the raw simulator; None for a policy that cannot act on abstract states."""
+    grounded: Outcomes | None = None
+    """In the grounded simulator for reference, where there is one; None likewise."""
     encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
     """Mean of each measure by encoder, where there is more than one."""
 
@@ -71,8 +77,8 @@ class Evaluation(Artefact):
     def _one_number_per_episode(self) -> Self:
         wrong = [
             f"{world}.{name} has {len(values)}"
-            for world, outcomes in (("target", self.target), ("simulated", self.simulated))
-            if outcomes is not None
+            for world in ("target", "simulated", "raw", "grounded")
+            if (outcomes := getattr(self, world)) is not None
             for name, values in outcomes.model_dump(by_alias=True).items()
             if len(values) != self.episodes
         ]

@@ -17,8 +17,10 @@ from astra_data.results.artefacts import (
     Gap,
     Metrics,
 )
+from astra_data.results.costs import Files, row_cost, seconds, throughput
 from astra_data.results.model import (
     BandMeans,
+    Cost,
     Dataset,
     DatasetUse,
     GapMeans,
@@ -26,41 +28,35 @@ from astra_data.results.model import (
     MethodResults,
     Origin,
     Results,
+    Validity,
 )
 from astra_data.results.provenance import origin
 from astra_data.results.runs import Runs
 from astra_data.rows import PLUS, is_plus
-from astra_data.statistics import Comparison, probability_of_improvement, summarise
+from astra_data.statistics import Comparison, correlation, probability_of_improvement, summarise
 
-THROUGHPUT = {
-    "collect": ("target_steps_per_second",),
-    "pair": ("pairs_per_second",),
-    "ground": ("windows_per_second",),
-    "train": ("simulator_steps_per_second", "steps_per_second"),
-    "align": ("windows_per_second",),
-    "evaluate": ("target_steps_per_second",),
-}
-"""The figures in which each stage gives its speed."""
+SHARED_WORLDS = ("raw", "grounded")
+"""Simulators that all rows are tested in."""
 
 
 def assemble(
     recipe: str,
     task: str,
     methods: Sequence[str],
-    seeds: Sequence[int],
+    asked: Sequence[int],
     *,
     root: Path,
     command: str,
     replicates: int,
     groundings: Mapping[str, str] | None = None,
 ) -> Results:
-    """Read every artefact under `root` and summarise it.
+    """Read the artefacts under `root` of every row, for those of the seeds `asked` for that it has finished.
 
     Raises:
-        MissingStageError: a row has no evaluation, or other artefacts for some of its seeds only.
+        MissingStageError: a row has no evaluation, or other artefacts for some of its finished seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
-    read = Runs(recipe, root, tuple(methods), tuple(seeds), groundings or {})
+    read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {})
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, methods)
     episodes = _check_alike(evaluations, task)
@@ -69,31 +65,43 @@ def assemble(
     curves = read.optional("train", "curve.json", CurveFile)
     alignments = read.optional("align", "metrics.json", Metrics)
     datasets = {stage: read.datasets(stage) for stage in ("collect", "pair")}
-    rows = {
-        method: _row(
+    gap_means = {owner: _gap_means(list(of_seeds.values())) for owner, of_seeds in gaps.items()}
+    rows = {}
+    for method, of_seeds in evaluations.items():
+        grounding = read.owner("ground", method)
+        made: dict[str, Mapping[int, Artefact]] = {
+            "ground": metrics.get(grounding, {}),
+            "train": curves.get(method, {}),
+            "align": alignments.get(read.owner("align", method), {}),
+            "evaluate": of_seeds,
+        }
+        rows[method] = _row(
             method,
-            evaluations[method],
-            read.owner("ground", method),
-            gaps,
-            curves.get(method, []),
+            of_seeds,
+            grounding,
+            gap_means.get(grounding),
+            list(curves.get(method, {}).values()),
+            row_cost(
+                {stage: [found[seed] for seed in of_seeds if seed in found] for stage, found in made.items()}
+            ),
             replicates=replicates,
         )
-        for method in methods
-    }
-    files: dict[str, Mapping[str, Sequence[Artefact]]] = {
+    files: Files = {
         "collect": {"all": list(datasets["collect"].values())},
         "pair": {"all": list(datasets["pair"].values())},
-        "ground": metrics,
-        "train": curves,
-        "align": alignments,
-        "evaluate": evaluations,
+        "ground": _listed(metrics),
+        "train": _listed(curves),
+        "align": _listed(alignments),
+        "evaluate": _listed(evaluations),
     }
+    reported = {seed for of_seeds in evaluations.values() for seed in of_seeds}
     return Results(
         recipe=recipe,
         task=task,
         command=command,
-        origins=_origins(files | {"report": {"all": [Artefact.model_validate(origin())]}}),
-        wall_seconds=_wall_seconds(files),
+        origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
+        wall_seconds=seconds(files, "wall_seconds"),
+        cpu_seconds=seconds(files, "cpu_seconds"),
         datasets=[
             Dataset(
                 stage=stage, seed=seed, name=file.name, version=file.version, content_hash=file.content_hash
@@ -102,17 +110,22 @@ def assemble(
             for seed, file in of_seeds.items()
         ],
         evaluated_with=_evaluated_with(evaluations),
-        seeds=list(seeds),
+        seeds=[seed for seed in asked if seed in reported],
         episodes=episodes,
         methods=rows,
         probability_of_improvement=_improvement(rows, replicates),
-        throughput={stage: _throughput(stage, rows_files) for stage, rows_files in files.items()},
+        predictive_validity=_validity(rows, replicates),
+        throughput=throughput(files),
     )
 
 
-def _check_alike(evaluations: dict[str, list[Evaluation]], task: str) -> int:
+def _listed[T: Artefact](files: Mapping[str, Mapping[int, T]]) -> dict[str, list[T]]:
+    return {row: list(of_seeds.values()) for row, of_seeds in files.items()}
+
+
+def _check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
     """Return the episodes per row and seed after checking that rows can be compared."""
-    files = [file for row in evaluations.values() for file in row]
+    files = [file for of_seeds in evaluations.values() for file in of_seeds.values()]
     episodes = files[0].episodes
     wrong = [f"{file.method} seed {file.seed} on {file.task}" for file in files if file.task != task]
     wrong += [
@@ -130,18 +143,20 @@ def _check_alike(evaluations: dict[str, list[Evaluation]], task: str) -> int:
 
 def _row(
     method: str,
-    evaluations: Sequence[Evaluation],
+    of_seeds: Mapping[int, Evaluation],
     grounding: str,
-    gaps: dict[str, list[Gap]],
+    gap: GapMeans | None,
     curves: Sequence[CurveFile],
+    cost: dict[str, Cost],
     *,
     replicates: int,
 ) -> MethodResults:
+    evaluations = list(of_seeds.values())
     means = [file.target.means() for file in evaluations]
     measures = {name: [seed[name] for seed in means] for name in means[0]}
-    simulated = [file.simulated.means()["success"] for file in evaluations if file.simulated is not None]
-    in_simulator = len(simulated) == len(evaluations)
-    summarised = measures | ({"simulated_success": simulated} if in_simulator else {})
+    simulated = _in_world(evaluations, "simulated", "success")
+    returns = {world: _in_world(evaluations, world, "return") for world in SHARED_WORLDS}
+    summarised = measures | ({} if simulated is None else {"simulated_success": simulated})
     measured = [{name: sorted(of) for name, of in file.encoders.items()} for file in evaluations]
     _require_alike(measured, "encoders")
     encoders = {
@@ -151,18 +166,20 @@ def _row(
     return MethodResults(
         title=method_title(method),
         role=ROLES.get(method),
+        seeds=list(of_seeds),
         success=measures["success"],
         topple=measures["topple"],
         wall_contact=measures["wall_contact"],
         steps=measures["steps"],
         returns=measures["return"],
-        simulated_success=simulated if in_simulator else None,
+        simulated_success=simulated,
+        simulator_returns={world: values for world, values in returns.items() if values is not None},
         encoders=encoders,
         summary={
             name: summarise(np.array(values), replicates=replicates) for name, values in summarised.items()
         },
-        grounding=grounding if grounding in gaps else None,
-        gap=_gap_means(gaps[grounding]) if grounding in gaps else None,
+        grounding=grounding if gap else None,
+        gap=gap,
         learning=[
             Learning(
                 steps=[point.steps for point in curve.points],
@@ -170,7 +187,14 @@ def _row(
             )
             for curve in curves
         ],
+        cost=cost,
     )
+
+
+def _in_world(evaluations: Sequence[Evaluation], world: str, measure: str) -> list[float] | None:
+    """Return the means of a measure, or None unless every seed was tested in that world."""
+    outcomes = [outcome for file in evaluations if (outcome := getattr(file, world)) is not None]
+    return [outcome.means()[measure] for outcome in outcomes] if len(outcomes) == len(evaluations) else None
 
 
 def _require_alike(values: Sequence[object], what: str) -> None:
@@ -201,7 +225,7 @@ def _gap_means(gaps: Sequence[Gap]) -> GapMeans:
     )
 
 
-def _origins(files: Mapping[str, Mapping[str, Sequence[Artefact]]]) -> list[Origin]:
+def _origins(files: Files) -> list[Origin]:
     origins: dict[str, Origin] = {}
     for stage, rows in files.items():
         for file in (file for row in rows.values() for file in row):
@@ -212,27 +236,11 @@ def _origins(files: Mapping[str, Mapping[str, Sequence[Artefact]]]) -> list[Orig
     return list(origins.values())
 
 
-def _wall_seconds(files: Mapping[str, Mapping[str, Sequence[Artefact]]]) -> dict[str, float]:
-    recorded = {
-        stage: [file.wall_seconds for row in rows.values() for file in row if file.wall_seconds is not None]
-        for stage, rows in files.items()
-    }
-    seconds = {stage: sum(times) for stage, times in recorded.items() if times}
-    return seconds | {"total": sum(seconds.values())}
-
-
-def _throughput(stage: str, files: Mapping[str, Sequence[Artefact]]) -> dict[str, dict[str, list[float]]]:
-    figures = {}
-    for figure in THROUGHPUT[stage]:
-        speeds = {method: [getattr(file, figure) for file in row] for method, row in files.items()}
-        figures[figure] = {method: row for method, row in speeds.items() if row and None not in row}
-    return figures
-
-
-def _evaluated_with(evaluations: dict[str, list[Evaluation]]) -> list[DatasetUse]:
+def _evaluated_with(evaluations: Mapping[str, Mapping[int, Evaluation]]) -> list[DatasetUse]:
     uses: dict[tuple[tuple[str | None, str | None], ...], list[str]] = {}
-    for method, files in evaluations.items():
-        uses.setdefault(tuple((file.dataset_version, file.dataset_hash) for file in files), []).append(method)
+    for method, of_seeds in evaluations.items():
+        named = tuple((file.dataset_version, file.dataset_hash) for file in of_seeds.values())
+        uses.setdefault(named, []).append(method)
     return [
         DatasetUse(
             versions=[version for version, _ in seeds], hashes=[digest for _, digest in seeds], methods=rows
@@ -241,15 +249,36 @@ def _evaluated_with(evaluations: dict[str, list[Evaluation]]) -> list[DatasetUse
     ]
 
 
-def _improvement(rows: dict[str, MethodResults], replicates: int) -> dict[str, dict[str, Comparison]]:
-    """Compare ASTRA with every other row that is trained as it is, with the [plus] settings or without."""
-    success = {method: np.array(row.success) for method, row in rows.items() if row.role != "ceiling"}
+def _improvement(rows: Mapping[str, MethodResults], replicates: int) -> dict[str, dict[str, Comparison]]:
+    """Compare ASTRA with every other row that is trained as it is, with the [plus] settings or without.
+
+    Rows that were in no simulator are compared with both, for the settings are none of theirs.
+    """
+    compared = {method: row for method, row in rows.items() if row.role != "ceiling"}
     return {
         ours: {
-            other: probability_of_improvement(success[ours], scores, replicates=replicates)
-            for other, scores in success.items()
-            if other != ours and is_plus(other) == is_plus(ours)
+            other: probability_of_improvement(
+                np.array(rows[ours].success), np.array(row.success), replicates=replicates
+            )
+            for other, row in compared.items()
+            if other != ours and (is_plus(other) == is_plus(ours) or row.simulated_success is None)
         }
         for ours in ("astra", f"astra{PLUS}")
-        if ours in success
+        if ours in rows
     }
+
+
+def _validity(rows: Mapping[str, MethodResults], replicates: int) -> dict[str, Validity]:
+    """Correlate the return in each shared simulator with that in the target, over rows and seeds."""
+    found = {}
+    for world in SHARED_WORLDS:
+        tested = [row for row in rows.values() if world in row.simulator_returns]
+        simulated = np.array([value for row in tested for value in row.simulator_returns[world]])
+        target = np.array([value for row in tested for value in row.returns])
+        if tested:
+            found[world] = Validity(
+                policies=len(target),
+                pearson=correlation(simulated, target, replicates=replicates),
+                spearman=correlation(simulated, target, ranks=True, replicates=replicates),
+            )
+    return found

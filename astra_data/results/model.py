@@ -1,10 +1,10 @@
-"""Results: what results.json holds. Lists are over seeds, in the order of `Results.seeds`."""
+"""Results: what results.json holds. A row's lists are over its seeds, in the order of its `seeds`."""
 
 from typing import Annotated, Literal
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
 
-from astra_data.statistics import Comparison, Summary
+from astra_data.statistics import Comparison, Correlation, Summary
 
 
 def _nan_for_null(value: object) -> object:
@@ -85,12 +85,31 @@ class GapMeans(Part):
     raw: dict[str, BandMeans]
 
 
+class Cost(Part):
+    """The time that one seed of a stage takes, on average."""
+
+    wall_seconds: float
+    cpu_seconds: float | None
+    """Of all threads; None where it was not recorded."""
+
+
+class Validity(Part):
+    """How well the return in a simulator foretells that in the target, over policies: rows and seeds."""
+
+    policies: int
+    pearson: Correlation | None
+    """None where it is undefined: for fewer than three policies, or where all have the same return."""
+    spearman: Correlation | None
+
+
 class MethodResults(Part):
     """One row. Each measure is a list over seeds of means over episodes in the target."""
 
     title: str
     role: str | None
     """"floor" or "ceiling" for the rows that bound the others."""
+    seeds: list[int]
+    """Those that are finished."""
     success: list[float]
     topple: list[float]
     wall_contact: list[float]
@@ -102,6 +121,8 @@ class MethodResults(Part):
     )
     simulated_success: list[float] | None
     """Success in the simulator that the policy was trained in; None for a row that was in none."""
+    simulator_returns: dict[str, list[float]]
+    """Return in the simulators that all rows are tested in, "raw" and "grounded", where the row was."""
     encoders: dict[str, dict[str, list[float]]]
     """The same measures by encoder, where a row has more than one."""
     summary: dict[str, Summary]
@@ -111,6 +132,8 @@ class MethodResults(Part):
     gap: GapMeans | None
     learning: list[Learning]
     """Empty for a row that is not trained."""
+    cost: dict[str, Cost]
+    """By stage; with the grounding and alignment that it uses, though other rows may share them."""
 
 
 class Results(Part):
@@ -125,14 +148,19 @@ class Results(Part):
     """Normally one; more if code or machine changed on the way."""
     wall_seconds: dict[str, float]
     """By stage over all rows and seeds, and "total"; stages that record no time are left out."""
+    cpu_seconds: dict[str, float]
+    """The same of all threads."""
     datasets: list[Dataset]
     evaluated_with: list[DatasetUse]
     seeds: list[int]
+    """Of which rows may have finished only some."""
     episodes: int
     """Per row and seed."""
     methods: dict[str, MethodResults]
     probability_of_improvement: dict[str, dict[str, Comparison]]
     """ASTRA's row → another that is trained alike → how likely a seed of the one beats one of the other."""
+    predictive_validity: dict[str, Validity]
+    """Of the simulators that all rows are tested in: "raw", and "grounded" where there is one."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
     """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
 

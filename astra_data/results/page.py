@@ -1,13 +1,12 @@
 """Results → Markdown: tables, figures and how to read them."""
 
-from collections.abc import Callable, Iterable, Mapping
-
-import numpy as np
+from collections.abc import Mapping
 
 from astra_data.figures import method_title
-from astra_data.results.model import BandMeans, Origin, Results
-from astra_data.rows import is_plus
-from astra_data.statistics import Summary
+from astra_data.results.cells import duration, interval, mean_std, spread, table
+from astra_data.results.making import cost, machine, origin
+from astra_data.results.model import BandMeans, Results
+from astra_data.rows import is_plus, reference_of
 
 HOW_TO_READ = {
     "success": (
@@ -27,10 +26,15 @@ HOW_TO_READ = {
     ),
     "learning": (
         "Share of the training episodes that reach the goal, in the simulator that the policy is trained in: "
-        "mean over seeds, band from the worst seed to the best; plus rows have a panel of their own. With "
+        "mean over seeds, band from the worst seed to the best; dashed with the `[plus]` settings. With "
         "`data_start_share` in the recipe that share of the episodes starts in the midst of a recorded "
         "trajectory, often nearer to the goal, so these figures are no success rates of the task; those are "
         "in the table. High here and low there means that the policy learned what the target does not do."
+    ),
+    "validity": (
+        "A dot is one policy: a row's seed, with its mean return over the episodes. On the dashed line the "
+        "simulator foretells the target's return exactly; what counts for choosing between policies is that "
+        "better in the simulator is better in the target."
     ),
     "gap": (
         "The simulator is given the target's actions from a target state on; the error is its distance "
@@ -42,6 +46,7 @@ HOW_TO_READ = {
 
 COLUMNS = (
     "method",
+    "seeds",
     "success",
     "IQM [95 %]",
     "topple",
@@ -56,6 +61,7 @@ CAPTIONS = {
     "trajectories": "Trajectories",
     "mismatch": "The same commands in simulator and target",
     "learning": "Learning curves",
+    "validity": "Return in the simulators and in the target",
     "gap": "Open-loop error by horizon",
 }
 
@@ -70,43 +76,45 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
     sections = [_head(results), _table(results), _comparison(results), _encoders(results)]
     for name in ("success", "trajectories", "mismatch", "learning"):
         sections.append(_figure(name, figures))
-    sections += [_gap(results), _figure("gap", figures), _cost(results), _origin(results)]
+    sections += [_gap(results), _figure("gap", figures), _validity(results), _figure("validity", figures)]
+    sections += [cost(results), origin(results)]
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
 def _head(results: Results) -> str:
-    stages = [origin for origin in results.origins if origin.machine and origin.stages != ["report"]]
-    machines = " and ".join(dict.fromkeys(_machine(origin) for origin in stages))
+    stages = [made for made in results.origins if made.machine and made.stages != ["report"]]
+    machines = " and ".join(dict.fromkeys(machine(made) for made in stages))
     seeds = ", ".join(str(seed) for seed in results.seeds)
+    if any(row.seeds != results.seeds for row in results.methods.values()):
+        seeds += " (rows have as many of them as the table says)"
     return (
         f"# {results.recipe}\n\n"
         f"Task `{results.task}`, seeds {seeds}, {results.episodes} episodes per row and seed. Produced by\n\n"
         f"```\n{results.command}\n```\n\n"
         f"on {machines or 'a machine that was not recorded'}. "
-        f"Wall time of the stages, summed: {_duration(results.wall_seconds['total'])}."
+        f"Wall time of the stages, summed: {duration(results.wall_seconds['total'])}."
     )
 
 
 def _table(results: Results) -> str:
     rows = results.methods
     best = max((row.summary["success"].mean for row in rows.values() if not row.role), default=None)
-    lines = [_line(COLUMNS), _line(["---", *["---:"] * (len(COLUMNS) - 1)])]
+    lines = []
     for row in rows.values():
         summary = row.summary
-        success = _spread(summary["success"], 2)
+        success = spread(summary["success"], 2)
         lines.append(
-            _line(
-                [
-                    f"{row.title} ({row.role})" if row.role else row.title,
-                    f"**{success}**" if not row.role and summary["success"].mean == best else success,
-                    _interval(summary["success"]),
-                    _spread(summary["topple"], 2),
-                    _spread(summary["wall_contact"], 2),
-                    _spread(summary["steps"], 0),
-                    _spread(summary["return"], 1),
-                    _spread(summary["simulated_success"], 2) if "simulated_success" in summary else "-",
-                ]
-            )
+            [
+                f"{row.title} ({row.role})" if row.role else row.title,
+                str(len(row.seeds)),
+                f"**{success}**" if not row.role and summary["success"].mean == best else success,
+                interval(summary["success"].iqm, summary["success"].low, summary["success"].high),
+                spread(summary["topple"], 2),
+                spread(summary["wall_contact"], 2),
+                spread(summary["steps"], 0),
+                spread(summary["return"], 1),
+                spread(summary["simulated_success"], 2) if "simulated_success" in summary else "-",
+            ]
         )
     note = (
         "Mean ± standard deviation over seeds, in the target. IQM: interquartile mean over seeds with its "
@@ -115,38 +123,68 @@ def _table(results: Results) -> str:
     )
     if any(map(is_plus, rows)):
         note += " A plus marks the same method trained with the recipe's `[plus]` settings."
-    return "## Results\n\n" + "\n".join(lines) + f"\n\n{note}"
+    return f"## Results\n\n{table(COLUMNS, lines)}\n\n{note}"
 
 
 def _comparison(results: Results) -> str:
     rows = results.methods
     lines = [
-        _line([rows[ours].title, rows[other].title, f"{found.probability:.2f}{_ends(found.low, found.high)}"])
+        [rows[ours].title, rows[other].title, interval(found.probability, found.low, found.high)]
         for ours, over in results.probability_of_improvement.items()
         for other, found in over.items()
     ]
     if not lines:
         return ""
-    head = [_line(["row", "beats", "probability [95 %]"]), _line(["---", "---", "---:"])]
     note = (
         "How likely a seed of the one has a higher success rate than a seed of the other; ties count half. "
-        "Only rows that are trained alike are compared: all with the `[plus]` settings, or all without."
+        "Only rows that are trained alike are compared: all with the `[plus]` settings, or all without; rows "
+        "that are trained in no simulator, which those settings are for, with both."
     )
-    return "## Probability of improvement\n\n" + "\n".join(head + lines) + f"\n\n{note}"
+    head = ["row", "beats", "probability [95 %]"]
+    return f"## Probability of improvement\n\n{table(head, lines, words=2)}\n\n{note}"
 
 
 def _encoders(results: Results) -> str:
     lines = [
-        _line([row.title, encoder, _mean_std(values["success"])])
+        [row.title, encoder, mean_std(values["success"])]
         for row in results.methods.values()
         for encoder, values in row.encoders.items()
         if len(row.encoders) > 1 and "success" in values
     ]
     if not lines:
         return ""
-    head = [_line(["method", "encoder", "success"]), _line(["---", "---", "---:"])]
     note = "The same policy, fed by the simulator's encoder (source) or the one aligned to the target."
-    return "## Encoders\n\n" + "\n".join(head + lines) + f"\n\n{note}"
+    return f"## Encoders\n\n{table(['method', 'encoder', 'success'], lines, words=2)}\n\n{note}"
+
+
+def _validity(results: Results) -> str:
+    found = results.predictive_validity
+    if not found:
+        return ""
+    lines = [
+        [
+            simulator,
+            str(validity.policies),
+            *(
+                interval(of.value, of.low, of.high) if of else "-"
+                for of in (validity.pearson, validity.spearman)
+            ),
+        ]
+        for simulator, validity in found.items()
+    ]
+    note = (
+        "How well the return in a simulator foretells the return in the target, over policies: every row and "
+        "seed, each tested from the task's starts and paid the task's reward. Intervals resample policies."
+    )
+    if "grounded" in found:
+        reference = reference_of(results.methods)
+        whose = f"{method_title(reference)}'s, of the same seed" if reference else "each row's own"
+        note += f" The grounding is {whose}."
+    absent = [row.title for row in results.methods.values() if "raw" not in row.simulator_returns]
+    if absent:
+        note += f" Without {', '.join(absent)}: not tested there, as what sees the full state cannot be."
+    head = ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"]
+    return f"## Predictive validity\n\n{table(head, lines)}\n\n{note}"
 
 
 def _gap(results: Results) -> str:
@@ -157,15 +195,13 @@ def _gap(results: Results) -> str:
     parts = []
     for quantity in first.grounded:
         columns = [f"{horizon} step{'s' if horizon > 1 else ''}" for horizon in first.horizons]
-        lines = [_line([f"`{quantity}`", *columns]), _line(["---", *["---:"] * len(columns)])]
         shared = all(gap.raw[quantity] == first.raw[quantity] for gap in gaps.values())
-        if shared:
-            lines.append(_line(["No grounding", *_cells(first.raw[quantity])]))
+        lines = [["No grounding", *_cells(first.raw[quantity])]] if shared else []
         for title, gap in gaps.items():
             if not shared:
-                lines.append(_line([f"{title}, no grounding", *_cells(gap.raw[quantity])]))
-            lines.append(_line([f"{title}, grounded", *_cells(gap.grounded[quantity])]))
-        parts.append("\n".join(lines))
+                lines.append([f"{title}, no grounding", *_cells(gap.raw[quantity])])
+            lines.append([f"{title}, grounded", *_cells(gap.grounded[quantity])])
+        parts.append(table([f"`{quantity}`", *columns], lines))
     note = "Mean error [95 % interval] after so many steps of the target's own actions, averaged over seeds."
     return "## Gap\n\n" + "\n\n".join(parts) + f"\n\n{note}"
 
@@ -175,124 +211,7 @@ def _cells(band: BandMeans) -> list[str]:
     return [f"{mean:.3g} [{low:.3g}, {high:.3g}]" for mean, low, high in ends]
 
 
-def _cost(results: Results) -> str:
-    lines = [_line(["stage", "wall time", "speed"]), _line(["---", "---:", "---"])]
-    for stage in ("collect", "pair", "ground", "train", "align", "evaluate"):
-        speeds = results.throughput.get(stage, {})
-        shown = [f"{_rates(rows)} {_unit(figure)}" for figure, rows in speeds.items() if rows]
-        seconds = results.wall_seconds.get(stage)
-        if shown or seconds is not None:
-            time = "-" if seconds is None else _duration(seconds)
-            lines.append(_line([stage, time, "; ".join(shown)]))
-    lines.append(_line(["total", _duration(results.wall_seconds["total"]), ""]))
-    note = (
-        "Wall time: summed over rows and seeds, which run side by side; a dash where a stage recorded none. "
-        "Speed: of one item beside the others, averaged over seeds. Simulator steps/s: the world alone; PPO "
-        "steps/s: world and learning."
-    )
-    return "## Cost\n\n" + "\n".join(lines) + f"\n\n{note}"
-
-
-def _rates(rows: Mapping[str, list[float]]) -> str:
-    means = {method_title(method): float(np.mean(values)) for method, values in rows.items()}
-    slowest, fastest = min(means, key=means.__getitem__), max(means, key=means.__getitem__)
-    if _short(means[slowest]) == _short(means[fastest]):
-        return _short(means[slowest])
-    return f"{_short(means[slowest])} ({slowest}) to {_short(means[fastest])} ({fastest})"
-
-
-def _origin(results: Results) -> str:
-    lines = [
-        f"- Code: {_by_stage(results.origins, _commit)}.",
-        f"- Machine: {_by_stage(results.origins, _machine)}.",
-        f"- Versions: {_by_stage(results.origins, _versions)}.",
-    ]
-    hashes_of: dict[tuple[str, str, str], list[str]] = {}
-    for dataset in results.datasets:
-        key = (dataset.stage, dataset.name, dataset.version)
-        hashes_of.setdefault(key, []).append(f"`{dataset.content_hash}` (seed {dataset.seed})")
-    for (stage, name, version), contents in hashes_of.items():
-        lines.append(f"- Dataset of `{stage}`: {name} {version}, content {', '.join(contents)}.")
-    for use in results.evaluated_with:
-        rows = ", ".join(results.methods[method].title for method in use.methods)
-        versions = ", ".join(dict.fromkeys(version for version in use.versions if version is not None))
-        hashes = ", ".join(dict.fromkeys(f"`{digest}`" for digest in use.hashes if digest is not None))
-        named = f"{versions or 'no dataset'}{f' ({hashes})' if hashes else ''}"
-        lines.append(f"- Dataset named by the evaluations of {rows}: {named}.")
-    return "## Where this comes from\n\n" + "\n".join(lines)
-
-
-def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:
-    """Return what all origins say, or each text with the stages that it holds for."""
-    stages: dict[str, list[str]] = {}
-    for origin in origins:
-        stages.setdefault(text(origin), []).extend(origin.stages)
-    if len(stages) == 1:
-        return next(iter(stages))
-    return "; ".join(f"{said} ({', '.join(dict.fromkeys(of))})" for said, of in stages.items())
-
-
-def _commit(origin: Origin) -> str:
-    if origin.commit is None:
-        return "not recorded"
-    commit = origin.commit.removesuffix("-dirty")
-    return f"commit `{commit}`{' with uncommitted changes' if commit != origin.commit else ''}"
-
-
-def _machine(origin: Origin) -> str:
-    machine = origin.machine
-    if machine is None:
-        return "not recorded"
-    gpu = f", {machine.gpu}" if machine.gpu else ""
-    return f"{machine.cpu}, {machine.cores} cores, {machine.memory_gib:g} GiB of memory{gpu}"
-
-
-def _versions(origin: Origin) -> str:
-    known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
-    return ", ".join(known) or "not recorded"
-
-
 def _figure(name: str, figures: Mapping[str, str]) -> str:
     if name not in figures:
         return ""
     return f"## {CAPTIONS[name]}\n\n![{CAPTIONS[name]}]({figures[name]})\n\n{HOW_TO_READ[name]}"
-
-
-def _line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _spread(summary: Summary, digits: int) -> str:
-    spread = "" if summary.std is None else f" ± {summary.std:.{digits}f}"
-    return f"{summary.mean:.{digits}f}{spread}"
-
-
-def _mean_std(values: list[float]) -> str:
-    spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.2f}{spread}"
-
-
-def _interval(summary: Summary) -> str:
-    return f"{summary.iqm:.2f}{_ends(summary.low, summary.high)}"
-
-
-def _ends(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f" [{low:.2f}, {high:.2f}]"
-
-
-def _unit(figure: str) -> str:
-    """Return "target steps/s" for "target_steps_per_second"; bare steps are PPO's."""
-    steps = figure.removesuffix("_per_second").replace("_", " ")
-    return f"{'PPO ' if steps == 'steps' else ''}{steps}/s"
-
-
-def _short(rate: float) -> str:
-    return f"{rate / 1000:.3g} k" if rate >= 1000 else f"{rate:.3g}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from astra_data.errors import BadInputError, MissingStageError
-from astra_data.results.artefacts import Artefact, DatasetFile, read_json
+from astra_data.results.artefacts import EVALUATION, Artefact, DatasetFile, read_json
 from astra_data.rows import base_method
 
 SHARED = ("ground", "align")
@@ -20,7 +21,7 @@ class Runs:
         recipe: the recipe's name.
         root: its folder of runs.
         methods: the rows.
-        seeds: the seeds of every row.
+        seeds: to report, of each row those whose evaluation is finished.
         groundings: row → the folder of its grounding and alignment, where that is not its base's.
     """
 
@@ -47,19 +48,33 @@ class Runs:
         """Return where a stage leaves a file of one row and seed."""
         return self.root / stage / self.owner(stage, method) / f"seed_{seed}" / name
 
-    def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, list[T]]:
-        """Read a file of every row and seed."""
-        self.require(stage, name, self.methods)
+    @cached_property
+    def finished(self) -> dict[str, tuple[int, ...]]:
+        """The seeds of each row whose evaluation is finished.
+
+        Raises:
+            MissingStageError: a row has none.
+        """
+        seeds = {
+            method: tuple(
+                seed for seed in self.seeds if self.path("evaluate", method, seed, EVALUATION).exists()
+            )
+            for method in self.methods
+        }
+        self._require("evaluate", EVALUATION, {row: self.seeds for row, found in seeds.items() if not found})
+        return seeds
+
+    def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
+        """Read a file of every row and its finished seeds: row → seed → file."""
         return self._read(stage, name, model, self.methods)
 
-    def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, list[T]]:
-        """Read a file of the rows that have it, by `owner`: for all of their seeds, or for none."""
+    def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
+        """Read a file of the rows that have it, by `owner`: for all of their finished seeds, or for none."""
         present = [
             method
-            for method in self.methods
-            if any(self.path(stage, method, seed, name).exists() for seed in self.seeds)
+            for method, seeds in self.finished.items()
+            if any(self.path(stage, method, seed, name).exists() for seed in seeds)
         ]
-        self.require(stage, name, present)
         return self._read(stage, name, model, present)
 
     def datasets(self, stage: str) -> dict[int, DatasetFile]:
@@ -71,21 +86,23 @@ class Runs:
         return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}
 
     def require(self, stage: str, name: str, methods: Sequence[str]) -> None:
-        """Check that the rows have a file for every seed.
+        """Check that the rows have a file for every finished seed.
 
         Raises:
             MissingStageError: some have not; the message lists them and says how to make the first.
         """
-        missing = [
-            (method, seed)
-            for method in methods
-            for seed in self.seeds
-            if not self.path(stage, method, seed, name).exists()
-        ]
+        self._require(stage, name, {method: self.finished[method] for method in methods})
+
+    def _require(self, stage: str, name: str, wanted: Mapping[str, Sequence[int]]) -> None:
+        missing = {
+            method: [seed for seed in seeds if not self.path(stage, method, seed, name).exists()]
+            for method, seeds in wanted.items()
+        }
+        missing = {method: seeds for method, seeds in missing.items() if seeds}
         if not missing:
             return
-        method, seed = missing[0]
-        absent = ", ".join(f"{method} seed {seed}" for method, seed in missing)
+        method, (seed, *_) = next(iter(missing.items()))
+        absent = "; ".join(f"{row} seed {', '.join(map(str, seeds))}" for row, seeds in missing.items())
         option = "" if self.root.parent == Path("runs") else f" --root {self.root.parent}"
         raise MissingStageError(
             f"expected {name} in {self.root / stage}/<method>/seed_<seed>/, found none for {absent}; "
@@ -94,10 +111,14 @@ class Runs:
 
     def _read[T: Artefact](
         self, stage: str, name: str, model: type[T], methods: Sequence[str]
-    ) -> dict[str, list[T]]:
+    ) -> dict[str, dict[int, T]]:
+        self.require(stage, name, methods)
+        paths: dict[str, dict[int, Path]] = {}
+        for method in methods:
+            # Rows that share an artefact may have different seeds of it.
+            found = paths.setdefault(self.owner(stage, method), {})
+            found |= {seed: self.path(stage, method, seed, name) for seed in self.finished[method]}
         return {
-            self.owner(stage, method): [
-                read_json(model, self.path(stage, method, seed, name)) for seed in self.seeds
-            ]
-            for method in methods
+            owner: {seed: read_json(model, found[seed]) for seed in self.seeds if seed in found}
+            for owner, found in paths.items()
         }

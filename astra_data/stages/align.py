@@ -1,7 +1,6 @@
 """Align: fit the target encoder ψ^t to the frozen source encoder (paper, Section IV-B)."""
 
 import json
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +17,7 @@ from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative, Positive
 from astra_data.results.provenance import origin
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.target_encoder_file import save_target_encoder
 
 
@@ -75,7 +75,7 @@ def align(
     optimizer = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    began = time.perf_counter()
+    stopwatch = Stopwatch()
     points: list[dict[str, float]] = []
     with finished_folder(out) as folder:
         for update in range(config.updates):
@@ -90,14 +90,13 @@ def align(
             schedule.step()
             if (update + 1) % 50 == 0:
                 points.append({"step": update + 1, **_agreement(model, encoder, held_out, bandwidths)})
-                rate = (update + 1) * config.batch_windows / (time.perf_counter() - began)
+                rate = (update + 1) * config.batch_windows / stopwatch.seconds
                 note = f"{rate:,.0f} windows/s  paired latent RMSE {points[-1]['latent_rmse']:.3f}"
                 progress((update + 1) / config.updates, note)
-        seconds = time.perf_counter() - began
         save_target_encoder(folder / "target_encoder.safetensors", encoder)
         metrics: dict[str, Any] = made | {
-            "windows_per_second": config.updates * config.batch_windows / seconds,
-            "wall_seconds": seconds,
+            "windows_per_second": config.updates * config.batch_windows / stopwatch.seconds,
+            **stopwatch.spent(),
             "points": points,
             **_agreement(model, encoder, held_out, bandwidths),
         }

@@ -36,6 +36,7 @@ from astra_data.progress import Progress, part
 from astra_data.recipe import Config, Count, NotNegative
 from astra_data.results.provenance import machine
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
 
@@ -109,7 +110,7 @@ def collect(
         BadInputError: the task is unknown, `out` exists, or the behaviour lacks something.
     """
     world = task_named(task)
-    began = time.perf_counter()
+    stopwatch = Stopwatch()
     saved = {
         f"{kind}_sha256": file_digest(path) for kind, path in _saved_files(config).items() if path.is_file()
     }
@@ -144,10 +145,9 @@ def collect(
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
         told |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
-        seconds = time.perf_counter() - began
         writer.made = {
             "behavior": told,
-            "wall_seconds": seconds,
+            **stopwatch.spent(),
             "target_steps_per_second": rate,
             "machine": machine(),
         }

@@ -13,6 +13,7 @@ from astra_data.methods import method_named
 from astra_data.progress import Progress
 from astra_data.recipe import Config
 from astra_data.results.provenance import origin
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import task_named
 
 
@@ -52,11 +53,13 @@ def ground(
     training, held_out = episodes.split(config.held_out_share, seed)
     with finished_folder(out) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
+        stopwatch = Stopwatch()
         grounding, metrics = fit(fitting)
+        spent = stopwatch.spent()
         progress(1.0, "gap report")
         gap = gap_report(world, grounding, held_out, seed=seed)
         save_grounding(folder / "grounding.safetensors", grounding, episodes)
-        (folder / "metrics.json").write_text(json.dumps(made | metrics, indent=1))
+        (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
         (folder / "config.json").write_text((settings or config).model_dump_json(indent=1))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)

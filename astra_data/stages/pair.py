@@ -27,6 +27,7 @@ from astra_data.progress import Progress
 from astra_data.recipe import Config, NotNegative
 from astra_data.results.provenance import machine
 from astra_data.simulator import AbstractSimulator
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import TASKS
 
 BATCH = 4096
@@ -68,7 +69,7 @@ def pair(
     pairing = pairing_named(simulator)
     source = Dataset.open(dataset)
     _check(source, pairing)
-    began = time.perf_counter()
+    stopwatch = Stopwatch()
     batch = built(pairing, BATCH)
     description, out = successor(
         source,
@@ -104,13 +105,13 @@ def pair(
                 writer.add(Episode(episode.uid, {**episode.columns, **values}, episode.metadata))
                 first += len(episode)
             steps += first
-            rate = steps / (time.perf_counter() - began)
+            rate = steps / stopwatch.seconds
             progress(steps / int(source.lengths.sum()), f"{rate:,.0f} pairs/s")
-        seconds = time.perf_counter() - began
+        spent = stopwatch.spent()
         writer.made = {
             "reset_error": reset_error,
-            "wall_seconds": seconds,
-            "pairs_per_second": steps / seconds,
+            **spent,
+            "pairs_per_second": steps / spent["wall_seconds"],
             "simulated_pairs_per_second": steps / simulating,
             "machine": machine(),
         }

@@ -15,12 +15,14 @@ from astra_data.checkpoint import finished_folder
 from astra_data.errors import BadInputError
 from astra_data.figures import (
     Curve,
+    Foretold,
     OpenLoop,
     Panel,
     dynamics_mismatch,
     learning_curves,
     open_loop_error,
     png,
+    predictive_validity,
     success_bars,
     trajectories,
 )
@@ -45,7 +47,7 @@ class ReportConfig(Config):
     """Rows whose trajectories are drawn; all rows when empty."""
 
     trajectory_episodes: int = Field(default=12, ge=1)
-    """Episodes drawn per row and world, the first ones of the first seed."""
+    """Episodes drawn per row and world, the first ones of the row's first seed."""
 
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
     """Resamples behind each interval."""
@@ -71,7 +73,7 @@ class Reported(Protocol):
 
     @property
     def seeds(self) -> Iterable[int]:
-        """Seeds of every row."""
+        """Seeds to report, of each row those that are finished."""
 
     @property
     def groundings(self) -> Mapping[str, str]:
@@ -98,7 +100,7 @@ def report(
         config: how to draw.
 
     Raises:
-        MissingStageError: a row has not been evaluated, or other artefacts for some of its seeds only.
+        MissingStageError: a row has no evaluation, or other artefacts for some of its finished seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
     results = assemble(
@@ -134,6 +136,8 @@ def _figures(results: Results, root: Path, config: ReportConfig) -> dict[str, Fi
     gaps = _gaps(results)
     if gaps:
         figures["gap"] = open_loop_error(gaps)
+    if results.predictive_validity:
+        figures["validity"] = predictive_validity(_foretold(results))
     return figures
 
 
@@ -161,7 +165,7 @@ def _trajectories(results: Results, root: Path, maze: Maze, config: ReportConfig
     if unknown:
         raise BadInputError(f"report.trajectory_methods: expected rows of the recipe, got '{unknown[0]}'")
     for method in config.trajectory_methods or results.methods:
-        folder = root / "evaluate" / method / f"seed_{results.seeds[0]}"
+        folder = root / "evaluate" / method / f"seed_{results.methods[method].seeds[0]}"
         evaluation = read_json(Evaluation, folder / EVALUATION)
         tensors = read_tensors(folder / TRAJECTORIES, ("target.position", "goal"))
         count = config.trajectory_episodes
@@ -190,6 +194,20 @@ def _curves(results: Results) -> dict[str, list[Curve]]:
         for method, seeds in curves.items()
         if seeds and all(np.isfinite(seed.success).any() for seed in seeds)
     }
+
+
+def _foretold(results: Results) -> list[Foretold]:
+    return [
+        Foretold(
+            title=f"{simulator} simulator".capitalize(),
+            returns={
+                method: np.array([row.simulator_returns[simulator], row.returns])
+                for method, row in results.methods.items()
+                if simulator in row.simulator_returns
+            },
+        )
+        for simulator in results.predictive_validity
+    ]
 
 
 def _gaps(results: Results) -> dict[str, OpenLoop]:

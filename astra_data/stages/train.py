@@ -12,6 +12,7 @@ from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Config
 from astra_data.results.provenance import origin
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import task_named
 from astra_data.training import TrainConfig, Training
 
@@ -59,6 +60,7 @@ def train(
         raise BadInputError(f"method '{method}' goes on from the policy of {base.initial}: train that first")
     if config.reward == "predicted" and not base.predicts_reward:
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
+    stopwatch = Stopwatch()
     with finished_folder(out) as folder:
         training = Training(
             task=world,
@@ -75,7 +77,7 @@ def train(
         )
         policy, curve = base.learn(training)
         policy.save(folder / "policy.safetensors")
-        (folder / "curve.json").write_text(json.dumps(made | curve, indent=1))
+        (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         for checkpoint in folder.glob("*checkpoint.safetensors"):
             checkpoint.unlink()

@@ -30,7 +30,7 @@ def make(
     config: EvaluateConfig = CONFIG,
     num_threads: int | None = None,
 ) -> Result:
-    paths = {"policy": None, "grounding": None, "target_encoder": None} | (inputs or {})
+    paths: dict[str, Any] = {"policy": None, "grounding": None, "target_encoder": None} | (inputs or {})
     evaluate(task, method, config, **paths, seed=0, out=out, progress=silent, num_threads=num_threads)
     tensors, _ = load_tensors(out / "trajectories.safetensors")
     return json.loads((out / "evaluation.json").read_text()), tensors
@@ -59,7 +59,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     inputs = {"policy": trained, "grounding": grounded, "target_encoder": aligned}
     told, paths = make(task, "astra", tmp_path / "astra", inputs)
     keys = {"task", "method", "seed", "episodes", "dataset_version", "dataset_hash", "wall_seconds"}
-    keys |= {"target_steps_per_second", "encoder", "target", "simulated", "encoders"}
+    keys |= {"cpu_seconds", "target_steps_per_second", "encoder", "target", "simulated", "encoders", "raw"}
     keys |= {"git_commit", "packages", "machine"}
     assert told.keys() == keys
     assert (told["method"], told["seed"], told["episodes"], told["encoder"]) == ("astra", 0, 3, "target")
@@ -74,6 +74,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     # Starts and goals are every method's, whatever it is.
     follower, followed = make(task, "follower", tmp_path / "follower")
     assert follower.keys() == keys - {"encoder", "simulated", "encoders", "dataset_version", "dataset_hash"}
+    assert follower["raw"].keys() == follower["target"].keys()
     check_outcome(follower["target"], followed["target.position"])
     for name in ("start", "goal"):
         assert torch.equal(followed[name], paths[name])
@@ -92,6 +93,24 @@ def test_a_policy_from_an_augmented_simulator_is_tested_in_both_worlds(
     assert told["encoder"] == "source"
     for world in ("target", "simulated"):
         check_outcome(told[world], paths[f"{world}.position"])
+
+
+def test_simulators_that_all_rows_share_begin_and_reward_alike(
+    task: str, paired: Path, trained: Path, grounded: Path, aligned: Path, tmp_path: Path
+) -> None:
+    inputs = {"policy": trained, "grounding": grounded, "target_encoder": aligned, "reference": grounded}
+    astra, _ = make(task, "astra", tmp_path / "astra", inputs)
+    # Its own world is the reference here, but for the reward that it predicts.
+    assert astra["grounded"] == astra["simulated"] | {"return": astra["grounded"]["return"]}
+    assert astra["grounded"]["return"] != astra["simulated"]["return"] != astra["raw"]["return"]
+    raw = {"dataset": paired, "grounding": None, "seed": 0, "out": tmp_path / "train", "device": "cpu"}
+    train(task, "direct_transfer", TRAIN, **raw, progress=silent)  # type: ignore[arg-type]
+    inputs = {"policy": tmp_path / "train", "reference": grounded}
+    transferred, _ = make(task, "direct_transfer", tmp_path / "direct_transfer", inputs)
+    assert transferred["raw"] == transferred["simulated"] != transferred["grounded"]
+    follower, _ = make(task, "follower", tmp_path / "follower", {"reference": grounded})
+    assert "simulated" not in follower
+    assert min(follower["raw"]["return"]) > max(transferred["raw"]["return"])
 
 
 def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(

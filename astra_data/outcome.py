@@ -1,0 +1,78 @@
+"""What happened in N episodes that were run side by side."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What happened in N episodes: a list per quantity, and every path.
+
+    Attributes:
+        success: 1 or 0.
+        topple: 1 or 0.
+        wall_contact: share of the steps.
+        steps: until the end.
+        returns: sum of rewards.
+        position: (N, T + 1, 2) in m, from the start on, NaN after the end.
+    """
+
+    success: list[float]
+    topple: list[float]
+    wall_contact: list[float]
+    steps: list[int]
+    returns: list[float]
+    position: Tensor
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Return the lists by name."""
+        return {
+            "success": self.success,
+            "topple": self.topple,
+            "wall_contact": self.wall_contact,
+            "steps": [float(steps) for steps in self.steps],
+            "return": self.returns,
+        }
+
+
+class EpisodeRecord:
+    """Follow N episodes until each has ended, in success or in a topple.
+
+    Attributes:
+        active: (N,) bool, not ended yet. total_steps: of all episodes so far.
+    """
+
+    def __init__(self, position: Tensor) -> None:
+        """Begin at `position` (N, 2)."""
+        count = len(position)
+        self.active = torch.ones(count, dtype=torch.bool)
+        self.total_steps = 0
+        self._success, self._topple, self._contact, self._steps, self._return = torch.zeros(5, count)
+        self._positions = [position.clone()]
+
+    def add(
+        self, position: Tensor, reward: Tensor, success: Tensor, toppled: Tensor, contact: Tensor
+    ) -> None:
+        """Add one step; what ended episodes do is ignored."""
+        active = self.active
+        self._success += success & active
+        self._topple += toppled & active
+        self._contact += contact & active
+        self._steps += active
+        self._return += reward * active
+        self._positions.append(torch.where(active.unsqueeze(-1), position, torch.nan))
+        self.total_steps += int(active.sum())
+        self.active = active & ~success & ~toppled
+
+    def outcome(self) -> Outcome:
+        """Return what happened so far."""
+        return Outcome(
+            success=self._success.tolist(),
+            topple=self._topple.tolist(),
+            wall_contact=(self._contact / self._steps).tolist(),
+            steps=self._steps.long().tolist(),
+            returns=self._return.tolist(),
+            position=torch.stack(self._positions, dim=1),
+        )
