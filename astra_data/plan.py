@@ -29,6 +29,7 @@ from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.report import ReportConfig, report
 from astra_data.stages.train import train
+from astra_data.target_training import TargetConfig
 from astra_data.tasks import TASKS
 from astra_data.training import TrainConfig
 from astra_data.variation import Variation
@@ -44,7 +45,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """Each stage, in order, and the stages whose artefacts it reads."""
 
-METHOD_TABLES = {"domain_randomization": "train"}
+METHOD_TABLES = {"domain_randomization": "train", "target": "train"}
 """Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
 
 
@@ -68,6 +69,8 @@ class Recipe(Config):
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
     domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
     """What domain randomization varies; by default as the paper prints it for navigation."""
+    target: TargetConfig = TargetConfig()
+    """The training of `target` and `full_obs`, laid over `[train]`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -182,7 +185,8 @@ def select(items: tuple[Item, ...], stage: str, *, method: str | None = None) ->
 
 def _collect(recipe: Recipe, folder: Path, seed: int) -> Item:
     key = f"collect/seed_{seed}"
-    return Item(key, (), partial(collect, recipe.task, recipe.collect, seed=seed, out=folder / key))
+    call = partial(collect, recipe.task, recipe.collect, seed=seed, out=folder / key)
+    return Item(key, (), call, is_threaded=True)
 
 
 def _pair(recipe: Recipe, folder: Path, seed: int) -> Item:
@@ -224,7 +228,8 @@ def _train(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> It
         out=folder / key,
         device=device,
     )
-    return Item(key, _existing(dataset, grounding, initial), call)
+    inputs = _existing(dataset, grounding, initial)
+    return Item(key, inputs, call, is_threaded=METHODS[base].steps_target)
 
 
 def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> Item:
@@ -257,7 +262,7 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
         seed=seed,
         out=folder / key,
     )
-    return Item(key, _existing(policy, grounding, target_encoder), call)
+    return Item(key, _existing(policy, grounding, target_encoder), call, is_threaded=True)
 
 
 def _report(recipe: Recipe, path: Path, folder: Path, seeds: tuple[int, ...], publish: bool) -> Item:
@@ -286,7 +291,8 @@ def _grounded_as(base: str) -> str:
 
 def _settings(recipe: Recipe, base: str, stage: str) -> Config | None:
     """Return the recipe's table for a method, where it has one for `stage`."""
-    settings: Config | None = getattr(recipe, base) if METHOD_TABLES.get(base) == stage else None
+    table = METHODS[base].table or base
+    settings: Config | None = getattr(recipe, table) if METHOD_TABLES.get(table) == stage else None
     return settings
 
 

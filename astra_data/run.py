@@ -23,8 +23,6 @@ from astra_data.schedule import Item, execute
 RUNS = Path("runs")
 ALWAYS_NEW = {"report"}
 """Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
-PHYSICS = {"collect", "evaluate"}
-"""Stages that step the target's physics, on any number of threads."""
 CUDA_JOBS = 2
 """Items at a time on a CUDA device: each process holds a context of its own there."""
 
@@ -129,7 +127,7 @@ def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
     counts = Counter(map(stage_of, items))
     shared = []
     for item in items:
-        if stage_of(item) in PHYSICS:
+        if item.is_threaded:
             num_threads = max(1, cores() // min(jobs, counts[stage_of(item)]))
             item = replace(item, call=partial(item.call, num_threads=num_threads))
         shared.append(item)

@@ -111,20 +111,28 @@ class SimulatorPpo:
         env = training_world(
             training.task, world, parts, training.grounding, num_envs=config.num_envs, device=device
         )
-        torch.manual_seed(derive(training.seed, "policy"))
-        policy = ActorCritic(
-            ActorCriticShape(
-                observation_size=env.observation_size,
-                action_size=env.action_size,
-                memory_size=0 if env.latent_size else config.memory_size,
-                hidden_sizes=config.hidden_sizes,
-            )
-        ).to(device)
-        ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
-        curve = optimise(ppo, env, config.ramp, training)
+        memory_size = 0 if env.latent_size else config.memory_size
+        policy, curve = train_by_ppo(env, config, memory_size, training)
         simulation = Simulation(parts.thinness, parts.scatter, world, parts.variation)
         episodes = training.episodes
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
+
+
+def train_by_ppo(
+    env: ResumableEnv, config: TrainConfig, memory_size: int, training: Training
+) -> tuple[ActorCritic, dict[str, Any]]:
+    """Train a new policy in `env`, with a memory of `memory_size`; return it and its learning curve."""
+    torch.manual_seed(derive(training.seed, "policy"))
+    policy = ActorCritic(
+        ActorCriticShape(
+            observation_size=env.observation_size,
+            action_size=env.action_size,
+            memory_size=memory_size,
+            hidden_sizes=config.hidden_sizes,
+        )
+    ).to(training.device)
+    ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
+    return policy, optimise(ppo, env, config.ramp, training)
 
 
 def optimise(ppo: Ppo, env: ResumableEnv, ramp: float, training: Training) -> dict[str, Any]:

@@ -20,6 +20,7 @@ TITLES = {
     "astra": "ASTRA",
     "iql": "IQL",
     "target": "Target",
+    "full_obs": "Full Obs",
     "follower": "Careful follower",
 }
 
@@ -32,6 +33,7 @@ COLOURS = {
     "astra": "#009E73",
     "iql": "#D55E00",
     "target": "#4D4D4D",
+    "full_obs": "#0072B2",
     "follower": "#9A9A9A",
 }
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
@@ -39,8 +41,8 @@ COLOURS = {
 SPARE_COLOURS = ("#882255", "#44AA99", "#999933", "#AA4499", "#332288", "#661100")
 """For methods without a colour of their own."""
 
-ROLES = {"direct_transfer": "floor", "follower": "ceiling"}
-"""Rows that bound the others: no grounding at all; a controller that never was in a simulator."""
+ROLES = {"direct_transfer": "floor", "target": "ceiling", "full_obs": "ceiling", "follower": "ceiling"}
+"""Rows that bound the others: no grounding at all; trained in the target itself, or written by hand."""
 
 SIMULATED = "#E07B00"
 """A simulator, in every figure (as in the paper's Fig. 3)."""

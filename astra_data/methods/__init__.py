@@ -7,6 +7,7 @@ from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
+from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {
@@ -19,6 +20,8 @@ METHODS: dict[str, Method] = {
         ASTRA_WITHOUT_LATENT,
         ASTRA_WITHOUT_REWARD,
         ASTRA_TASK_REWARD,
+        TARGET,
+        FULL_OBS,
         FOLLOWER,
     )
 }
