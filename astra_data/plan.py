@@ -8,7 +8,7 @@ A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` set
 grounding and the alignment of `<method>`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -65,6 +65,8 @@ class Recipe(Config):
     align: AlignConfig
     evaluate: EvaluateConfig
     report: ReportConfig
+    based_on: str | None = None
+    """The recipe that all that is not said here, and every artefact it leaves unchanged, is taken from."""
     plus: TrainConfig
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
     domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
@@ -173,14 +175,6 @@ def plan(
 def stage_of(item: Item) -> str:
     """Return the stage that makes `item`."""
     return item.key.partition("/")[0]
-
-
-def select(items: tuple[Item, ...], stage: str, *, method: str | None = None) -> Iterator[Item]:
-    """Yield the items of `stage`, of `method` only where it is given."""
-    for item in items:
-        parts = item.key.split("/")
-        if parts[0] == stage and method in (None, *parts[1:-1]):
-            yield item
 
 
 def _collect(recipe: Recipe, folder: Path, seed: int) -> Item:
