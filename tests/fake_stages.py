@@ -112,7 +112,7 @@ def train(
     progress: Progress,
     num_threads: int | None = None,
 ) -> None:
-    asked = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
+    asked: dict[str, object] = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
     if num_threads:
         asked |= {"num_threads": num_threads, "settings": settings}
     _write(config, out, progress, task=task, method=method, **asked)
