@@ -11,8 +11,8 @@ exchange    importers/  exporters/ (one file per format of other libraries and l
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
 learning    tasks  simulators  world  target_world  training_world  policy_file  deployment  behaviors
             suboptimal  gap  mismatch  outcome  gymnasium_faces  pairing  relocation  fitting  training
-            method  learners/
+            target_training  method  learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
-roof        plan  schedule  display  inspection_page  run  commands/  cli
+roof        plan  experiment  schedule  display  inspection_page  run  commands/  cli
 """

@@ -16,6 +16,17 @@ EncoderKind = Literal["target", "source"]
 Observed = Literal["abstract", "full"]
 
 
+def target_observation(
+    task: Task, state: Tensor, goal: Tensor, latent: Tensor | None, observed: Observed
+) -> Tensor:
+    """Assemble what a policy sees (..., O) of target states (..., S) with goals (..., G) and latents, if any.
+
+    It is what it would see of φ(s), and where the full state is observed, everything else of it behind that.
+    """
+    abstract = policy_observation(task.maze, task.abstraction(state), goal, latent)
+    return abstract if observed == "abstract" else torch.cat([abstract, task.beyond(state)], dim=-1)
+
+
 @dataclass
 class DeployedPolicy:
     """A policy at work on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them.
@@ -37,8 +48,9 @@ class DeployedPolicy:
     @property
     def observation_size(self) -> int:
         """Values that the task and the grounding show to a policy."""
-        navigation = len(policy_observation(self.task.maze, torch.zeros(4), torch.zeros(2), None))
-        return navigation + (self.model.shape.latent_size if self.model is not None else 0)
+        state = torch.zeros(self.task.state_columns[0].size)
+        seen = len(target_observation(self.task, state, torch.zeros(2), None, self.observed))
+        return seen + (self.model.shape.latent_size if self.model is not None else 0)
 
     def start(self, count: int, generator: torch.Generator | None = None) -> None:
         """Forget everything; B = `count`. With `generator`, actions are drawn as in training."""
@@ -51,10 +63,9 @@ class DeployedPolicy:
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
-        abstract = self.task.abstraction(state)
-        seen = abstract if self.target_encoder is None else state
+        seen = self.task.abstraction(state) if self.target_encoder is None else state
         latent = self._latent(self.target_encoder or self.model, seen, goal)
-        return self._act(policy_observation(self.task.maze, abstract, goal, latent))
+        return self._act(target_observation(self.task, state, goal, latent, self.observed))
 
     def act_in_simulator(self, abstract: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for abstract states (B, X) and goals (B, G); latents come from ψ^s."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from astra_data.fitting import Fit, HistoryFit
+from astra_data.target_training import TargetPpo
 from astra_data.training import Learn, SimulatorPpo
 
 IN_RAW_SIMULATOR = SimulatorPpo()
@@ -19,6 +20,7 @@ class Method:
         aligns: whether a target encoder is fitted for deployment.
         initial: the method whose policy its own goes on from, if any.
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
+        table: the recipe's table with its settings, if it has any; that of its own name where empty.
     """
 
     name: str
@@ -28,6 +30,7 @@ class Method:
     aligns: bool = False
     initial: str | None = None
     grounded_as: str = ""
+    table: str = ""
 
     @property
     def grounds(self) -> bool:
@@ -43,6 +46,11 @@ class Method:
     def in_simulator(self) -> bool:
         """Whether its policy is trained in the abstract simulator, so that the cures of `[plus]` apply."""
         return isinstance(self.learn, SimulatorPpo)
+
+    @property
+    def steps_target(self) -> bool:
+        """Whether its policy is trained in the target itself."""
+        return isinstance(self.learn, TargetPpo)
 
     @property
     def predicts_reward(self) -> bool:

@@ -27,6 +27,8 @@ class BatchedPhysics:
     Attributes:
         qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`.
         qvel: velocities, (B, nv) float64, likewise.
+        state: all that the copies' futures depend on, warm starts included, (B, N) float64; what was copied
+            from it may be written back into it.
         touching: whether anything touched a watched geom when the copy was last stepped, (B,) bool.
     """
 
@@ -53,13 +55,13 @@ class BatchedPhysics:
         self.substeps = substeps
         self.num_threads = min(num_threads or cores(), num_envs)
         self._watched = watched_geoms
-        self._state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
+        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
         after_time, end = 1 + model.nq, 1 + model.nq + model.nv
-        self.qpos: Floats = self._state[:, 1:after_time]
-        self.qvel: Floats = self._state[:, after_time:end]
+        self.qpos: Floats = self.state[:, 1:after_time]
+        self.qvel: Floats = self.state[:, after_time:end]
         self.touching: Bools = np.zeros(num_envs, dtype=bool)
-        self._control: Floats = self._state[:, self._state.shape[1] - model.nu :]
-        self._rows = list(self._state)
+        self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
+        self._rows = list(self.state)
         self._data = [mujoco.MjData(model) for _ in range(self.num_threads)]
         self._pool = ThreadPoolExecutor(self.num_threads)
         self.set_state(np.arange(num_envs), np.tile(model.qpos0, (num_envs, 1)), np.zeros_like(self.qvel))

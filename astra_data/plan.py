@@ -8,7 +8,7 @@ A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` set
 grounding and the alignment of `<method>`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.report import ReportConfig, report
 from astra_data.stages.train import train
+from astra_data.target_training import TargetConfig
 from astra_data.tasks import TASKS
 from astra_data.training import TrainConfig
 from astra_data.variation import Variation
@@ -49,6 +50,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 METHOD_TABLES = {
     "domain_randomization": "train",
     "rma": "train",
+    "target": "train",
     "nas_golemo": "ground",
 }
 """Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
@@ -70,6 +72,8 @@ class Recipe(Config):
     align: AlignConfig
     evaluate: EvaluateConfig
     report: ReportConfig
+    based_on: str | None = None
+    """The recipe that all that is not said here, and every artefact it leaves unchanged, is taken from."""
     plus: TrainConfig
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
     domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
@@ -78,6 +82,8 @@ class Recipe(Config):
     """How the residual model of Golemo et al. is fitted."""
     rma: RmaConfig = RmaConfig()
     """How the student of rapid motor adaptation learns."""
+    target: TargetConfig = TargetConfig()
+    """The training of `target` and `full_obs`, laid over `[train]`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -182,17 +188,10 @@ def stage_of(item: Item) -> str:
     return item.key.partition("/")[0]
 
 
-def select(items: tuple[Item, ...], stage: str, *, method: str | None = None) -> Iterator[Item]:
-    """Yield the items of `stage`, of `method` only where it is given."""
-    for item in items:
-        parts = item.key.split("/")
-        if parts[0] == stage and method in (None, *parts[1:-1]):
-            yield item
-
-
 def _collect(recipe: Recipe, folder: Path, seed: int) -> Item:
     key = f"collect/seed_{seed}"
-    return Item(key, (), partial(collect, recipe.task, recipe.collect, seed=seed, out=folder / key))
+    call = partial(collect, recipe.task, recipe.collect, seed=seed, out=folder / key)
+    return Item(key, (), call, is_threaded=True)
 
 
 def _pair(recipe: Recipe, folder: Path, seed: int) -> Item:
@@ -234,7 +233,8 @@ def _train(recipe: Recipe, folder: Path, row: str, seed: int, device: str) -> It
         out=folder / key,
         device=device,
     )
-    return Item(key, _existing(dataset, grounding, initial), call)
+    inputs = _existing(dataset, grounding, initial)
+    return Item(key, inputs, call, is_threaded=METHODS[base].steps_target)
 
 
 def _align(recipe: Recipe, folder: Path, base: str, seed: int, device: str) -> Item:
@@ -268,7 +268,8 @@ def _evaluate(recipe: Recipe, folder: Path, row: str, seed: int) -> Item:
         seed=seed,
         out=folder / key,
     )
-    return Item(key, _existing(policy, grounding, target_encoder, reference), call)
+    inputs = _existing(policy, grounding, target_encoder, reference)
+    return Item(key, inputs, call, is_threaded=True)
 
 
 def _report(recipe: Recipe, path: Path, folder: Path, seeds: tuple[int, ...], publish: bool) -> Item:
@@ -297,7 +298,8 @@ def _grounded_as(base: str) -> str:
 
 def _settings(recipe: Recipe, base: str, stage: str) -> Config | None:
     """Return the recipe's table for a method, where it has one for `stage`."""
-    settings: Config | None = getattr(recipe, base) if METHOD_TABLES.get(base) == stage else None
+    table = METHODS[base].table or base
+    settings: Config | None = getattr(recipe, table) if METHOD_TABLES.get(table) == stage else None
     return settings
 
 

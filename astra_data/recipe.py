@@ -36,6 +36,15 @@ def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:
     Raises:
         RecipeError: the file is missing or not TOML, or `model` refuses it; one message holds every fault.
     """
+    return validated(load_tables(path), model, str(path))
+
+
+def load_tables(path: Path) -> dict[str, Any]:
+    """Read the TOML file at `path` as it is.
+
+    Raises:
+        RecipeError: the file is missing or not TOML.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -44,10 +53,9 @@ def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path} cannot be read as a text file: {error}") from None
     try:
-        tables = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RecipeError(_syntax_fault(path, text, str(error))) from None
-    return validated(tables, model, str(path))
 
 
 def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: str) -> M:

@@ -1,6 +1,5 @@
 """Run recipes: every stage for every row and seed, each artefact once, from where the last run stopped."""
 
-import json
 import os
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -13,18 +12,15 @@ from rich.console import Console
 
 from astra_data.cores import cores
 from astra_data.display import display
-from astra_data.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.errors import BadInputError, MissingStageError
+from astra_data.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.lock import held
-from astra_data.plan import METHOD_TABLES, STAGES, Recipe, plan, select, stage_of
-from astra_data.recipe import did_you_mean, load_recipe
+from astra_data.plan import STAGES, Recipe, plan, stage_of
+from astra_data.recipe import did_you_mean
 from astra_data.rows import base_method
 from astra_data.schedule import Item, execute
 
 RUNS = Path("runs")
-ALWAYS_NEW = {"report"}
-"""Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
-PHYSICS = {"collect", "evaluate"}
-"""Stages that step the target's physics, on any number of threads."""
 CUDA_JOBS = 2
 """Items at a time on a CUDA device: each process holds a context of its own there."""
 
@@ -50,16 +46,16 @@ def run(
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made what is there.
+        MissingStageError: an artefact of the recipe that it is based on is not finished.
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     _check_stage(until or "report")
-    recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
-    wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
-    planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device)
-    items = [item for item in planned if stage_of(item) in wanted]
-    _make(recipe, folder, items, jobs, device)
-    return folder
+    experiment = load_experiment(recipe_path, root)
+    wanted = set(list(STAGES)[: list(STAGES).index(until or "report") + 1]) - experiment.borrowed
+    planned = plan(experiment.recipe, recipe_path, experiment.folder, seeds=seeds, device=device)
+    _make(experiment, [item for item in planned if stage_of(item) in wanted], jobs, device)
+    return experiment.folder
 
 
 def run_stage(
@@ -82,44 +78,60 @@ def run_stage(
         AstraDataError: an item failed.
     """
     _check_stage(stage)
-    recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
+    experiment = load_experiment(recipe_path, root)
+    maker = experiment.maker(stage)
+    if maker is not experiment:
+        raise BadInputError(
+            f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` for that"
+        )
+    recipe, folder = experiment.recipe, experiment.folder
     planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device, publish=publish)
-    items = _selected(recipe, planned, stage, method)
-    # The report takes the seeds that are there, and says itself which rows have none.
-    to_make = [item for item in items if stage != "report" and not _finished(item, folder)]
-    reads = [key for item in to_make for key in item.inputs]
-    missing = next((key for key in reads if not (folder / key).is_dir()), None)
-    if missing:
-        option = "" if root == RUNS else f" --root {root}"
-        command = f"astra-data {missing.partition('/')[0]} {recipe_path}{option}"
-        raise MissingStageError(f"{folder / missing} is missing: run `{command}` first")
-    _make(recipe, folder, items, jobs, device)
+    _make(experiment, _selected(recipe, planned, stage, method), jobs, device)
     return folder / stage
 
 
 def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
     """Validate a recipe without running it; return each planned artefact and whether it is finished."""
-    recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
-    _check_unchanged(recipe, folder)
-    return {item.key: _finished(item, folder) for item in plan(recipe, recipe_path, folder)}
+    experiment = load_experiment(recipe_path, root)
+    experiment.check_unchanged()
+    planned = plan(experiment.recipe, recipe_path, experiment.folder)
+    return {item.key: _finished(item, experiment) for item in planned}
 
 
-def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | None, device: str) -> None:
+def _make(experiment: Experiment, items: Collection[Item], jobs: int | None, device: str) -> None:
     _check_device(device)
+    recipe, folder = experiment.recipe, experiment.folder
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
-        _check_unchanged(recipe, folder)
+        experiment.check_unchanged()
+        items = [item for item in items if not _finished(item, experiment)]
+        _check_inputs(experiment, items)
+        experiment.link_borrowed()
         partial_file = folder / ".recipe.json.partial"
         partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
         os.replace(partial_file, folder / "recipe.json")
-        items = [item for item in items if not _finished(item, folder)]
         jobs = jobs or _default_jobs(device)
         # The networks get one thread: faster as small as they are, and idle threads slow down other items.
         prepare = partial(torch.set_num_threads, 1)
         with display(len(items), Console()) as watch:
             execute(_share_cores(items, jobs), jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+
+
+def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
+    """Check that what `items` read and none of them makes is finished."""
+    made = {item.key for item in items}
+    # The report takes the seeds that are there, and says itself which rows have none.
+    readers = [item for item in items if stage_of(item) not in ALWAYS_NEW]
+    reads = [key for item in readers for key in item.inputs if key not in made]
+    missing = next((key for key in reads if not experiment.has(key)), None)
+    if missing:
+        stage, root = missing.partition("/")[0], experiment.folder.parent
+        maker = experiment.maker(stage)
+        command = f"astra-data {stage if maker is experiment else 'run'} {maker.path}"
+        option = "" if root == RUNS else f" --root {root}"
+        raise MissingStageError(f"{experiment.place(missing)} is missing: run `{command}{option}` first")
 
 
 def _default_jobs(device: str) -> int:
@@ -131,15 +143,15 @@ def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
     counts = Counter(map(stage_of, items))
     shared = []
     for item in items:
-        if stage_of(item) in PHYSICS:
+        if item.is_threaded:
             num_threads = max(1, cores() // min(jobs, counts[stage_of(item)]))
             item = replace(item, call=partial(item.call, num_threads=num_threads))
         shared.append(item)
     return shared
 
 
-def _finished(item: Item, folder: Path) -> bool:
-    return stage_of(item) not in ALWAYS_NEW and (folder / item.key).is_dir()
+def _finished(item: Item, experiment: Experiment) -> bool:
+    return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
 
 
 def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str | None) -> list[Item]:
@@ -147,7 +159,12 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
         raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
     if method is not None and stage in ("ground", "align"):
         method = base_method(method)
-    selected = list(select(items, stage, method=method))
+
+    def is_asked_for(key: str) -> bool:
+        made_by, *row_and_seed = key.split("/")
+        return made_by == stage and method in (None, *row_and_seed[:-1])
+
+    selected = [item for item in items if is_asked_for(item.key)]
     if not selected:
         raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
     return selected
@@ -166,25 +183,3 @@ def _check_device(device: str) -> None:
     count = torch.cuda.device_count()
     if wanted.type == "cuda" and (wanted.index or 0) >= count:
         raise BadInputError(f"device '{device}' is not here: torch sees {count} CUDA devices")
-
-
-def _check_unchanged(recipe: Recipe, folder: Path) -> None:
-    """Refuse settings that differ from those that made what is already there, finished or begun."""
-    record = folder / "recipe.json"
-    if not record.is_file():
-        return
-    before, now = json.loads(record.read_text()), json.loads(recipe.model_dump_json())
-    changed = {key for key in now.keys() - {"methods", "seeds"} if before.get(key) != now[key]}
-    stale: set[str] = set()
-    for stage, reads in STAGES.items():
-        sections = {"task", stage} | ({"plus"} if stage == "train" else set())
-        sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
-        if changed & sections or stale.intersection(reads):
-            stale.add(stage)
-    present = [str(folder / stage) for stage in STAGES if stage in stale - ALWAYS_NEW]
-    present = [stage for stage in present if Path(stage).exists()]
-    if present:
-        raise RecipeError(
-            f"{' and '.join(sorted(changed))} changed in the recipe since {folder} was made: "
-            f"give the recipe another name, or remove {' '.join(present)}"
-        )

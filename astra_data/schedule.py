@@ -26,11 +26,13 @@ class Item:
         key: its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`.
         inputs: keys of the artefacts that it reads.
         call: makes it; called as `call(progress=...)` in another process, so it must be picklable.
+        is_threaded: whether `call` also takes `num_threads`, which it works the faster with.
     """
 
     key: str
     inputs: tuple[str, ...]
     call: Callable[..., object]
+    is_threaded: bool = False
 
 
 class Watcher(Protocol):

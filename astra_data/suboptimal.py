@@ -19,7 +19,7 @@ def suboptimal_policy(
 ) -> DeployedPolicy:
     """Train a policy without memory by PPO in the target, and stop after `steps` environment steps."""
     torch.manual_seed(derive(seed, "suboptimal policy"))
-    world = TargetWorld(task, _ENVS, seed=derive(seed, "suboptimal world"), num_threads=num_threads)
+    world = TargetWorld(task, _ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
     config = PpoConfig(total_steps=steps)
     ppo = Ppo(world, policy, config, horizon=task.navigation.horizon, seed=seed)

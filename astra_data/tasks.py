@@ -4,7 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, get_args
 
-from astra_data.abstraction import ant_to_point_mass
+from torch import Tensor
+
+from astra_data.abstraction import ant_beyond_point_mass, ant_to_point_mass
 from astra_data.ant import TIMESTEP_S, WALL_REACH_M
 from astra_data.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.envs.antmaze import AntMazeEnv
@@ -25,6 +27,7 @@ class Task:
         name: in recipes. instruction: what LeRobot calls the task.
         navigation: maze, horizon, reward and success.
         abstraction: φ, target states (..., S) to abstract states (..., X).
+        beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., S - X).
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
@@ -38,6 +41,7 @@ class Task:
     instruction: str
     navigation: Navigation
     abstraction: Callable[[Any], Any]
+    beyond: Callable[[Tensor], Tensor]
     state_columns: tuple[Column, ...]
     abstract_state: Column
     timestep_s: float
@@ -134,6 +138,7 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         instruction="walk through the maze to the goal",
         navigation=Navigation(maze, horizon, reward),
         abstraction=ant_to_point_mass,
+        beyond=ant_beyond_point_mass,
         state_columns=_ANT_COLUMNS,
         abstract_state=_POINT_MASS,
         timestep_s=TIMESTEP_S,

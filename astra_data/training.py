@@ -131,19 +131,9 @@ class SimulatorPpo:
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
-        config = training.config
         env, simulation = self.world(training)
-        torch.manual_seed(derive(training.seed, "policy"))
-        policy = ActorCritic(
-            ActorCriticShape(
-                observation_size=env.observation_size,
-                action_size=env.action_size,
-                memory_size=0 if env.latent_size else config.memory_size,
-                hidden_sizes=config.hidden_sizes,
-            )
-        ).to(training.device)
-        ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
-        curve = optimise(ppo, env, config.ramp, training)
+        memory_size = 0 if env.latent_size else training.config.memory_size
+        policy, curve = train_by_ppo(env, training.config, memory_size, training)
         episodes = training.episodes
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
@@ -166,6 +156,23 @@ class SimulatorPpo:
             tells_parameters=tells_parameters,
         )
         return env, Simulation(parts.thinness, parts.scatter, switches, parts.variation)
+
+
+def train_by_ppo(
+    env: ResumableEnv, config: TrainConfig, memory_size: int, training: Training
+) -> tuple[ActorCritic, dict[str, Any]]:
+    """Train a new policy in `env`, with a memory of `memory_size`; return it and its learning curve."""
+    torch.manual_seed(derive(training.seed, "policy"))
+    policy = ActorCritic(
+        ActorCriticShape(
+            observation_size=env.observation_size,
+            action_size=env.action_size,
+            memory_size=memory_size,
+            hidden_sizes=config.hidden_sizes,
+        )
+    ).to(training.device)
+    ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
+    return policy, optimise(ppo, env, config.ramp, training)
 
 
 def optimise(

@@ -20,7 +20,7 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
         monkeypatch.setattr(plan, stage, getattr(fake_stages, stage))
     monkeypatch.setattr(plan, "METHODS", fake_stages.METHODS)
     monkeypatch.setattr(plan, "TASKS", {"maze": None})
-    monkeypatch.setattr("astra_data.run.Recipe", model)
+    monkeypatch.setattr("astra_data.experiment.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
     monkeypatch.setattr("torch.set_num_threads", int)

@@ -32,10 +32,18 @@ class FakeConfig(Config):
 
 class FakeMethod:
     def __init__(
-        self, grounds: bool, aligns: bool, trains: bool, grounded_as: str = "", initial: str | None = None
+        self,
+        grounds: bool,
+        aligns: bool,
+        trains: bool,
+        grounded_as: str = "",
+        initial: str | None = None,
+        steps_target: bool = False,
+        table: str = "",
     ) -> None:
         self.grounds, self.aligns, self.trains = grounds, aligns, trains
-        self.in_simulator = trains and initial is None
+        self.in_simulator = trains and initial is None and not steps_target
+        self.steps_target, self.table = steps_target, table
         self.grounded_as, self.initial = grounded_as, initial
 
 
@@ -45,6 +53,8 @@ METHODS = {
     "nas": FakeMethod(grounds=True, aligns=False, trains=True),
     "astra": FakeMethod(grounds=True, aligns=True, trains=True),
     "astra_again": FakeMethod(grounds=True, aligns=True, trains=True, grounded_as="astra"),
+    "target": FakeMethod(grounds=False, aligns=False, trains=True, steps_target=True),
+    "full_obs": FakeMethod(grounds=False, aligns=False, trains=True, steps_target=True, table="target"),
     "fine_tuned": FakeMethod(grounds=False, aligns=False, trains=True, initial="direct_transfer"),
 }
 
@@ -100,8 +110,11 @@ def train(
     out: Path,
     device: str,
     progress: Progress,
+    num_threads: int | None = None,
 ) -> None:
-    asked = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
+    asked: dict[str, object] = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
+    if num_threads:
+        asked |= {"num_threads": num_threads, "settings": settings}
     _write(config, out, progress, task=task, method=method, **asked)
 
 

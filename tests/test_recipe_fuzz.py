@@ -1,6 +1,7 @@
 """Whatever a recipe holds: a model, or one clear message. ASTRA_DATA_FUZZ is how many examples are tried."""
 
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -9,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astra_data.errors import RecipeError
+from astra_data.experiment import load_experiment
 from astra_data.plan import Recipe
-from astra_data.recipe import load_recipe, validated
+from astra_data.recipe import validated
 
 fuzzed = settings(
     max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "60")),
@@ -31,8 +33,9 @@ def load(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recipe.toml"
         path.write_bytes(content)
+        shutil.copy(RECIPES[0].with_name("antmaze_umaze.toml"), folder)
         try:
-            load_recipe(path, Recipe)
+            load_experiment(path, Path(folder))
         except RecipeError as error:
             assert str(error).startswith(str(path))
 

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from astra_data.plan import Recipe, plan
-from astra_data.recipe import load_recipe
+from astra_data.experiment import load_experiment
+from astra_data.plan import plan
 
 HOUSE = Path(__file__).parents[1]
 
@@ -12,4 +12,11 @@ HOUSE = Path(__file__).parents[1]
 def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
     first = path.read_text().splitlines()[0]
     assert first == f"# uv run astra-data run recipes/{path.name}"
-    assert plan(load_recipe(path, Recipe), path, Path("runs") / path.stem)
+    experiment = load_experiment(path, Path("runs"))
+    assert plan(experiment.recipe, path, experiment.folder)
+
+
+def test_only_the_legs_differ_in_the_morphology_test() -> None:
+    experiment = load_experiment(HOUSE / "recipes" / "leg_scale.toml", Path("runs"))
+    assert experiment.recipe.evaluate.leg_scale == 1.25
+    assert experiment.borrowed == {"collect", "pair", "ground", "train", "align"}

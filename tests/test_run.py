@@ -61,6 +61,26 @@ def test_items_side_by_side_share_the_cores(
         assert asked(folder / "evaluate" / row / "seed_0")["num_threads"] == each_of_two
 
 
+def test_trainings_in_the_target_get_their_share_of_the_cores_and_one_table(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.run.cores", lambda: 8)
+    methods = '["direct_transfer", "target", "full_obs"]'
+    recipe.write_text(f'task = "maze"\nmethods = {methods}\nseeds = [0]\n[target]\nnum_envs = 7\n')
+    folder = run(recipe, root=tmp_path, jobs=2, until="train")
+    for row in ("target", "full_obs"):
+        told = asked(folder / "train" / row / "seed_0")
+        assert told["num_threads"] == 4 and "num_envs=7" in str(told["settings"])
+    assert "num_threads" not in asked(folder / "train/direct_transfer/seed_0")
+
+
+def test_a_stage_may_make_what_its_own_items_read(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text('task = "maze"\nmethods = ["fine_tuned"]\nseeds = [0]\n')
+    run(recipe, root=tmp_path, until="pair")
+    folder = run_stage(recipe, "train", root=tmp_path)
+    assert asked(folder / "fine_tuned/seed_0")["initial"] == str(folder / "direct_transfer/seed_0")
+
+
 @pytest.mark.parametrize(("device", "jobs"), [("cpu", 5), ("cuda:0", 2)])
 def test_few_items_at_a_time_hold_a_context_of_a_gpu(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, jobs: int

@@ -106,6 +106,15 @@ class AntMazeEnv:
         self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
         self.toppled[rows] = False
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
+        return {"physics": torch.from_numpy(self.physics.state.copy()), "goal": self.goal.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state`."""
+        self.physics.state[:] = state["physics"].numpy()
+        self.goal = state["goal"].clone()
+
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stand frozen."""
         command = action.clamp(-1.0, 1.0).numpy().astype(np.float64)

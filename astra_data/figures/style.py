@@ -24,6 +24,7 @@ TITLES = {
     "astra_task_reward": "ASTRA, task reward",
     "iql": "IQL",
     "target": "Target",
+    "full_obs": "Full Obs",
     "follower": "Careful follower",
 }
 
@@ -40,6 +41,7 @@ COLOURS = {
     "astra_task_reward": "#117733",
     "iql": "#D55E00",
     "target": "#4D4D4D",
+    "full_obs": "#0072B2",
     "follower": "#9A9A9A",
 }
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
@@ -47,8 +49,8 @@ COLOURS = {
 SPARE_COLOURS = ("#882255", "#44AA99", "#999933", "#AA4499", "#332288", "#661100")
 """For methods without a colour of their own."""
 
-ROLES = {"direct_transfer": "floor", "follower": "ceiling"}
-"""Rows that bound the others: no grounding at all; a controller that never was in a simulator."""
+ROLES = {"direct_transfer": "floor", "target": "ceiling", "full_obs": "ceiling", "follower": "ceiling"}
+"""Rows that bound the others: no grounding at all; trained in the target itself, or written by hand."""
 
 SIMULATED = "#E07B00"
 """A simulator, in every figure (as in the paper's Fig. 3)."""

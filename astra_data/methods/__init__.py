@@ -9,6 +9,7 @@ from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
+from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {
@@ -23,6 +24,8 @@ METHODS: dict[str, Method] = {
         ASTRA_WITHOUT_LATENT,
         ASTRA_WITHOUT_REWARD,
         ASTRA_TASK_REWARD,
+        TARGET,
+        FULL_OBS,
         FOLLOWER,
     )
 }

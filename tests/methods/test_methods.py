@@ -37,6 +37,7 @@ def test_what_the_rows_of_the_paper_differ_in() -> None:
         "astra_task_reward",
     }
     assert [name for name, method in METHODS.items() if not method.trains] == ["follower"]
+    assert {name for name, method in METHODS.items() if method.steps_target} == {"target", "full_obs"}
     assert [reward(name) for name in ("direct_transfer", "nas", "astra")] == ["abstract"] * 2 + ["predicted"]
     assert [reward(name) for name in ("astra_without_reward", "astra_task_reward")] == ["abstract"] * 2
 

@@ -1,0 +1,175 @@
+"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if it is on any.
+
+    based_on = "antmaze_umaze"
+
+A recipe with this line says only what differs from the recipe of that name beside it. Stages that nothing
+differs for are not run again: links in its folder lead to the other recipe's artefacts.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from astra_data.errors import RecipeError
+from astra_data.plan import METHOD_TABLES, STAGES, Recipe
+from astra_data.recipe import did_you_mean, load_tables, validated
+
+ALWAYS_NEW = {"report"}
+"""Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A recipe and where its artefacts are.
+
+    Attributes:
+        recipe: with everything that it takes from the one that it is based on.
+        path: the recipe's file. folder: of its artefacts.
+        base: the experiment that it is based on, if any.
+    """
+
+    recipe: Recipe
+    path: Path
+    folder: Path
+    base: "Experiment | None" = None
+
+    @cached_property
+    def borrowed(self) -> set[str]:
+        """The stages whose artefacts are the base's."""
+        if self.base is None:
+            return set()
+        changed = _differences(_recorded(self.base.recipe), self.recipe)
+        return STAGES.keys() - ALWAYS_NEW - _stale_stages(changed)
+
+    def maker(self, stage: str) -> "Experiment":
+        """Return the experiment that makes the artefacts of `stage`."""
+        return self.base if self.base and stage in self.borrowed else self
+
+    def place(self, key: str) -> Path:
+        """Return where the artefact `key` is made."""
+        return self.maker(key.partition("/")[0]).folder / key
+
+    def has(self, key: str) -> bool:
+        """Tell whether the artefact `key` is finished."""
+        stage = key.partition("/")[0]
+        return self.place(key).is_dir() and not self.maker(stage)._is_link(stage)
+
+    def _is_link(self, stage: str) -> bool:
+        """Tell whether a stage's folder is a link to another recipe's, from this run or an earlier one."""
+        link = self.folder / stage
+        return link.is_symlink() and link.readlink().parent.parent == Path("..")
+
+    def link_borrowed(self) -> None:
+        """Let links in the folder lead to what is borrowed.
+
+        Raises:
+            RecipeError: there are artefacts where a link belongs.
+        """
+        for stage in STAGES:
+            link = self.folder / stage
+            if self._is_link(stage):
+                link.unlink()
+            if stage not in self.borrowed:
+                continue
+            source = self.maker(stage).folder
+            if link.exists():
+                raise RecipeError(
+                    f"{link} is in the way: {self.path} is based on {source.name}, whose {stage} it uses; "
+                    f"give the recipe another name, or remove {link}"
+                )
+            link.symlink_to(Path("..") / source.name / stage)
+
+    def check_unchanged(self) -> None:
+        """Refuse settings that differ from those that made what is already there, finished or begun.
+
+        Raises:
+            RecipeError: they do, here or in the base.
+        """
+        if self.base:
+            self.base.check_unchanged()
+        record = self.folder / "recipe.json"
+        if not record.is_file():
+            return
+        changed = _differences(json.loads(record.read_text()), self.recipe)
+        stale = _stale_stages(changed) - self.borrowed - ALWAYS_NEW
+        own = [stage for stage in STAGES if stage in stale and not self._is_link(stage)]
+        present = [str(self.folder / stage) for stage in own if (self.folder / stage).exists()]
+        if present:
+            raise RecipeError(
+                f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
+                f"give the recipe another name, or remove {' '.join(present)}"
+            )
+
+
+def load_experiment(path: Path, root: Path) -> Experiment:
+    """Read the recipe at `path`, whose artefacts are in a folder of its name in `root`.
+
+    Raises:
+        RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
+    """
+    tables = load_tables(path)
+    folder = root / path.stem
+    if "based_on" not in tables:
+        return Experiment(validated(tables, Recipe, str(path)), path, folder)
+    name = tables["based_on"]
+    known = sorted({file.stem for file in path.parent.glob("*.toml")} - {path.stem})
+    if name not in known:
+        raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
+    base_path = path.with_name(f"{name}.toml")
+    base_tables = load_tables(base_path)
+    if "based_on" in base_tables:
+        raise RecipeError(f"{path}: based_on: expected a recipe that is based on none itself, got '{name}'")
+    base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)
+    recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
+    _check_fit(recipe, base, path)
+    return Experiment(recipe, path, folder, base)
+
+
+def _recorded(recipe: Recipe) -> dict[str, Any]:
+    """Return a recipe as it is recorded in its folder."""
+    values: dict[str, Any] = json.loads(recipe.model_dump_json())
+    return values
+
+
+def _stale_stages(changed: set[str]) -> set[str]:
+    """Return the stages that a change of the keys `changed` of a recipe reaches."""
+    stale: set[str] = set()
+    for stage, reads in STAGES.items():
+        sections = {"task", stage} | ({"plus"} if stage == "train" else set())
+        sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
+        if changed & sections or stale.intersection(reads):
+            stale.add(stage)
+    return stale
+
+
+def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
+    """Return the settings of `recipe` that differ from those recorded `before`.
+
+    A table that was not known then has its defaults, which are what was done.
+    """
+    before = _recorded(type(recipe).model_construct()) | dict(before)
+    now = _recorded(recipe)
+    return {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
+
+
+def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    def both(key: str) -> Any:  # noqa: ANN401 - any value of a recipe
+        old, new = below[key], above[key]
+        return old | new if isinstance(old, dict) and isinstance(new, dict) else new
+
+    return dict(below) | {key: both(key) if key in below else value for key, value in above.items()}
+
+
+def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
+    name, faults = base.path.stem, []
+    if recipe.task != base.recipe.task:
+        faults.append(f"task: expected that of {name}, '{base.recipe.task}', got '{recipe.task}'")
+    for key in ("methods", "seeds"):
+        theirs, ours = getattr(base.recipe, key), getattr(recipe, key)
+        unknown = [value for value in ours if value not in theirs]
+        faults += [f"{key}: {name} has no '{value}', it has {list(theirs)}" for value in unknown]
+    if faults:
+        raise RecipeError(f"{path} does not fit what it is based on: {'; '.join(faults)}")

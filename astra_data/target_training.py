@@ -1,0 +1,47 @@
+"""The paper's upper bounds: policies that are trained in the target itself (Section V-A)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from astra_data.deployment import Observed
+from astra_data.policy_file import PolicyFile
+from astra_data.recipe import Config, Count
+from astra_data.target_world import TargetStarts, TargetWorld
+from astra_data.training import Training, train_by_ppo
+
+
+class TargetConfig(Config):
+    """What differs from `[train]` in the target, whose steps are slow; not in the paper."""
+
+    total_steps: Count = 2_000_000
+    """Environment steps in all."""
+    num_envs: Count = 128
+    """Target environments stepped side by side."""
+
+
+@dataclass(frozen=True)
+class TargetPpo:
+    """Train by PPO in the target, from its own rewards.
+
+    Attributes:
+        observed: whether the policy sees φ of the state, which leaves it a memory to need, or all of it.
+    """
+
+    observed: Observed
+
+    def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        """Return the policy and its learning curve."""
+        settings, episodes = training.settings, training.episodes
+        config = training.config.model_copy(update=settings.model_dump() if settings else {})
+        env = TargetWorld(
+            training.task,
+            config.num_envs,
+            observed=self.observed,
+            starts=TargetStarts.of(episodes),
+            data_start_share=config.data_start_share,
+            device=training.device,
+            num_threads=training.num_threads,
+        )
+        memory_size = config.memory_size if self.observed == "abstract" else 0
+        policy, curve = train_by_ppo(env, config, memory_size, training)
+        return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve

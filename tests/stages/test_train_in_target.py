@@ -1,0 +1,77 @@
+from pathlib import Path
+
+import pytest
+from small_run import TRAIN
+
+from astra_data import training as stage
+from astra_data.policy_file import PolicyFile
+from astra_data.progress import Progress, silent
+from astra_data.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.stages.train import train
+from astra_data.target_training import TargetConfig
+
+CONFIG = TRAIN.model_copy(update={"data_start_share": 0.5})
+SETTINGS = TargetConfig(num_envs=4, total_steps=4 * 8 * 6)
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def stop(fraction: float, note: str) -> None:
+    if fraction > 0.7:
+        raise Stopped
+
+
+def make(task: str, row: str, dataset: Path, out: Path, progress: Progress = silent) -> bytes:
+    train(
+        task,
+        row,
+        CONFIG,
+        settings=SETTINGS,
+        dataset=dataset,
+        grounding=None,
+        seed=0,
+        out=out,
+        device="cpu",
+        progress=progress,
+        num_threads=1,
+    )
+    return (out / "policy.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(("row", "observed", "size"), [("target", "abstract", 8), ("full_obs", "full", 33)])
+def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
+    task: str,
+    paired: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    row: str,
+    observed: str,
+    size: int,
+) -> None:
+    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 2)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    expected = make(task, row, paired, whole)
+    with pytest.raises(Stopped):
+        make(task, row, paired, broken, stop)
+    seen: list[float] = []
+    assert make(task, row, paired, broken, lambda done, note: seen.append(done)) == expected
+    assert seen == pytest.approx([5 / 6, 1.0])
+    trained = PolicyFile.load(whole / "policy.safetensors")
+    assert trained.simulation is None and trained.observed == observed
+    assert trained.policy.shape.observation_size == size
+    assert (trained.policy.memory is None) == (observed == "full")
+    evaluate(
+        task,
+        row,
+        EvaluateConfig(episodes=2),
+        policy=whole,
+        grounding=None,
+        target_encoder=None,
+        seed=0,
+        out=tmp_path / "evaluated",
+        progress=silent,
+        num_threads=1,
+    )
+    assert (tmp_path / "evaluated" / "evaluation.json").is_file()
