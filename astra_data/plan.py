@@ -19,6 +19,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from astra_data.errors import BadInputError
 from astra_data.fitting import GroundConfig
 from astra_data.methods import METHODS
+from astra_data.methods.compass import CompassConfig
 from astra_data.recipe import Config, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus
 from astra_data.schedule import Item
@@ -44,8 +45,8 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """Each stage, in order, and the stages whose artefacts it reads."""
 
-METHOD_TABLES = {"domain_randomization": "train"}
-"""Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
+METHOD_TABLES = {"domain_randomization": "train", "compass": "ground", "compass_uniform": "train"}
+"""Methods with settings of their own in a recipe, and the stage that they are for."""
 
 
 class Recipe(Config):
@@ -68,6 +69,13 @@ class Recipe(Config):
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
     domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
     """What domain randomization varies; by default as the paper prints it for navigation."""
+    compass: CompassConfig = CompassConfig()
+    """The ranges of `compass` and `compass_uniform`, and how the former identifies its parameters."""
+
+    @property
+    def compass_uniform(self) -> Variation:
+        """What `compass_uniform` varies."""
+        return self.compass.variation
 
     @model_validator(mode="before")
     @classmethod
