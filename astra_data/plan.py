@@ -86,9 +86,7 @@ class Recipe(Config):
     @classmethod
     def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
         train = info.data.get("train")
-        if train is None or not isinstance(overrides, dict):
-            return overrides
-        return train.model_dump() | overrides
+        return train.model_dump() | overrides if train and isinstance(overrides, dict) else overrides
 
     @field_validator("task")
     @classmethod

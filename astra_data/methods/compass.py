@@ -264,15 +264,16 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     summary = recorded.summary[usual]
     parameters = box.normal(contexts)[:, None, columns].expand(-1, len(summary), -1)
     cause = torch.cat([parameters, summary.expand(len(contexts), -1, -1)], dim=-1)
-    torch.manual_seed(derive(fitting.seed, f"{name} model"))
     effect = (difference / scale).flatten(0, 1)
+    torch.manual_seed(derive(fitting.seed, f"{name} model"))
     model = fit_causes(cause.flatten(0, 1), effect, config, penalised=len(varied))
     mask = (model.probability > config.mask_threshold).float()
     steers = torch.tensor([parameter in STEERING for parameter in varied], device=device)
     moves = mask[: len(varied)].any(-1) & steers
     here = box.normal(parameters_at(search.point))[columns].to(device)
     there = descend(model, mask, here, moves, summary).cpu()
-    values = torch.lerp(*box.ranges()[columns].unbind(-1), (there + 1.0) / 2.0)
+    low, high = box.ranges()[columns].unbind(-1)
+    values = low + (there + 1.0) / 2.0 * (high - low)
     moved = {
         parameter: _within(value, getattr(box, parameter))
         for parameter, value, moving in zip(varied, values.tolist(), moves.tolist(), strict=True)
@@ -284,11 +285,8 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     if after < before:
         search.point |= moved
     search.narrow(moved, config.shrink)
-    probabilities = model.probability[: len(varied)].tolist()
-    return {
-        parameter: dict(zip(GAPS, row, strict=True))
-        for parameter, row in zip(varied, probabilities, strict=True)
-    }
+    rows = (dict(zip(GAPS, row, strict=True)) for row in model.probability.tolist())
+    return dict(zip(varied, rows, strict=False))
 
 
 COMPASS = Method(name="compass", title="COMPASS", fit=identify)
