@@ -9,7 +9,7 @@ from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
-from astra_data.seeding import generator
+from astra_data.seeding import derive, generator
 from astra_data.simulators import hidden_before, simulator_of, start_simulator
 from astra_data.tasks import Task
 
@@ -25,6 +25,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     are distances in m and m/s after 1, 10, 50 and 200 steps; means and 95 % bootstrap intervals over
     episodes.
     """
+    torch.manual_seed(derive(seed, "gap noise"))
     windows = episodes.windows
     lengths = episodes.lengths
     pairs = [

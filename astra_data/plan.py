@@ -20,6 +20,7 @@ from astra_data.errors import BadInputError
 from astra_data.fitting import GroundConfig
 from astra_data.learners.rma import RmaConfig
 from astra_data.methods import METHODS
+from astra_data.methods.compass import CompassConfig
 from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.recipe import Config, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus, reference_of
@@ -49,11 +50,13 @@ STAGES: dict[str, tuple[str, ...]] = {
 
 METHOD_TABLES = {
     "domain_randomization": "train",
+    "compass": "ground",
+    "compass_uniform": "train",
     "rma": "train",
-    "target": "train",
     "nas_golemo": "ground",
+    "target": "train",
 }
-"""Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
+"""Methods with settings of their own in a recipe, and the stage that they are for."""
 
 
 class Recipe(Config):
@@ -84,6 +87,13 @@ class Recipe(Config):
     """How the student of rapid motor adaptation learns."""
     target: TargetConfig = TargetConfig()
     """The training of `target` and `full_obs`, laid over `[train]`."""
+    compass: CompassConfig = CompassConfig()
+    """The ranges of `compass` and `compass_uniform`, and how the former identifies its parameters."""
+
+    @property
+    def compass_uniform(self) -> Variation:
+        """What `compass_uniform` varies."""
+        return self.compass.variation
 
     @model_validator(mode="before")
     @classmethod
@@ -94,9 +104,7 @@ class Recipe(Config):
     @classmethod
     def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
         train = info.data.get("train")
-        if train is None or not isinstance(overrides, dict):
-            return overrides
-        return train.model_dump() | overrides
+        return train.model_dump() | overrides if train and isinstance(overrides, dict) else overrides
 
     @field_validator("task")
     @classmethod

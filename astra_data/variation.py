@@ -23,7 +23,7 @@ class Variation(Config):
     """Ranges of the parameters of an episode, drawn uniformly; by default all are the plain simulator's.
 
     In this simulator friction, action scale and timestep all lengthen or shorten the way of a command, so
-    trajectories tell their product only.
+    positions tell their product only; velocities, that of the first two.
     """
 
     friction: Range = (1.0, 1.0)

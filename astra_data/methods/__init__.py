@@ -3,6 +3,7 @@
 from astra_data.errors import BadInputError
 from astra_data.method import Method
 from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
+from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
@@ -18,6 +19,8 @@ METHODS: dict[str, Method] = {
         DIRECT_TRANSFER,
         DOMAIN_RANDOMIZATION,
         RMA,
+        COMPASS_UNIFORM,
+        COMPASS,
         NAS,
         NAS_GOLEMO,
         ASTRA,

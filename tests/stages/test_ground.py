@@ -4,16 +4,19 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_run import GOLEMO, GROUND
+from small_run import GOLEMO, GROUND, TRAIN
 
 from astra_data import fitting as stage
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.fitting import telemetry
-from astra_data.grounding_file import load_history_model
+from astra_data.grounding_file import load_grounding, load_history_model
+from astra_data.methods.compass import CompassConfig
 from astra_data.models.grounding import LossWeights
 from astra_data.progress import Progress, silent
 from astra_data.stages.ground import ground
+from astra_data.stages.train import train
+from astra_data.variation import Variation
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
@@ -150,3 +153,19 @@ def test_methods_without_a_grounding_and_raw_datasets_are_refused(
     assert "\n" not in str(caught.value)
     with pytest.raises(BadInputError, match="no dataset there"):
         make(task, tmp_path / "nowhere", tmp_path / "out")
+
+
+def test_identified_parameters_are_an_artefact_that_policies_are_trained_with(
+    task: str, paired: Path, tmp_path: Path
+) -> None:
+    settings = CompassConfig(contexts=4, windows=20, window=10, updates=5, iterations=1)
+    given = {"dataset": paired, "seed": 0, "device": "cpu", "progress": silent}
+    ground(task, "compass", GROUND, settings=settings, out=tmp_path / "ground", **given)  # type: ignore[arg-type]
+    files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}
+    assert {file.name for file in (tmp_path / "ground").iterdir()} == files
+    found = load_grounding(tmp_path / "ground" / "grounding.safetensors")
+    assert isinstance(found, Variation)
+    metrics = json.loads((tmp_path / "ground" / "metrics.json").read_text())
+    assert {name: (value, value) for name, value in metrics["point"].items()}.items() <= dict(found).items()
+    train(task, "compass", TRAIN, grounding=tmp_path / "ground", out=tmp_path / "train", **given)  # type: ignore[arg-type]
+    assert (tmp_path / "train" / "policy.safetensors").is_file()

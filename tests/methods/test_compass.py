@@ -1,0 +1,154 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import BadInputError
+from astra_data.fitting import Fitting, GroundConfig
+from astra_data.methods.compass import CompassConfig, identify
+from astra_data.models.grounding import Windows
+from astra_data.plan import Recipe, plan
+from astra_data.progress import Progress, silent
+from astra_data.recipe import Config, load_recipe
+from astra_data.tasks import TASKS
+from astra_data.variation import PARAMETERS, Variation
+
+TASK = TASKS["antmaze-umaze"]
+PLANTED = {"friction": 0.92, "action_scale": 0.05, "timestep_scale": 1.1, "heading_bias_deg": 3.0}
+QUICK = CompassConfig(
+    # No more noise than leaves the planted gap of 3 cm to be seen.
+    action_noise=(0.0, 0.0),
+    position_noise_m=(0.0, 0.002),
+    velocity_noise_m_s=(0.0, 0.002),
+    contexts=128,
+    windows=60,
+    window=15,
+    updates=600,
+    iterations=4,
+)
+
+
+def record(planted: dict[str, float], seed: int, episodes: int = 16, steps: int = 60) -> PairedEpisodes:
+    """Drive point masses with planted parameters by commands that are held for 15 steps."""
+    torch.manual_seed(seed)
+    variation = Variation(**{name: (value, value) for name, value in planted.items()})
+    target = TASK.varied_simulator(episodes, variation)
+    start = torch.tensor(TASK.maze.cell_centre(*TASK.maze.start), dtype=torch.float32)
+    target.reset_to(torch.cat([start, torch.zeros(2)]).repeat(episodes, 1))
+    action = (torch.rand(episodes, steps // 15, 2) * 2.0 - 1.0).repeat_interleave(15, dim=1)
+    state = torch.stack([target.state, *(target.step(action[:, step]) for step in range(steps))], dim=1)
+    none = torch.zeros(episodes, steps, 2)
+    windows = Windows(
+        state=state[:, :-1],
+        action=action,
+        previous_action=none,
+        goal=none,
+        simulated_next=state[:, 1:],
+        next_state=state[:, 1:],
+        reward=none,
+        topples_soon=none[..., 0],
+        mask=torch.ones(episodes, steps),
+    )
+    return PairedEpisodes(torch.zeros(episodes, steps, 29), windows, "planted@data-1.0.0", "0")
+
+
+def fitting(folder: Path, settings: Config | None = QUICK, progress: Progress = silent) -> Fitting:
+    training, held_out = record(PLANTED, 0), record(PLANTED, 1, episodes=4)
+    return Fitting(TASK, GroundConfig(), settings, training, held_out, 0, "cpu", folder, progress)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Variation, dict[str, Any]]:
+    return identify(fitting(tmp_path_factory.mktemp("compass")))
+
+
+def test_planted_parameters_are_found(found: tuple[Variation, dict[str, Any]]) -> None:
+    variation, metrics = found
+    point = metrics["point"]
+    speed = point["friction"] * (1.0 + point["action_scale"])
+    assert speed == pytest.approx(0.92 * 1.05, rel=0.02)
+    assert speed * point["timestep_scale"] == pytest.approx(0.92 * 1.05 * 1.1, rel=0.02)
+    assert point["heading_bias_deg"] == pytest.approx(3.0, abs=1.0)
+    before, after = metrics["held_out_gap"]["plain"], metrics["held_out_gap"]["identified"]
+    assert after["position_m"] < 0.25 * before["position_m"]
+    assert after["velocity_m_s"] < 0.4 * before["velocity_m_s"]
+    for name, value in point.items():
+        assert getattr(variation, name) == (value, value)
+    # Noise cannot be identified: it keeps its ranges.
+    for name in PARAMETERS:
+        if name not in point:
+            assert getattr(variation, name) == getattr(QUICK, name)
+
+
+def test_the_mask_tells_causes_from_bystanders(found: tuple[Variation, dict[str, Any]]) -> None:
+    mask = found[1]["mask"]
+    # Only parameters that vary are asked about.
+    assert mask.keys() == {*PLANTED, "position_noise_m", "velocity_noise_m_s"}
+    for relevant in ("friction", "action_scale", "timestep_scale"):
+        assert mask[relevant]["position_m"] > 0.7
+        assert mask["position_noise_m"]["position_m"] < QUICK.mask_threshold
+        assert mask["velocity_noise_m_s"]["position_m"] < QUICK.mask_threshold
+    # The same velocity, held for longer, is no other velocity.
+    assert mask["timestep_scale"]["velocity_m_s"] < QUICK.mask_threshold < mask["friction"]["velocity_m_s"]
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def stop(fraction: float, note: str) -> None:
+    if fraction >= 0.5:
+        raise Stopped
+
+
+def test_after_an_interruption_it_goes_on(tmp_path: Path) -> None:
+    settings = QUICK.model_copy(update={"contexts": 8, "updates": 20})
+    for name in ("whole", "interrupted"):
+        (tmp_path / name).mkdir()
+    whole, expected = identify(fitting(tmp_path / "whole", settings))
+    with pytest.raises(Stopped):
+        identify(fitting(tmp_path / "interrupted", settings, stop))
+    seen: list[str] = []
+    resumed, metrics = identify(
+        fitting(tmp_path / "interrupted", settings, lambda _, note: seen.append(note))
+    )
+    assert len(seen) == 2 and "windows/s  held-out gap 0." in seen[0]
+    assert resumed == whole
+    assert metrics["iterations"] == expected["iterations"]
+
+
+def test_around_the_point_is_within_the_ranges(
+    found: tuple[Variation, dict[str, Any]], tmp_path: Path
+) -> None:
+    fixed = {"friction": (1.0, 1.0), "heading_bias_deg": (0.0, 0.0)}
+    settings = QUICK.model_copy(update={"policy_at": "around", "contexts": 32, "iterations": 1, **fixed})
+    variation, metrics = identify(fitting(tmp_path, settings))
+    low, high = variation.timestep_scale
+    assert 0.75 <= low < metrics["point"]["timestep_scale"] < high <= 1.25
+    assert high - low <= 0.6 * (1.25 - 0.75) + 1e-6
+    assert variation.friction == (1.0, 1.0) and variation.velocity_noise_m_s == QUICK.velocity_noise_m_s
+
+
+def test_what_cannot_be_identified_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="expected episodes of at least 61 steps, the longest has 60: sh"):
+        identify(fitting(tmp_path, QUICK.model_copy(update={"window": 61})))
+    fixed = {name: (1.0, 1.0) for name in PLANTED}
+    with pytest.raises(BadInputError, match="expected a range for at least one of friction"):
+        identify(fitting(tmp_path, QUICK.model_copy(update=fixed)))
+
+
+def test_both_rows_read_the_same_table(tmp_path: Path) -> None:
+    path = tmp_path / "r.toml"
+    path.write_text(
+        'task = "antmaze-umaze"\nmethods = ["compass", "compass_uniform", "compass_plus"]\nseeds = [0]\n'
+        "[compass]\nfriction = [0.5, 0.9]\nwindow = 10\n"
+    )
+    items = {item.key: item.call.keywords for item in plan(load_recipe(path, Recipe), path, tmp_path)}  # type: ignore[attr-defined]
+    assert items["ground/compass/seed_0"]["settings"].window == 10
+    assert items["ground/compass/seed_0"]["settings"].friction == (0.5, 0.9)
+    uniform = items["train/compass_uniform/seed_0"]["settings"]
+    assert uniform == Variation(**{**CompassConfig().variation.model_dump(), "friction": (0.5, 0.9)})
+    assert items["train/compass/seed_0"]["settings"] is None
+    assert items["train/compass_plus/seed_0"]["grounding"] == tmp_path / "ground/compass/seed_0"
