@@ -18,6 +18,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from astra_data.errors import BadInputError
 from astra_data.fitting import GroundConfig
+from astra_data.learners.iql import IqlConfig
 from astra_data.methods import METHODS
 from astra_data.recipe import Config, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus
@@ -44,7 +45,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """Each stage, in order, and the stages whose artefacts it reads."""
 
-METHOD_TABLES = {"domain_randomization": "train"}
+METHOD_TABLES = {"domain_randomization": "train", "iql": "train", "direct_transfer_iql": "train"}
 """Tables of a recipe with the settings of the method of that name, and the stage that they are for."""
 
 
@@ -68,6 +69,10 @@ class Recipe(Config):
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
     domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
     """What domain randomization varies; by default as the paper prints it for navigation."""
+    iql: IqlConfig = IqlConfig()
+    """How IQL learns."""
+    direct_transfer_iql: IqlConfig = IqlConfig()
+    """How direct transfer is fine-tuned."""
 
     @model_validator(mode="before")
     @classmethod

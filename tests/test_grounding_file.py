@@ -13,7 +13,7 @@ def test_a_grounding_comes_back_frozen(tmp_path: Path) -> None:
     model = GroundingModel(shape, "detach")
     model.set_scales({"state": torch.randn(50, 4), "reward": torch.randn(50, 1)})
     empty = torch.zeros(1, 1)
-    episodes = PairedEpisodes(empty, Windows(*[empty] * 9), "toy@data-1.0.0", "abc")
+    episodes = PairedEpisodes(empty, empty, empty.bool(), Windows(*[empty] * 9), "toy@data-1.0.0", "abc")
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, model, episodes)
     loaded = load_history_model(path)

@@ -19,6 +19,7 @@ TITLES = {
     "nas": "NAS",
     "astra": "ASTRA",
     "iql": "IQL",
+    "direct_transfer_iql": "Direct transfer + IQL",
     "target": "Target",
     "follower": "Careful follower",
 }
@@ -31,6 +32,7 @@ COLOURS = {
     "nas": "#56B4E9",
     "astra": "#009E73",
     "iql": "#D55E00",
+    "direct_transfer_iql": "#7B3294",
     "target": "#4D4D4D",
     "follower": "#9A9A9A",
 }

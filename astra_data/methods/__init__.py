@@ -6,6 +6,7 @@ from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LAT
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
+from astra_data.methods.iql import DIRECT_TRANSFER_IQL, IQL
 from astra_data.methods.nas import NAS
 from astra_data.rows import PLUS, base_method
 
@@ -19,6 +20,8 @@ METHODS: dict[str, Method] = {
         ASTRA_WITHOUT_LATENT,
         ASTRA_WITHOUT_REWARD,
         ASTRA_TASK_REWARD,
+        IQL,
+        DIRECT_TRANSFER_IQL,
         FOLLOWER,
     )
 }
