@@ -70,8 +70,9 @@ class Experience:
     """E recorded episodes of up to T steps, as a policy sees them; padded at the end.
 
     Attributes:
-        observation: (E, T, O). previous_action: (E, T, A), zero at the start. action: (E, T, A).
-        reward: (E, T). next_observation: (E, T, O).
+        observation: (E, T, C), what the policy sees (O), then what only the critics see.
+        previous_action: (E, T, A), zero at the start. action: (E, T, A).
+        reward: (E, T). next_observation: (E, T, C).
         terminated: (E, T) bool, the task ended: no value beyond it. Running out of time ends nothing.
         lengths: the number of real steps of each episode, (E,).
     """
@@ -159,6 +160,13 @@ class Iql:
         self._optimizer.step()
         return {"policy": float(loss.detach()), "std": float(self.policy.log_std.detach().exp().mean())}
 
+    @torch.no_grad()
+    def values(self, observation: Tensor) -> Tensor:
+        """Return the state values (...) of `observation` (..., O)."""
+        batch = TensorDict({"observation": observation}, batch_size=observation.shape[:-1])
+        with self._loss.value_network_params.to_module(self._loss.value_network):
+            return torch.as_tensor(self._loss.value_network(batch)["state_value"].squeeze(-1))
+
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a later `load_state_dict` needs to go on from here."""
         return {
@@ -177,21 +185,21 @@ class Iql:
 
 
 def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
-    """Return every real step of `experience` with the return of the steps that follow it, (N,)."""
-    lengths = experience.lengths[:, None]
+    """Return steps of `experience` with the return of `config.return_steps` steps and what comes then, (N,).
+
+    Steps whose return the end of the record cuts short are left out; the end of the task does not cut it.
+    """
+    count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
-    is_real = step < lengths
-    reward = (experience.reward * config.reward_scale + config.reward_shift) * is_real
-    padded = nn.functional.pad(reward, (0, config.return_steps - 1))
-    weights = config.discount ** torch.arange(config.return_steps, device=reward.device)
-    summed = (padded.unfold(1, config.return_steps, 1) * weights).sum(-1)
-    last = (step + config.return_steps - 1).minimum(lengths - 1)
+    reward = (experience.reward * config.reward_scale + config.reward_shift) * (step < lengths)
+    weights = config.discount ** torch.arange(count, device=reward.device)
+    summed = (nn.functional.pad(reward, (0, count - 1)).unfold(1, count, 1) * weights).sum(-1)
+    last = (step + count - 1).minimum(lengths - 1)
     rows = (torch.arange(len(lengths), device=lengths.device)[:, None], last)
     terminated = experience.terminated[rows]
     table = {
         "observation": experience.observation,
         "action": experience.action,
-        "steps_to_next_obs": (last - step + 1).unsqueeze(-1),
         "next": {
             "observation": experience.next_observation[rows],
             "reward": summed.unsqueeze(-1),
@@ -199,7 +207,8 @@ def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
             "done": terminated.unsqueeze(-1),
         },
     }
-    return TensorDict(table, batch_size=reward.shape)[is_real]
+    whole = (step + count <= lengths) | (terminated & (step < lengths))
+    return TensorDict(table, batch_size=reward.shape)[whole]
 
 
 def _iql_loss(policy: ActorCritic, experience: Experience, config: IqlConfig) -> IQLLoss:
@@ -222,7 +231,7 @@ def _iql_loss(policy: ActorCritic, experience: Experience, config: IqlConfig) ->
         reduction="none",
         scalar_output_mode="exclude",
     )
-    loss.make_value_estimator(gamma=config.discount)
+    loss.make_value_estimator(gamma=config.discount**config.return_steps)
     return loss.to(experience.observation.device)
 
 
@@ -245,6 +254,7 @@ class _Policy(nn.Module):
     def forward(self, observation: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
         start = torch.zeros(observation.shape[:2], device=observation.device)
         hidden = self.policy.initial_hidden(len(observation))
-        features = self.policy.remember_sequence(observation, previous_action, hidden, start)
+        seen = observation[..., : self.policy.shape.observation_size]
+        features = self.policy.remember_sequence(seen, previous_action, hidden, start)
         mean, std = self.policy.policy(features)
         return mean, std

@@ -10,17 +10,22 @@ import time
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.learners.iql import Experience, Iql, IqlConfig
 from astra_data.method import Method
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.history import PositionFeatures
 from astra_data.policy_file import PolicyFile
 from astra_data.seeding import derive
+from astra_data.tasks import Task
 from astra_data.training import Training
 from astra_data.world import policy_observation
 
 _CHECKPOINT_EVERY = 500
+_POSITION_OCTAVES = 4
 
 
 def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
@@ -31,11 +36,11 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     """
     config = training.settings if isinstance(training.settings, IqlConfig) else IqlConfig()
     episodes = training.episodes
-    experience = experience_of(training)
+    experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
         shape = ActorCriticShape(
-            observation_size=experience.observation.shape[-1],
+            observation_size=experience.observation.shape[-1] - 4 * _POSITION_OCTAVES,
             action_size=experience.action.shape[-1],
             memory_size=training.config.memory_size,
             hidden_sizes=training.config.hidden_sizes,
@@ -47,15 +52,24 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     return PolicyFile(policy, None, episodes.reference, episodes.content_hash), curve
 
 
-def experience_of(training: Training) -> Experience:
-    """Return the target's side of the paired episodes as a policy sees it: φ(s_i), goal, actions, rewards."""
-    maze, episodes, windows = training.task.maze, training.episodes, training.episodes.windows
+def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
+    """Return the target's side of `episodes` as a policy sees it: φ(s_i), goal, actions, rewards.
+
+    The critics also see sines and cosines of the position.
+    """
+    windows = episodes.windows
+    features = PositionFeatures(_POSITION_OCTAVES).to(windows.state.device)
+
+    def observation(state: Tensor) -> Tensor:
+        seen = policy_observation(task.maze, state, windows.goal, None)
+        return torch.cat([seen, features(state[..., :2])], dim=-1)
+
     return Experience(
-        observation=policy_observation(maze, windows.state, windows.goal, None),
+        observation=observation(windows.state),
         previous_action=windows.previous_action,
         action=windows.action,
         reward=episodes.reward,
-        next_observation=policy_observation(maze, windows.next_state, windows.goal, None),
+        next_observation=observation(windows.next_state),
         terminated=episodes.terminated,
         lengths=episodes.lengths,
     )

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from astra_data.checkpoint import load_tensors
 from astra_data.errors import BadInputError
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policy_file import PolicyFile
 from astra_data.progress import silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.tasks import TASKS
@@ -77,6 +79,18 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
         assert len(paths[name].unique(dim=0)) == CONFIG.episodes
     assert torch.equal(followed["start"], followed["target.position"][:, 0])
     assert torch.equal(paths["start"], paths["target.position"][:, 0])
+
+
+def test_a_policy_that_was_in_no_simulator_is_tested_in_the_target_alone(
+    task: str, trained: Path, tmp_path: Path
+) -> None:
+    grounded_policy = PolicyFile.load(trained / "policy.safetensors")
+    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=4))
+    replace(grounded_policy, policy=policy, simulation=None).save(tmp_path / "policy.safetensors")
+    told, paths = make(task, "iql", tmp_path / "out", {"policy": tmp_path})
+    assert "simulated" not in told and "simulated.position" not in paths
+    assert told["encoders"].keys() == {"source"}
+    check_outcome(told["target"], paths["target.position"])
 
 
 def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
