@@ -71,7 +71,7 @@ class Recipe(Config):
     """What domain randomization varies; by default as the paper prints it for navigation."""
     iql: IqlConfig = IqlConfig()
     """How IQL learns."""
-    direct_transfer_iql: IqlConfig = IqlConfig()
+    direct_transfer_iql: IqlConfig = IqlConfig(learning_rate=3e-4)
     """How direct transfer is fine-tuned."""
 
     @model_validator(mode="before")

@@ -2,15 +2,19 @@
 
 As in their Algorithm 1 the critics come first, from single transitions, for they do not depend on the policy;
 then the policy is extracted by advantage-weighted regression, from windows of whole stretches, so that one
-with a memory learns with it. Every update seeds torch from (seed, update): a run that resumes from a
-checkpoint repeats what an uninterrupted run would have done.
+with a memory learns with it. The critics see no history: the random commands in the records are held for a
+while, and critics that know the last command learn little about any other.
+
+Every update seeds torch from (seed, update): a run that resumes from a checkpoint repeats what an
+uninterrupted run would have done.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Self
 
 import torch
+from pydantic import Field, model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -18,6 +22,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from astra_data.dataset.pairs import draw_steps
+from astra_data.errors import BadInputError
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.models.history import mlp
 from astra_data.recipe import Config, Count, NotNegative, Positive, Share
@@ -27,13 +32,13 @@ from astra_data.seeding import derive
 class IqlConfig(Config):
     """How a policy is learned from recorded episodes. The paper prints none of these."""
 
-    critic_updates: Count = 12_000
+    critic_updates: Count = 5_000
     """Gradient updates of the critics, before the first of the policy."""
-    critic_batch: Count = 512
+    critic_batch: Count = 256
     """Transitions per update of the critics."""
-    critic_sizes: tuple[int, ...] = (256, 256)
+    critic_sizes: tuple[int, ...] = (128, 128)
     """Hidden layers of each critic."""
-    critic_learning_rate: Positive = 3e-4
+    critic_learning_rate: Positive = 1e-3
     """Of the critics."""
     target_rate: Share = 0.005
     """Share by which the slow action values follow, per update."""
@@ -41,20 +46,22 @@ class IqlConfig(Config):
     """Of the action values that the state value is; as the method's authors have it for AntMaze."""
     discount: Share = 0.99
     """Of the reward, per step."""
-    return_steps: Count = 1
-    """Rewards of so many recorded steps are summed before the state value takes over; 1 is the method as
-    printed."""
+    return_steps: Count = 10
+    """Rewards of so many recorded steps are summed before the state value takes over. 1 is the method as
+    printed: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the critics'
+    errors."""
     reward_scale: Positive = 1.0
     """Factor on the recorded reward, before the shift."""
     reward_shift: float = 0.0
-    """Added to each step's reward; -1 is usual where rewards are sparse and falling over ends nothing."""
-    policy_updates: Count = 1_000
+    """Added to each step's reward; by default nothing, as progress is paid step by step. The -1 that is usual
+    for sparse rewards makes falling over pay where that ends the task."""
+    policy_updates: Count = 600
     """Gradient updates of the policy."""
-    batch_windows: Count = 48
+    batch_windows: Count = 24
     """Windows per update of the policy."""
     window: Count = 100
     """Steps per window, in backpropagation through time."""
-    burn_in: int = 20
+    burn_in: Annotated[int, Field(ge=0)] = 20
     """Steps at the start of a window that only fill the memory; none where the episode begins there."""
     learning_rate: Positive = 1e-3
     """Of the policy at the start; falls to zero along a half cosine."""
@@ -63,6 +70,12 @@ class IqlConfig(Config):
     it for AntMaze."""
     gradient_norm: Positive = 1.0
     """The policy's gradients are clipped to this norm."""
+
+    @model_validator(mode="after")
+    def _leaves_steps_to_learn_from(self) -> Self:
+        if self.burn_in >= self.window:
+            raise ValueError(f"burn_in: expected less than the window of {self.window}, got {self.burn_in}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -188,6 +201,9 @@ def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
     """Return steps of `experience` with the return of `config.return_steps` steps and what comes then, (N,).
 
     Steps whose return the end of the record cuts short are left out; the end of the task does not cut it.
+
+    Raises:
+        BadInputError: no step is left.
     """
     count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
@@ -208,6 +224,11 @@ def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
         },
     }
     whole = (step + count <= lengths) | (terminated & (step < lengths))
+    if not bool(whole.any()):
+        raise BadInputError(
+            f"expected an episode of at least {count} steps (return_steps), or one that ends the task; "
+            f"the longest has {int(lengths.max())}"
+        )
     return TensorDict(table, batch_size=reward.shape)[whole]
 
 

@@ -1,8 +1,9 @@
 """IQL on the target's own episodes, and direct transfer fine-tuned by it (Section V, "IQL" and "DT+IQL").
 
 The paper does not say whether the fine-tuning interacts with the target: ours learns from the same recorded
-episodes as every other row. What the critics see, the reward's scale and the steps of the return are said in
-`learners/iql.py`.
+episodes as every other row. On the Long Maze, after 1500 updates of the critics, the command that they value
+most has a mean cosine with the careful follower's of 0.35; of 0.50 with returns of ten steps; of 0.65 with
+sines and cosines of the position as well; but of 0.41 without those where the critics know the last command.
 """
 
 import copy

@@ -2,9 +2,11 @@ from typing import Any
 
 import pytest
 import torch
+from pydantic import ValidationError
 from torch import Tensor
 
 from astra_data.checkpoint import flatten, unflatten
+from astra_data.errors import BadInputError
 from astra_data.learners.iql import Experience, Iql, IqlConfig, transitions
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 
@@ -133,6 +135,15 @@ def test_returns_are_those_of_a_plain_loop() -> None:
             assert bool(got["next", "terminated"]) == bool(experience.terminated[episode, end - 1])
             row += 1
     assert row == len(table)
+
+
+def test_settings_and_episodes_that_leave_nothing_to_learn_from_are_told() -> None:
+    with pytest.raises(ValidationError, match="burn_in: expected less than the window of 10, got 10"):
+        IqlConfig(window=10, burn_in=10)
+    cut = constant_reward(terminated=False)
+    with pytest.raises(BadInputError, match=r"at least 4 steps \(return_steps\).*the longest has 3"):
+        transitions(cut, config(return_steps=4))
+    assert len(transitions(constant_reward(terminated=True), config(return_steps=4))) == 24
 
 
 @pytest.mark.parametrize("memory", [0, 8])
