@@ -71,8 +71,8 @@ class Recipe(Config):
     """What domain randomization varies; by default as the paper prints it for navigation."""
     iql: IqlConfig = IqlConfig()
     """How IQL learns."""
-    direct_transfer_iql: IqlConfig = IqlConfig(learning_rate=3e-4)
-    """How direct transfer is fine-tuned."""
+    direct_transfer_iql: IqlConfig = IqlConfig(learning_rate=1e-4, policy_updates=100)
+    """How direct transfer is fine-tuned; by default gently, for it unlearns more than it learns."""
 
     @model_validator(mode="before")
     @classmethod
