@@ -18,6 +18,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from astra_data.errors import BadInputError
 from astra_data.fitting import GroundConfig
+from astra_data.learners.iql import IqlConfig
 from astra_data.learners.rma import RmaConfig
 from astra_data.methods import METHODS
 from astra_data.methods.compass import CompassConfig
@@ -54,6 +55,8 @@ METHOD_TABLES = {
     "compass_uniform": "train",
     "rma": "train",
     "nas_golemo": "ground",
+    "iql": "train",
+    "direct_transfer_iql": "train",
     "target": "train",
 }
 """Methods with settings of their own in a recipe, and the stage that they are for."""
@@ -89,6 +92,10 @@ class Recipe(Config):
     """The training of `target` and `full_obs`, laid over `[train]`."""
     compass: CompassConfig = CompassConfig()
     """The ranges of `compass` and `compass_uniform`, and how the former identifies its parameters."""
+    iql: IqlConfig = IqlConfig()
+    """How IQL learns."""
+    direct_transfer_iql: IqlConfig = IqlConfig(learning_rate=1e-4, policy_updates=100)
+    """How direct transfer is fine-tuned; by default gently, for it unlearns more than it learns."""
 
     @property
     def compass_uniform(self) -> Variation:

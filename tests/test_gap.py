@@ -35,7 +35,14 @@ def episodes(speed: float) -> PairedEpisodes:
         topples_soon=torch.zeros(3, STEPS),
         mask=mask,
     )
-    return PairedEpisodes(torch.zeros(3, STEPS, 29), windows, "toy@data-1.0.0", "0")
+    return PairedEpisodes(
+        target_state=torch.zeros(3, STEPS, 29),
+        reward=torch.zeros(3, STEPS),
+        terminated=torch.zeros(3, STEPS, dtype=torch.bool),
+        windows=windows,
+        reference="toy@data-1.0.0",
+        content_hash="0",
+    )
 
 
 def untrained() -> GroundingModel:

@@ -9,12 +9,16 @@ from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.models.residual import ResidualModel, ResidualShape
 
 
+def no_episodes() -> PairedEpisodes:
+    empty = torch.zeros(1, 1)
+    return PairedEpisodes(empty, empty, empty.bool(), Windows(*[empty] * 9), "toy@data-1.0.0", "abc")
+
+
 def test_a_grounding_comes_back_frozen(tmp_path: Path) -> None:
     shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
     model = GroundingModel(shape, "detach")
     model.set_scales({"state": torch.randn(50, 4), "reward": torch.randn(50, 1)})
-    empty = torch.zeros(1, 1)
-    episodes = PairedEpisodes(empty, Windows(*[empty] * 9), "toy@data-1.0.0", "abc")
+    episodes = no_episodes()
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, model, episodes)
     loaded = load_history_model(path)
@@ -30,7 +34,7 @@ def test_a_grounding_comes_back_frozen(tmp_path: Path) -> None:
 def test_a_residual_model_comes_back_frozen(tmp_path: Path) -> None:
     model = ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=2))
     model.set_scales(torch.randn(50, 4), torch.randn(50, 4))
-    episodes = PairedEpisodes(torch.zeros(1, 1), Windows(*[torch.zeros(1, 1)] * 9), "toy@data-1.0.0", "abc")
+    episodes = no_episodes()
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, model, episodes)
     loaded = load_grounding(path)

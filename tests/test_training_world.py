@@ -35,7 +35,14 @@ def episodes() -> PairedEpisodes:
         topples_soon=torch.zeros(2, 400),
         mask=mask,
     )
-    return PairedEpisodes(torch.zeros(2, 400, 29), windows, "toy@data-1.0.0", "0")
+    return PairedEpisodes(
+        target_state=torch.zeros(2, 400, 29),
+        reward=torch.zeros(2, 400),
+        terminated=torch.zeros(2, 400, dtype=torch.bool),
+        windows=windows,
+        reference="toy@data-1.0.0",
+        content_hash="0",
+    )
 
 
 @pytest.fixture

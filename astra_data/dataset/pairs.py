@@ -37,12 +37,16 @@ class PairedEpisodes:
     """E paired episodes, padded at the end to T steps.
 
     Attributes:
-        target_state: s_i, (E, T, S). windows: everything else, (E, T, ...), with the mask of real steps.
+        target_state: s_i, (E, T, S). reward: what the target paid for each step, (E, T).
+        terminated: (E, T) bool, the task ended there, well or badly; never by running out of time.
+        windows: everything else, (E, T, ...), with the mask of real steps.
         reference: name and version of the dataset. content_hash: its hash.
         held_out: which episodes the dataset itself sets aside, (E,) bool; None where it does not.
     """
 
     target_state: Tensor
+    reward: Tensor
+    terminated: Tensor
     windows: Windows
     reference: str
     content_hash: str
@@ -71,6 +75,8 @@ class PairedEpisodes:
         ended = columns[TERMINATED]
         return cls(
             target_state=padded(columns[STATE]),
+            reward=padded(columns[REWARD]),
+            terminated=padded(ended).bool(),
             windows=Windows(
                 state=padded(columns[ABSTRACT_STATE]),
                 action=action,
@@ -105,6 +111,8 @@ class PairedEpisodes:
         return replace(
             self,
             target_state=self.target_state[episodes],
+            reward=self.reward[episodes],
+            terminated=self.terminated[episodes],
             windows=_gather(self.windows, episodes),
             held_out=None if self.held_out is None else self.held_out[episodes],
         )
@@ -130,24 +138,38 @@ class PairedEpisodes:
         return values[self.windows.mask.bool()]
 
     def draw_windows(self, count: int, length: int) -> tuple[Windows, Tensor]:
-        """Draw windows of `length` steps, each step equally likely; from torch's global generator.
-
-        A window that is drawn across an end of its episode is moved inside, and its mask marks only the
-        steps that were drawn. Without those, the last steps, where episodes topple, would hardly be seen.
+        """Draw windows of `length` steps as `draw_steps` does; the mask marks only the steps that were drawn.
 
         Returns:
             the windows (count, length, ...), and the target states in them (count, length, S).
         """
-        length = min(length, self.windows.mask.shape[1])
-        beginnings = self.lengths + length - 1
-        episodes = torch.multinomial(beginnings.float(), count, replacement=True)
-        drawn = (torch.rand(count, device=episodes.device) * beginnings[episodes]).long() - (length - 1)
-        first = drawn.clamp_min(0).minimum((self.lengths[episodes] - length).clamp_min(0))
-        steps = first[:, None] + torch.arange(length, device=first.device)
-        rows = (episodes[:, None], steps)
-        windows = _gather(self.windows, rows)
-        is_drawn = (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
-        return replace(windows, mask=windows.mask * is_drawn), self.target_state[rows]
+        episodes, steps, is_drawn = draw_steps(self.lengths, count, length)
+        windows = _gather(self.windows, (episodes, steps))
+        return replace(windows, mask=windows.mask * is_drawn), self.target_state[episodes, steps]
+
+
+def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw windows of `length` steps, each step equally likely; from torch's global generator.
+
+    A window that is drawn across an end of its episode is moved inside. Without those, the last steps, where
+    episodes topple, would hardly be seen.
+
+    Args:
+        lengths: of the episodes, (E,).
+        count: of windows.
+        length: of each window; at most the longest episode's.
+
+    Returns:
+        episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn, (count,
+        length) bool. In an episode shorter than `length`, steps beyond its end are among them.
+    """
+    length = min(length, int(lengths.max()))
+    beginnings = lengths + length - 1
+    episodes = torch.multinomial(beginnings.float(), count, replacement=True)
+    drawn = (torch.rand(count, device=episodes.device) * beginnings[episodes]).long() - (length - 1)
+    first = drawn.clamp_min(0).minimum((lengths[episodes] - length).clamp_min(0))
+    steps = first[:, None] + torch.arange(length, device=first.device)
+    return episodes[:, None], steps, (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
 
 
 def _soon(toppled: NDArray[np.bool_], lengths: NDArray[np.int64]) -> NDArray[np.bool_]:

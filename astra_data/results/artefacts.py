@@ -102,6 +102,7 @@ class CurveFile(Artefact):
 
     steps_per_second: float | None = None
     simulator_steps_per_second: float | None = None
+    updates_per_second: float | None = None
     points: list[Point] = Field(min_length=1)
 
 

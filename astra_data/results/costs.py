@@ -12,7 +12,7 @@ THROUGHPUT = {
     "collect": ("target_steps_per_second",),
     "pair": ("pairs_per_second",),
     "ground": ("windows_per_second",),
-    "train": ("simulator_steps_per_second", "steps_per_second"),
+    "train": ("simulator_steps_per_second", "steps_per_second", "updates_per_second"),
     "align": ("windows_per_second",),
     "evaluate": ("target_steps_per_second",),
 }

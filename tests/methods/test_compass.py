@@ -51,7 +51,10 @@ def record(planted: dict[str, float], seed: int, episodes: int = 16, steps: int 
         topples_soon=none[..., 0],
         mask=torch.ones(episodes, steps),
     )
-    return PairedEpisodes(torch.zeros(episodes, steps, 29), windows, "planted@data-1.0.0", "0")
+    unpaid = none[..., 0]
+    return PairedEpisodes(
+        torch.zeros(episodes, steps, 29), unpaid, unpaid.bool(), windows, "planted@data-1.0.0", "0"
+    )
 
 
 def fitting(folder: Path, settings: Config | None = QUICK, progress: Progress = silent) -> Fitting:

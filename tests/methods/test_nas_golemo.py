@@ -32,7 +32,8 @@ def episodes(count: int, lacking: Tensor, action: Tensor) -> PairedEpisodes:
         topples_soon=torch.zeros(count, STEPS),
         mask=mask,
     )
-    return PairedEpisodes(torch.zeros(count, STEPS, 29), windows, "toy@data-1.0.0", "0")
+    none = torch.zeros(count, STEPS)
+    return PairedEpisodes(torch.zeros(count, STEPS, 29), none, none.bool(), windows, "toy@data-1.0.0", "0")
 
 
 def fitting(both: PairedEpisodes, folder: Path, config: GolemoConfig = CONFIG) -> Fitting:

@@ -12,6 +12,8 @@ from torch import Tensor
 from astra_data.checkpoint import load_tensors
 from astra_data.errors import BadInputError
 from astra_data.learners.rma import RmaConfig
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policy_file import PolicyFile
 from astra_data.progress import silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.train import train
@@ -111,6 +113,18 @@ def test_simulators_that_all_rows_share_begin_and_reward_alike(
     follower, _ = make(task, "follower", tmp_path / "follower", {"reference": grounded})
     assert "simulated" not in follower
     assert min(follower["raw"]["return"]) > max(transferred["raw"]["return"])
+
+
+def test_a_policy_that_was_in_no_simulator_is_tested_in_the_target_alone(
+    task: str, trained: Path, tmp_path: Path
+) -> None:
+    grounded_policy = PolicyFile.load(trained / "policy.safetensors")
+    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=4))
+    replace(grounded_policy, policy=policy, simulation=None).save(tmp_path / "policy.safetensors")
+    told, paths = make(task, "iql", tmp_path / "out", {"policy": tmp_path})
+    assert "simulated" not in told and "simulated.position" not in paths
+    assert told["encoders"].keys() == {"source"}
+    check_outcome(told["target"], paths["target.position"])
 
 
 def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(

@@ -1,0 +1,159 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.learners.iql import IqlConfig
+from astra_data.methods import METHODS, iql
+from astra_data.methods.iql import experience_of, learn_from_episodes
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.grounding import Windows
+from astra_data.policy_file import PolicyFile, deploy
+from astra_data.progress import Progress, silent
+from astra_data.tasks import TASKS
+from astra_data.training import TrainConfig, Training
+
+TASK = TASKS["antmaze-umaze"]
+STEPS = 30
+CONFIG = IqlConfig(
+    critic_updates=12,
+    critic_batch=16,
+    critic_sizes=(8,),
+    policy_updates=8,
+    batch_windows=4,
+    window=10,
+    burn_in=2,
+)
+
+
+@pytest.fixture
+def episodes() -> PairedEpisodes:
+    """Return six episodes of random states; the last one is 20 steps long and ends well."""
+    torch.manual_seed(0)
+    state, goal = torch.randn(6, STEPS + 1, 4), torch.randn(6, 1, 2).expand(6, STEPS, 2)
+    action = torch.rand(6, STEPS, 2) * 2 - 1
+    mask, terminated = torch.ones(6, STEPS), torch.zeros(6, STEPS, dtype=torch.bool)
+    mask[5, 20:] = 0.0
+    terminated[5, 19] = True
+    windows = Windows(
+        state=state[:, :-1],
+        action=action,
+        previous_action=torch.cat([torch.zeros(6, 1, 2), action[:, :-1]], dim=1),
+        goal=goal,
+        simulated_next=torch.full((6, STEPS, 4), torch.nan),
+        next_state=state[:, 1:],
+        reward=torch.full((6, STEPS, 2), torch.nan),
+        topples_soon=torch.zeros(6, STEPS),
+        mask=mask,
+    )
+    return PairedEpisodes(
+        target_state=torch.randn(6, STEPS, 29),
+        reward=torch.randn(6, STEPS),
+        terminated=terminated,
+        windows=windows,
+        reference="toy@data-1.0.0",
+        content_hash="abc",
+    )
+
+
+@pytest.fixture
+def given() -> PolicyFile:
+    torch.manual_seed(5)
+    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=8))
+    return PolicyFile(policy.requires_grad_(False), None, "toy@data-1.0.0", "abc")
+
+
+Learn = Callable[..., tuple[PolicyFile, dict[str, Any]]]
+
+
+@pytest.fixture
+def learn(episodes: PairedEpisodes, tmp_path: Path) -> Learn:
+    def learn(
+        initial: PolicyFile | None = None, progress: Progress = silent, **settings: object
+    ) -> tuple[PolicyFile, dict[str, Any]]:
+        return learn_from_episodes(
+            Training(
+                task=TASK,
+                config=TrainConfig(memory_size=8, hidden_sizes=(16,)),
+                settings=CONFIG.model_copy(update=settings),
+                episodes=episodes,
+                grounding=None,
+                initial=initial,
+                seed=3,
+                device="cpu",
+                folder=tmp_path,
+                progress=progress,
+            )
+        )
+
+    return learn
+
+
+def test_only_the_targets_side_is_learned_from(episodes: PairedEpisodes) -> None:
+    experience = experience_of(TASK, episodes)
+    assert experience.observation.shape == experience.next_observation.shape == (6, STEPS, 8 + 16)
+    assert torch.equal(experience.observation[:, 1:, :2], experience.next_observation[:, :-1, :2])
+    assert experience.observation.isfinite().all()
+    assert torch.equal(experience.reward, episodes.reward)
+    assert experience.lengths.tolist() == [STEPS] * 5 + [20]
+    assert experience.terminated.nonzero().tolist() == [[5, 19]]
+
+
+def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
+    trained, curve = learn()
+    assert trained.policy.shape == ActorCriticShape(8, 2, 8, hidden_sizes=(16,))
+    assert trained.simulation is None
+    assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "abc")
+    assert [(point["steps"], point["success"]) for point in curve["points"]] == [(20, None)]
+    assert curve["updates_per_second"] > 0
+    deployed = deploy(TASK, trained, None)
+    deployed.start(3)
+    assert deployed.act(torch.randn(3, 29), torch.randn(3, 2)).abs().max() <= 1.0
+
+
+def test_fine_tuning_begins_with_the_given_policy(learn: Learn, given: PolicyFile, tmp_path: Path) -> None:
+    before = {name: value.clone() for name, value in given.policy.state_dict().items()}
+    rested, _ = learn(given, policy_updates=0)
+    assert all(torch.equal(rested.policy.state_dict()[name], value) for name, value in before.items())
+    (tmp_path / "checkpoint.safetensors").unlink()
+    tuned, _ = learn(given)
+    assert tuned.policy.shape == given.policy.shape
+    assert not torch.equal(tuned.policy.state_dict()["actor.4.weight"], before["actor.4.weight"])
+    assert all(torch.equal(given.policy.state_dict()[name], value) for name, value in before.items())
+    assert METHODS["direct_transfer_iql"].initial == "direct_transfer"
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def test_after_an_interruption_it_goes_on(
+    learn: Learn, given: PolicyFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(iql, "_CHECKPOINT_EVERY", 15)
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    whole, curve = learn(given)
+    checkpoint.unlink()
+    seen: list[float] = []
+
+    def stop(done: float, note: str) -> None:
+        raise Stopped
+
+    def watch(done: float, note: str) -> None:
+        seen.append(done)
+
+    with pytest.raises(Stopped):
+        learn(given, stop)
+    assert not checkpoint.exists()
+    with pytest.raises(Stopped):
+        learn(given, lambda done, note: stop(done, note) if done == 1.0 else None)
+    assert checkpoint.exists()
+    resumed, again = learn(given, watch)
+    assert seen == [1.0]
+    assert again["points"] == curve["points"]
+    whole.save(tmp_path / "whole")
+    resumed.save(tmp_path / "resumed")
+    assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
