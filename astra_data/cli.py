@@ -59,10 +59,13 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "evaluate": recipes.evaluate,
         "report": recipes.report,
     },
-    "Recipes or datasets": {"collect": building.collect, "pair": building.pair},
+    "Recipes or datasets": {
+        "collect": building.collect,
+        "pair": building.pair,
+        "subset": editing.subset,
+    },
     "Datasets": {
         "augment": augmenting.augment,
-        "subset": editing.subset,
         "merge": editing.merge,
         "delete": editing.delete,
         "filter": editing.filter_,

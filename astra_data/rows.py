@@ -1,4 +1,7 @@
-"""Rows of the results: a method by its name, or followed by `_plus`, trained with the `[plus]` settings."""
+"""Rows of the results: a method by its name, or followed by `_plus`, trained with the `[plus]` settings.
+
+And where in a stage's folder what belongs to one seed of a row lies.
+"""
 
 PLUS = "_plus"
 
@@ -11,3 +14,8 @@ def is_plus(row: str) -> bool:
 def base_method(row: str) -> str:
     """Return the name of a row's method: `astra` of "astra" and of "astra_plus"."""
     return row.removesuffix(PLUS)
+
+
+def place(seed: int, percent: int | None = None) -> str:
+    """Return the folder of a seed, within that of the dataset's size where there are several."""
+    return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -14,8 +15,9 @@ from rich.console import Console
 from astra_data.cores import cores
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.experiment import METHOD_TABLES, STAGES, WHOLE, Part, Recipe
 from astra_data.lock import held
-from astra_data.plan import METHOD_TABLES, STAGES, Recipe, plan, select, stage_of
+from astra_data.plan import plan, select, stage_of
 from astra_data.recipe import did_you_mean, load_recipe
 from astra_data.rows import base_method
 from astra_data.schedule import Item, execute
@@ -56,7 +58,7 @@ def run(
     _check_stage(until or "report")
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
-    planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device)
+    planned = plan(recipe, recipe_path, folder, Part.of(recipe, seeds=seeds), device=device)
     items = [item for item in planned if stage_of(item) in wanted]
     _make(recipe, folder, items, jobs, device)
     return folder
@@ -83,7 +85,8 @@ def run_stage(
     """
     _check_stage(stage)
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
-    planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device, publish=publish)
+    part = Part.of(recipe, seeds=seeds)
+    planned = plan(recipe, recipe_path, folder, part, device=device, publish=publish)
     items = _selected(recipe, planned, stage, method)
     reads = [key for item in items if not _finished(item, folder) for key in item.inputs]
     missing = next((key for key in reads if not (folder / key).is_dir()), None)
@@ -171,11 +174,11 @@ def _check_unchanged(recipe: Recipe, folder: Path) -> None:
     record = folder / "recipe.json"
     if not record.is_file():
         return
-    before, now = json.loads(record.read_text()), json.loads(recipe.model_dump_json())
+    before, now = _told(json.loads(record.read_text())), _told(json.loads(recipe.model_dump_json()))
     changed = {key for key in now.keys() - {"methods", "seeds"} if before.get(key) != now[key]}
     stale: set[str] = set()
     for stage, reads in STAGES.items():
-        sections = {"task", stage} | ({"plus"} if stage == "train" else set())
+        sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
         sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
         if changed & sections or stale.intersection(reads):
             stale.add(stage)
@@ -186,3 +189,9 @@ def _check_unchanged(recipe: Recipe, folder: Path) -> None:
             f"{' and '.join(sorted(changed))} changed in the recipe since {folder} was made: "
             f"give the recipe another name, or remove {' '.join(present)}"
         )
+
+
+def _told(settings: dict[str, Any]) -> dict[str, Any]:
+    """Say of the sizes only what the artefacts of the others depend on: the largest."""
+    percents = settings.get("sweep", {}).get("percent", ())
+    return settings | {"sweep": max(percents, default=WHOLE)}

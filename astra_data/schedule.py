@@ -26,11 +26,13 @@ class Item:
         key: its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`.
         inputs: keys of the artefacts that it reads.
         call: makes it; called as `call(progress=...)` in another process, so it must be picklable.
+        device: torch device that it computes on.
     """
 
     key: str
     inputs: tuple[str, ...]
     call: Callable[..., object]
+    device: str = "cpu"
 
 
 class Watcher(Protocol):

@@ -22,12 +22,17 @@ class Reported:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     groundings: Mapping[str, str]
+    percents: tuple[int, ...]
 
 
 class FakeConfig(Config):
     steps: int = 1
     rate: float = 0.5
     fails: bool = False
+
+
+class FakeCollectConfig(FakeConfig):
+    episodes: int = 200
 
 
 class FakeMethod:
@@ -62,13 +67,17 @@ def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -
 
 
 def collect(
-    task: str, config: FakeConfig, *, seed: int, out: Path, progress: Progress, num_threads: int
+    task: str, config: FakeCollectConfig, *, seed: int, out: Path, progress: Progress, num_threads: int
 ) -> None:
-    _write(config, out, progress, task=task, seed=seed, num_threads=num_threads)
+    _write(config, out, progress, task=task, seed=seed, episodes=config.episodes, num_threads=num_threads)
 
 
 def pair(task: str, config: FakeConfig, *, dataset: Path, out: Path, progress: Progress) -> None:
     _write(config, out, progress, task=task, dataset=dataset)
+
+
+def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progress) -> None:
+    _write(FakeConfig(), out, progress, dataset=dataset, percent=percent, of=of)
 
 
 def ground(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astra_data.errors import RecipeError
-from astra_data.plan import Recipe
+from astra_data.experiment import Recipe
 from astra_data.recipe import load_recipe, validated
 
 fuzzed = settings(
