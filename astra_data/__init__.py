@@ -14,5 +14,6 @@ learning    tasks  simulators  world  target_world  training_world  policy_file 
             learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
-roof        experiment  plan  schedule  display  inspection_page  run  commands/  cli
+roof        experiment  plan  schedule  cluster  display  board  inspection_page  run  sweep  commands/
+            cli
 """

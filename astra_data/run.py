@@ -3,7 +3,8 @@
 import json
 import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from astra_data.cluster import execute_on_cluster
 from astra_data.cores import cores
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
@@ -20,7 +22,7 @@ from astra_data.lock import held
 from astra_data.plan import plan, select, stage_of
 from astra_data.recipe import did_you_mean, load_recipe
 from astra_data.rows import base_method
-from astra_data.schedule import Item, execute
+from astra_data.schedule import Item, Watcher, execute
 
 RUNS = Path("runs")
 ALWAYS_NEW = {"report"}
@@ -60,7 +62,7 @@ def run(
     wanted = list(STAGES)[: list(STAGES).index(until or "report") + 1]
     planned = plan(recipe, recipe_path, folder, Part.of(recipe, seeds=seeds), device=device)
     items = [item for item in planned if stage_of(item) in wanted]
-    _make(recipe, folder, items, jobs, device)
+    make(recipe, folder, items, jobs=jobs, device=device)
     return folder
 
 
@@ -88,13 +90,13 @@ def run_stage(
     part = Part.of(recipe, seeds=seeds)
     planned = plan(recipe, recipe_path, folder, part, device=device, publish=publish)
     items = _selected(recipe, planned, stage, method)
-    reads = [key for item in items if not _finished(item, folder) for key in item.inputs]
+    reads = [key for item in items if not finished(item, folder) for key in item.inputs]
     missing = next((key for key in reads if not (folder / key).is_dir()), None)
     if missing:
         option = "" if root == RUNS else f" --root {root}"
         command = f"astra-data {missing.partition('/')[0]} {recipe_path}{option}"
         raise MissingStageError(f"{folder / missing} is missing: run `{command}` first")
-    _make(recipe, folder, items, jobs, device)
+    make(recipe, folder, items, jobs=jobs, device=device)
     return folder / stage
 
 
@@ -102,11 +104,41 @@ def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
     """Validate a recipe without running it; return each planned artefact and whether it is finished."""
     recipe, folder = load_recipe(recipe_path, Recipe), root / recipe_path.stem
     _check_unchanged(recipe, folder)
-    return {item.key: _finished(item, folder) for item in plan(recipe, recipe_path, folder)}
+    return {item.key: finished(item, folder) for item in plan(recipe, recipe_path, folder)}
 
 
-def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | None, device: str) -> None:
-    _check_device(device)
+Show = Callable[[int, Console], AbstractContextManager[Watcher]]
+"""Begins to show so many items, as `display.display` does."""
+
+
+def make(
+    recipe: Recipe,
+    folder: Path,
+    items: Collection[Item],
+    *,
+    jobs: int | None,
+    device: str,
+    cluster: str | None = None,
+    show: Show = display,
+) -> None:
+    """Make those of a recipe's `items` that are not finished yet.
+
+    Args:
+        recipe: whose artefacts they are.
+        folder: the recipe's.
+        items: each after those it reads.
+        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
+        device: torch device of the networks.
+        cluster: address of the Ray cluster that works, or "local" for one that is started; by default
+            processes of this machine do.
+        show: shows how the items get on.
+
+    Raises:
+        RecipeError: the recipe differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder, or device or cluster are not there.
+        AstraDataError: an item failed.
+    """
+    _check_device(device, cluster)
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder) as ours:
         if not ours:
@@ -115,12 +147,16 @@ def _make(recipe: Recipe, folder: Path, items: Collection[Item], jobs: int | Non
         partial_file = folder / ".recipe.json.partial"
         partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
         os.replace(partial_file, folder / "recipe.json")
-        items = [item for item in items if not _finished(item, folder)]
-        jobs = jobs or _default_jobs(device)
+        items = [item for item in items if not finished(item, folder)]
         # The networks get one thread: faster as small as they are, and idle threads slow down other items.
-        prepare = partial(torch.set_num_threads, 1)
-        with display(len(items), Console()) as watch:
-            execute(_share_cores(items, jobs), jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+        prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
+        with show(len(items), Console()) as watch:
+            if cluster is None:
+                jobs = jobs or _default_jobs(device)
+                execute(_share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+            else:
+                items = [_with_threads(item, 1) for item in items]
+                execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
 
 
 def _default_jobs(device: str) -> int:
@@ -130,16 +166,17 @@ def _default_jobs(device: str) -> int:
 def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
     """Tell the items that step the target's physics their share of the cores."""
     counts = Counter(map(stage_of, items))
-    shared = []
-    for item in items:
-        if stage_of(item) in PHYSICS:
-            num_threads = max(1, cores() // min(jobs, counts[stage_of(item)]))
-            item = replace(item, call=partial(item.call, num_threads=num_threads))
-        shared.append(item)
-    return shared
+    return [_with_threads(item, max(1, cores() // min(jobs, counts[stage_of(item)]))) for item in items]
 
 
-def _finished(item: Item, folder: Path) -> bool:
+def _with_threads(item: Item, num_threads: int) -> Item:
+    if stage_of(item) not in PHYSICS:
+        return item
+    return replace(item, call=partial(item.call, num_threads=num_threads))
+
+
+def finished(item: Item, folder: Path) -> bool:
+    """Tell whether the artefact of `item` is there, and is not to be made anew."""
     return stage_of(item) not in ALWAYS_NEW and (folder / item.key).is_dir()
 
 
@@ -159,11 +196,16 @@ def _check_stage(stage: str) -> None:
         raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
 
 
-def _check_device(device: str) -> None:
+def _check_device(device: str, cluster: str | None) -> None:
     try:
         wanted = torch.device(device)
     except RuntimeError:
         raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'") from None
+    if cluster is not None:
+        # Ray gives each task its own GPU, which is the only one that it sees.
+        if wanted.index:
+            raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
+        return
     count = torch.cuda.device_count()
     if wanted.type == "cuda" and (wanted.index or 0) >= count:
         raise BadInputError(f"device '{device}' is not here: torch sees {count} CUDA devices")

@@ -24,7 +24,8 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     for module in (plan, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setattr(experiment, "TASKS", {"maze": None})
-    monkeypatch.setattr("astra_data.run.Recipe", model)
+    for roof in ("run", "sweep"):
+        monkeypatch.setattr(f"astra_data.{roof}.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
     monkeypatch.setattr("torch.set_num_threads", int)

@@ -9,6 +9,8 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from astra_data.errors import BadInputError
 from astra_data.progress import Progress
@@ -54,7 +56,13 @@ METHODS = {
 }
 
 
-def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -> None:
+def _write(
+    config: FakeConfig,
+    out: Path,
+    progress: Progress,
+    files: Mapping[str, object] = MappingProxyType({}),
+    **asked: Any,  # noqa: ANN401 - JSON
+) -> None:
     folder = out.with_name(f".{out.name}.partial")
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "attempts").open("a") as file:
@@ -63,6 +71,8 @@ def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -
     if config.fails:
         raise BadInputError("told to fail")
     (folder / "asked.json").write_text(json.dumps(asked | {"steps": config.steps}, default=str))
+    for name, content in files.items():
+        (folder / f"{name}.json").write_text(json.dumps(content))
     os.replace(folder, out)
 
 
@@ -93,7 +103,7 @@ def ground(
     progress: Progress,
 ) -> None:
     asked = {"settings": settings, "dataset": dataset, "seed": seed, "device": device}
-    _write(config, out, progress, task=task, method=method, **asked)
+    _write(config, out, progress, {"metrics": {"wall_seconds": 1.5}}, task=task, method=method, **asked)
 
 
 def train(
@@ -111,7 +121,7 @@ def train(
     progress: Progress,
 ) -> None:
     asked = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
-    _write(config, out, progress, task=task, method=method, **asked)
+    _write(config, out, progress, {"curve": {"wall_seconds": 20.0}}, task=task, method=method, **asked)
 
 
 def align(
@@ -124,7 +134,8 @@ def align(
     device: str,
     progress: Progress,
 ) -> None:
-    _write(config, out, progress, dataset=dataset, grounding=grounding, seed=seed)
+    asked = {"dataset": dataset, "grounding": grounding, "seed": seed}
+    _write(config, out, progress, {"metrics": {"wall_seconds": 0.25}}, **asked)
 
 
 def evaluate(
@@ -140,8 +151,22 @@ def evaluate(
     progress: Progress,
     num_threads: int,
 ) -> None:
-    asked = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
-    _write(config, out, progress, task=task, method=method, seed=seed, num_threads=num_threads, **asked)
+    asked: dict[str, Any] = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
+    asked |= {"task": task, "method": method, "seed": seed, "num_threads": num_threads}
+    outcomes = {name: [0.0, 1.0] for name in ("success", "topple", "wall_contact", "steps", "return")}
+    evaluation = {
+        "task": task,
+        "method": method,
+        "seed": seed,
+        "episodes": 2,
+        "dataset_version": "fake@data-1.0.0",
+        "dataset_hash": f"hash{seed}",
+        "git_commit": "abc",
+        "wall_seconds": 3.0,
+        "target": outcomes | {"success": [float(seed), 1.0]},
+        "simulated": None if policy is None else outcomes,
+    }
+    _write(config, out, progress, {"evaluation": evaluation}, **asked)
 
 
 def report(
