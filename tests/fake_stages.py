@@ -178,7 +178,7 @@ def report(
     progress: Progress,
     config: FakeConfig,
 ) -> None:
-    asked: dict[str, object] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
+    asked: dict[str, Any] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
     asked |= {"command": command, "publish": publish}
     shutil.rmtree(root / "report", ignore_errors=True)
     _write(config, root / "report", progress, **asked)

@@ -4,6 +4,7 @@ style         colours, titles and roles of the methods; fonts and lines
 scores        success_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
 coverage      coverage: which positions or velocities a dataset holds
+sizes         data_efficiency: success over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
 """
 
@@ -11,6 +12,7 @@ from astra_data.figures.coverage import coverage
 from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.figures.scores import Curve, learning_curves, success_bars
+from astra_data.figures.sizes import Visits, data_efficiency
 from astra_data.figures.style import ROLES, method_colour, method_title, png
 
 __all__ = [
@@ -18,7 +20,9 @@ __all__ = [
     "Curve",
     "OpenLoop",
     "Panel",
+    "Visits",
     "coverage",
+    "data_efficiency",
     "dynamics_mismatch",
     "learning_curves",
     "method_colour",

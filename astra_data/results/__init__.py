@@ -5,5 +5,7 @@ runs          find those files for all rows and seeds
 model         Results: what results.json holds
 assembly      artefacts → Results
 page          Results → Markdown
+sizes         Results of each size of the dataset, and their page
+wording       numbers and origins in the words of a page
 provenance    commit, machine and package versions, for every stage to record
 """

@@ -53,14 +53,15 @@ def assemble(
     command: str,
     replicates: int,
     groundings: Mapping[str, str] | None = None,
+    percent: int | None = None,
 ) -> Results:
-    """Read every artefact under `root` and summarise it.
+    """Read every artefact under `root` and summarise it; of one size of the dataset where there are several.
 
     Raises:
         MissingStageError: a row has no evaluation, or other artefacts for some of its seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
-    read = Runs(recipe, root, tuple(methods), tuple(seeds), groundings or {})
+    read = Runs(recipe, root, tuple(methods), tuple(seeds), groundings or {}, percent)
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, methods)
     episodes = _check_alike(evaluations, task)
@@ -68,7 +69,7 @@ def assemble(
     gaps = read.optional("ground", "gap.json", Gap)
     curves = read.optional("train", "curve.json", CurveFile)
     alignments = read.optional("align", "metrics.json", Metrics)
-    datasets = {stage: read.datasets(stage) for stage in ("collect", "pair")}
+    datasets = {stage: read.datasets(stage) for stage in ("collect", "pair", "subset")}
     rows = {
         method: _row(
             method,

@@ -1,13 +1,23 @@
 """Results → Markdown: tables, figures and how to read them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from astra_data.figures import method_title
-from astra_data.results.model import BandMeans, Origin, Results
+from astra_data.results.model import BandMeans, Results
+from astra_data.results.wording import (
+    by_stage,
+    commit,
+    duration,
+    ends,
+    interval,
+    line,
+    machine,
+    spread,
+    versions,
+)
 from astra_data.rows import is_plus
-from astra_data.statistics import Summary
 
 HOW_TO_READ = {
     "success": (
@@ -76,35 +86,35 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 
 def _head(results: Results) -> str:
     stages = [origin for origin in results.origins if origin.machine and origin.stages != ["report"]]
-    machines = " and ".join(dict.fromkeys(_machine(origin) for origin in stages))
+    machines = " and ".join(dict.fromkeys(machine(origin) for origin in stages))
     seeds = ", ".join(str(seed) for seed in results.seeds)
     return (
         f"# {results.recipe}\n\n"
         f"Task `{results.task}`, seeds {seeds}, {results.episodes} episodes per row and seed. Produced by\n\n"
         f"```\n{results.command}\n```\n\n"
         f"on {machines or 'a machine that was not recorded'}. "
-        f"Wall time of the stages, summed: {_duration(results.wall_seconds['total'])}."
+        f"Wall time of the stages, summed: {duration(results.wall_seconds['total'])}."
     )
 
 
 def _table(results: Results) -> str:
     rows = results.methods
     best = max((row.summary["success"].mean for row in rows.values() if not row.role), default=None)
-    lines = [_line(COLUMNS), _line(["---", *["---:"] * (len(COLUMNS) - 1)])]
+    lines = [line(COLUMNS), line(["---", *["---:"] * (len(COLUMNS) - 1)])]
     for row in rows.values():
         summary = row.summary
-        success = _spread(summary["success"], 2)
+        success = spread(summary["success"], 2)
         lines.append(
-            _line(
+            line(
                 [
                     f"{row.title} ({row.role})" if row.role else row.title,
                     f"**{success}**" if not row.role and summary["success"].mean == best else success,
-                    _interval(summary["success"]),
-                    _spread(summary["topple"], 2),
-                    _spread(summary["wall_contact"], 2),
-                    _spread(summary["steps"], 0),
-                    _spread(summary["return"], 1),
-                    _spread(summary["simulated_success"], 2) if "simulated_success" in summary else "-",
+                    interval(summary["success"]),
+                    spread(summary["topple"], 2),
+                    spread(summary["wall_contact"], 2),
+                    spread(summary["steps"], 0),
+                    spread(summary["return"], 1),
+                    spread(summary["simulated_success"], 2) if "simulated_success" in summary else "-",
                 ]
             )
         )
@@ -121,13 +131,13 @@ def _table(results: Results) -> str:
 def _comparison(results: Results) -> str:
     rows = results.methods
     lines = [
-        _line([rows[ours].title, rows[other].title, f"{found.probability:.2f}{_ends(found.low, found.high)}"])
+        line([rows[ours].title, rows[other].title, f"{found.probability:.2f}{ends(found.low, found.high)}"])
         for ours, over in results.probability_of_improvement.items()
         for other, found in over.items()
     ]
     if not lines:
         return ""
-    head = [_line(["row", "beats", "probability [95 %]"]), _line(["---", "---", "---:"])]
+    head = [line(["row", "beats", "probability [95 %]"]), line(["---", "---", "---:"])]
     note = (
         "How likely a seed of the one has a higher success rate than a seed of the other; ties count half. "
         "Only rows that are trained alike are compared: all with the `[plus]` settings, or all without."
@@ -137,14 +147,14 @@ def _comparison(results: Results) -> str:
 
 def _encoders(results: Results) -> str:
     lines = [
-        _line([row.title, encoder, _mean_std(values["success"])])
+        line([row.title, encoder, _mean_std(values["success"])])
         for row in results.methods.values()
         for encoder, values in row.encoders.items()
         if len(row.encoders) > 1 and "success" in values
     ]
     if not lines:
         return ""
-    head = [_line(["method", "encoder", "success"]), _line(["---", "---", "---:"])]
+    head = [line(["method", "encoder", "success"]), line(["---", "---", "---:"])]
     note = "The same policy, fed by the simulator's encoder (source) or the one aligned to the target."
     return "## Encoders\n\n" + "\n".join(head + lines) + f"\n\n{note}"
 
@@ -157,14 +167,14 @@ def _gap(results: Results) -> str:
     parts = []
     for quantity in first.grounded:
         columns = [f"{horizon} step{'s' if horizon > 1 else ''}" for horizon in first.horizons]
-        lines = [_line([f"`{quantity}`", *columns]), _line(["---", *["---:"] * len(columns)])]
+        lines = [line([f"`{quantity}`", *columns]), line(["---", *["---:"] * len(columns)])]
         shared = all(gap.raw[quantity] == first.raw[quantity] for gap in gaps.values())
         if shared:
-            lines.append(_line(["No grounding", *_cells(first.raw[quantity])]))
+            lines.append(line(["No grounding", *_cells(first.raw[quantity])]))
         for title, gap in gaps.items():
             if not shared:
-                lines.append(_line([f"{title}, no grounding", *_cells(gap.raw[quantity])]))
-            lines.append(_line([f"{title}, grounded", *_cells(gap.grounded[quantity])]))
+                lines.append(line([f"{title}, no grounding", *_cells(gap.raw[quantity])]))
+            lines.append(line([f"{title}, grounded", *_cells(gap.grounded[quantity])]))
         parts.append("\n".join(lines))
     note = "Mean error [95 % interval] after so many steps of the target's own actions, averaged over seeds."
     return "## Gap\n\n" + "\n\n".join(parts) + f"\n\n{note}"
@@ -176,15 +186,15 @@ def _cells(band: BandMeans) -> list[str]:
 
 
 def _cost(results: Results) -> str:
-    lines = [_line(["stage", "wall time", "speed"]), _line(["---", "---:", "---"])]
+    lines = [line(["stage", "wall time", "speed"]), line(["---", "---:", "---"])]
     for stage in ("collect", "pair", "ground", "train", "align", "evaluate"):
         speeds = results.throughput.get(stage, {})
         shown = [f"{_rates(rows)} {_unit(figure)}" for figure, rows in speeds.items() if rows]
         seconds = results.wall_seconds.get(stage)
         if shown or seconds is not None:
-            time = "-" if seconds is None else _duration(seconds)
-            lines.append(_line([stage, time, "; ".join(shown)]))
-    lines.append(_line(["total", _duration(results.wall_seconds["total"]), ""]))
+            time = "-" if seconds is None else duration(seconds)
+            lines.append(line([stage, time, "; ".join(shown)]))
+    lines.append(line(["total", duration(results.wall_seconds["total"]), ""]))
     note = (
         "Wall time: summed over rows and seeds, which run side by side; a dash where a stage recorded none. "
         "Speed: of one item beside the others, averaged over seeds. Simulator steps/s: the world alone; PPO "
@@ -203,9 +213,9 @@ def _rates(rows: Mapping[str, list[float]]) -> str:
 
 def _origin(results: Results) -> str:
     lines = [
-        f"- Code: {_by_stage(results.origins, _commit)}.",
-        f"- Machine: {_by_stage(results.origins, _machine)}.",
-        f"- Versions: {_by_stage(results.origins, _versions)}.",
+        f"- Code: {by_stage(results.origins, commit)}.",
+        f"- Machine: {by_stage(results.origins, machine)}.",
+        f"- Versions: {by_stage(results.origins, versions)}.",
     ]
     hashes_of: dict[tuple[str, str, str], list[str]] = {}
     for dataset in results.datasets:
@@ -215,41 +225,11 @@ def _origin(results: Results) -> str:
         lines.append(f"- Dataset of `{stage}`: {name} {version}, content {', '.join(contents)}.")
     for use in results.evaluated_with:
         rows = ", ".join(results.methods[method].title for method in use.methods)
-        versions = ", ".join(dict.fromkeys(version for version in use.versions if version is not None))
+        numbers = ", ".join(dict.fromkeys(version for version in use.versions if version is not None))
         hashes = ", ".join(dict.fromkeys(f"`{digest}`" for digest in use.hashes if digest is not None))
-        named = f"{versions or 'no dataset'}{f' ({hashes})' if hashes else ''}"
+        named = f"{numbers or 'no dataset'}{f' ({hashes})' if hashes else ''}"
         lines.append(f"- Dataset named by the evaluations of {rows}: {named}.")
     return "## Where this comes from\n\n" + "\n".join(lines)
-
-
-def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:
-    """Return what all origins say, or each text with the stages that it holds for."""
-    stages: dict[str, list[str]] = {}
-    for origin in origins:
-        stages.setdefault(text(origin), []).extend(origin.stages)
-    if len(stages) == 1:
-        return next(iter(stages))
-    return "; ".join(f"{said} ({', '.join(dict.fromkeys(of))})" for said, of in stages.items())
-
-
-def _commit(origin: Origin) -> str:
-    if origin.commit is None:
-        return "not recorded"
-    commit = origin.commit.removesuffix("-dirty")
-    return f"commit `{commit}`{' with uncommitted changes' if commit != origin.commit else ''}"
-
-
-def _machine(origin: Origin) -> str:
-    machine = origin.machine
-    if machine is None:
-        return "not recorded"
-    gpu = f", {machine.gpu}" if machine.gpu else ""
-    return f"{machine.cpu}, {machine.cores} cores, {machine.memory_gib:g} GiB of memory{gpu}"
-
-
-def _versions(origin: Origin) -> str:
-    known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
-    return ", ".join(known) or "not recorded"
 
 
 def _figure(name: str, figures: Mapping[str, str]) -> str:
@@ -258,26 +238,9 @@ def _figure(name: str, figures: Mapping[str, str]) -> str:
     return f"## {CAPTIONS[name]}\n\n![{CAPTIONS[name]}]({figures[name]})\n\n{HOW_TO_READ[name]}"
 
 
-def _line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _spread(summary: Summary, digits: int) -> str:
-    spread = "" if summary.std is None else f" ± {summary.std:.{digits}f}"
-    return f"{summary.mean:.{digits}f}{spread}"
-
-
 def _mean_std(values: list[float]) -> str:
     spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
     return f"{np.mean(values):.2f}{spread}"
-
-
-def _interval(summary: Summary) -> str:
-    return f"{summary.iqm:.2f}{_ends(summary.low, summary.high)}"
-
-
-def _ends(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f" [{low:.2f}, {high:.2f}]"
 
 
 def _unit(figure: str) -> str:
@@ -288,11 +251,3 @@ def _unit(figure: str) -> str:
 
 def _short(rate: float) -> str:
     return f"{rate / 1000:.3g} k" if rate >= 1000 else f"{rate:.3g}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
