@@ -14,13 +14,13 @@ from astra_data.errors import AstraDataError, BadInputError, MissingStageError
 from astra_data.schedule import Item
 from astra_data.sweep import sweep
 
+# As `execute_on_cluster` has it; Ray looks when it is imported.
+os.environ |= {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0"}
 pytest.importorskip("ray", reason="ray is not installed: uv sync --extra ray")
 
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - only where Ray is installed
 
     node = {"num_cpus": 1, "include_dashboard": False}

@@ -193,7 +193,7 @@ def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
     *maps, success = figure.axes
     # Sizes are in order, however they are given.
     assert [axes.get_title() for axes in maps] == ["25 %", "100 %", "150 %"]
-    assert [np.max(axes.images[0].get_array()) for axes in maps] == [1, 4, 9]
+    assert [axes.images[0].get_array().max() for axes in maps] == [1, 4, 9]  # type: ignore[union-attr]
     line = success.lines[0]
     assert np.array(line.get_xdata()).tolist() == [25, 100, 150]
     assert np.array(line.get_ydata()).tolist() == [0.1, 0.7, 0.8]
