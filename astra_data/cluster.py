@@ -22,6 +22,13 @@ HERE = "local"
 """The address of a cluster of this machine alone, which begins and ends with the run."""
 GPU_SHARE = 0.5
 """Of a GPU for an item that computes on one: two hold their contexts there side by side."""
+SETTINGS = {
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
+}
+"""Otherwise Ray has `uv run` build an environment for every worker, reports its use, and lets
+its workers give way to every other process."""
 PATIENCE_S = 10
 """How long cancelled tasks are waited for."""
 
@@ -105,9 +112,8 @@ class Mailbox:
 
 
 def _connect(address: str, jobs: int | None) -> Any:  # noqa: ANN401 - the module
-    # Otherwise Ray has `uv run` build a new environment in every worker, and reports each cluster home.
-    os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
     ray = optional("ray", "ray")
     local = {"num_cpus": jobs or cores(), "include_dashboard": False} if address == HERE else {}
     try:

@@ -9,13 +9,13 @@ import pytest
 from fake_items import crash, fail, hang, kill_itself, rendezvous, touch
 from test_schedule import Record
 
-from astra_data.cluster import execute_on_cluster
+from astra_data.cluster import SETTINGS, execute_on_cluster
 from astra_data.errors import AstraDataError, BadInputError, MissingStageError
 from astra_data.schedule import Item
 from astra_data.sweep import sweep
 
-# As `execute_on_cluster` has it; Ray looks when it is imported.
-os.environ |= {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0"}
+# Ray looks when it is imported.
+os.environ |= SETTINGS
 pytest.importorskip("ray", reason="ray is not installed: uv sync --extra ray")
 
 
