@@ -44,7 +44,8 @@ def execute_on_cluster(
 ) -> None:
     """Run `items` as `schedule.execute` does, each as a task with one core of the cluster at `address`.
 
-    Relative paths mean the same on every machine: a task works in this process's working folder.
+    Relative paths and modules mean the same on every machine: a task works in this process's working folder
+    and looks for modules where it does.
 
     Args:
         items: in order of preference.
@@ -75,7 +76,8 @@ def execute_on_cluster(
                 # Unpickled inside the task, when its log is in place.
                 call = pickle.dumps((prepare, item.call))
                 log = logs / f"{item.key}.txt"
-                begun = task.options(num_gpus=share).remote(item.key, call, log, Path.cwd(), mailbox)
+                here = Path.cwd(), sys.path
+                begun = task.options(num_gpus=share).remote(item.key, call, log, here, mailbox)
                 running[begun] = item.key
             if not running:
                 raise ValueError(f"items wait for each other: {', '.join(sorted(unfinished))}")
@@ -147,11 +149,19 @@ def _finish(ray: Any, task_id: Any, key: str, watch: Watcher) -> None:  # noqa: 
     watch.finished(key, outcome)
 
 
-def _work(key: str, call: bytes, log: Path, folder: Path, mailbox: Any) -> float | AstraDataError:  # noqa: ANN401
+def _work(
+    key: str,
+    call: bytes,
+    log: Path,
+    here: tuple[Path, list[str]],
+    mailbox: Any,  # noqa: ANN401 - Ray's
+) -> float | AstraDataError:
     """Run an item; return its wall-clock time in s, or the error with which it failed."""
     # The tasks of a worker follow each other, and what they import stays.
     ray = sys.modules["ray"]
+    folder, modules = here
     os.chdir(folder)
+    sys.path.extend(place for place in modules if place not in sys.path)
     began = time.perf_counter()
 
     def tell(note: tuple[float, str] | None) -> None:
