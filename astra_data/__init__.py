@@ -14,5 +14,6 @@ learning    tasks  simulators  world  target_world  training_world  policy_file 
             target_training  method  learners/
 methods     methods/ (one file each: what is different about it)
 stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
-roof        plan  experiment  schedule  display  inspection_page  run  commands/  cli
+roof        request  plan  experiment  schedule  cluster  display  board  inspection_page  run  sweep
+            commands/  cli
 """

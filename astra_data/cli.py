@@ -22,6 +22,7 @@ from astra_data.commands import (
     inspecting,
     recipes,
     sharing,
+    sweeping,
 )
 from astra_data.errors import AstraDataError
 
@@ -52,6 +53,7 @@ def _options(
 PANELS: dict[str, dict[str, Callable[..., None]]] = {
     "Recipes": {
         "run": recipes.run,
+        "sweep": sweeping.sweep,
         "check": recipes.check,
         "ground": recipes.ground,
         "train": recipes.train,
@@ -59,10 +61,13 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "evaluate": recipes.evaluate,
         "report": recipes.report,
     },
-    "Recipes or datasets": {"collect": building.collect, "pair": building.pair},
+    "Recipes or datasets": {
+        "collect": building.collect,
+        "pair": building.pair,
+        "subset": editing.subset,
+    },
     "Datasets": {
         "augment": augmenting.augment,
-        "subset": editing.subset,
         "merge": editing.merge,
         "delete": editing.delete,
         "filter": editing.filter_,

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from astra_data.progress import Progress as Notes
@@ -16,8 +17,8 @@ SECONDS_OF_SPEED = 600
 
 
 @contextmanager
-def display(total: int, console: Console) -> Iterator[Watcher]:
-    """Show `total` items getting on, as it suits `console`."""
+def display(total: int, console: Console, above: RenderableType = "") -> Iterator[Watcher]:
+    """Show `total` items getting on, as it suits `console`; in a terminal with `above` over them."""
     if not console.is_terminal:
         yield PlainDisplay(total, console)
         return
@@ -28,7 +29,8 @@ def display(total: int, console: Console) -> Iterator[Watcher]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
     )
-    with Progress(*columns, console=console, speed_estimate_period=SECONDS_OF_SPEED) as progress:
+    progress = Progress(*columns, console=console, speed_estimate_period=SECONDS_OF_SPEED)
+    with Live(Group(above, progress) if above else progress, console=console):
         yield LiveDisplay(total, progress)
 
 
@@ -67,6 +69,10 @@ class PlainDisplay:
         self._finished += 1
         self._print(f"{key}  finished in {seconds:.1f} s  ({self._finished} of {self._total})")
 
+    def failed(self, key: str) -> None:
+        """Print that the item has failed."""
+        self._print(f"{key}  failed")
+
     def _print(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
@@ -95,3 +101,7 @@ class LiveDisplay:
         text = f"{self._finished} of {self._total} finished"
         self._progress.update(self._whole, completed=self._finished, description=text)
         self._progress.console.print(f"{key}  finished in {seconds:.1f} s", markup=False, highlight=False)
+
+    def failed(self, key: str) -> None:
+        """Leave the item's line where it stopped."""
+        self._progress.update(self._tasks[key], note="failed")

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.errors import RecipeError
-from astra_data.plan import METHOD_TABLES, STAGES, Recipe
 from astra_data.recipe import did_you_mean, load_tables, validated
+from astra_data.request import METHOD_TABLES, STAGES, WHOLE, Recipe
 
 ALWAYS_NEW = {"report"}
 """Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
@@ -138,7 +138,7 @@ def _stale_stages(changed: set[str]) -> set[str]:
     """Return the stages that a change of the keys `changed` of a recipe reaches."""
     stale: set[str] = set()
     for stage, reads in STAGES.items():
-        sections = {"task", stage} | ({"plus"} if stage == "train" else set())
+        sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
         sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
         if changed & sections or stale.intersection(reads):
             stale.add(stage)
@@ -151,8 +151,14 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     A table that was not known then has its defaults, which are what was done.
     """
     before = _recorded(type(recipe).model_construct()) | dict(before)
-    now = _recorded(recipe)
+    before, now = _told(before), _told(_recorded(recipe))
     return {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
+
+
+def _told(settings: dict[str, Any]) -> dict[str, Any]:
+    """Say of the sizes only what the artefacts of the others depend on: the largest."""
+    percents = settings.get("sweep", {}).get("percent", ())
+    return settings | {"sweep": max(percents, default=WHOLE)}
 
 
 def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -111,14 +111,14 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     )
 
 
-def visited(dataset: Dataset) -> Map | None:
-    """Count where the robot was; None where the state's roles do not tell.
+def visited(dataset: Dataset, role: str = "position") -> Map | None:
+    """Count where the robot was, or another planar `role` of its state; None where the state has none.
 
     Raises:
         CorruptDatasetError: a file cannot be read.
     """
     states = [column for column in dataset.schema if column.name == STATE]
-    found = _empty_map(_empty_spreads(dataset, states), "position")
+    found = _empty_map(_empty_spreads(dataset, states), role)
     if found is None:
         return None
     planar, group = found

@@ -1,4 +1,7 @@
-"""Rows of the results: a method by its name, or followed by `_plus`, trained with the `[plus]` settings."""
+"""Rows of the results: a method by its name, or followed by `_plus`, trained with the `[plus]` settings.
+
+And where in a stage's folder what belongs to one seed of a row lies.
+"""
 
 from collections.abc import Iterable
 
@@ -21,3 +24,8 @@ def reference_of(rows: Iterable[str]) -> str | None:
     Otherwise they have none in common, and each is tested in its own.
     """
     return "nas" if "nas" in map(base_method, rows) else None
+
+
+def place(seed: int, percent: int | None = None) -> str:
+    """Return the folder of a seed, within that of the dataset's size where there are several."""
+    return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"

@@ -2,7 +2,8 @@
 
 import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,15 +11,17 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
+from astra_data.cluster import execute_on_cluster
 from astra_data.cores import cores
 from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError
 from astra_data.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.lock import held
-from astra_data.plan import STAGES, Recipe, plan, stage_of
+from astra_data.plan import plan, stage_of
 from astra_data.recipe import did_you_mean
+from astra_data.request import STAGES, Part, Recipe
 from astra_data.rows import base_method
-from astra_data.schedule import Item, execute
+from astra_data.schedule import Item, Watcher, execute
 
 RUNS = Path("runs")
 CUDA_JOBS = 2
@@ -53,8 +56,10 @@ def run(
     _check_stage(until or "report")
     experiment = load_experiment(recipe_path, root)
     wanted = set(list(STAGES)[: list(STAGES).index(until or "report") + 1]) - experiment.borrowed
-    planned = plan(experiment.recipe, recipe_path, experiment.folder, seeds=seeds, device=device)
-    _make(experiment, [item for item in planned if stage_of(item) in wanted], jobs, device)
+    part = Part.of(experiment.recipe, seeds=seeds)
+    planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
+    items = [item for item in planned if stage_of(item) in wanted]
+    make(experiment, items, jobs=jobs, device=device)
     return experiment.folder
 
 
@@ -85,8 +90,9 @@ def run_stage(
             f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` for that"
         )
     recipe, folder = experiment.recipe, experiment.folder
-    planned = plan(recipe, recipe_path, folder, seeds=seeds, device=device, publish=publish)
-    _make(experiment, _selected(recipe, planned, stage, method), jobs, device)
+    part = Part.of(recipe, seeds=seeds)
+    planned = plan(recipe, recipe_path, folder, part, device=device, publish=publish)
+    make(experiment, _selected(recipe, planned, stage, method), jobs=jobs, device=device)
     return folder / stage
 
 
@@ -95,28 +101,61 @@ def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
     experiment = load_experiment(recipe_path, root)
     experiment.check_unchanged()
     planned = plan(experiment.recipe, recipe_path, experiment.folder)
-    return {item.key: _finished(item, experiment) for item in planned}
+    return {item.key: finished(item, experiment) for item in planned}
 
 
-def _make(experiment: Experiment, items: Collection[Item], jobs: int | None, device: str) -> None:
-    _check_device(device)
+Show = Callable[[int, Console], AbstractContextManager[Watcher]]
+"""Begins to show so many items, as `display.display` does."""
+
+
+def make(
+    experiment: Experiment,
+    items: Collection[Item],
+    *,
+    jobs: int | None,
+    device: str,
+    cluster: str | None = None,
+    show: Show = display,
+) -> None:
+    """Make those of an experiment's `items` that are not finished yet.
+
+    Args:
+        experiment: whose artefacts they are.
+        items: each after those it reads.
+        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
+        device: torch device of the networks.
+        cluster: address of the Ray cluster that works, or "local" for one that is started; by default
+            processes of this machine do.
+        show: shows how the items get on.
+
+    Raises:
+        MissingStageError: an artefact that an item reads is neither finished nor among them.
+        RecipeError: the recipe differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder, or device or cluster are not there.
+        AstraDataError: an item failed.
+    """
+    _check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
-        items = [item for item in items if not _finished(item, experiment)]
+        items = [item for item in items if not finished(item, experiment)]
         _check_inputs(experiment, items)
         experiment.link_borrowed()
         partial_file = folder / ".recipe.json.partial"
         partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
         os.replace(partial_file, folder / "recipe.json")
-        jobs = jobs or _default_jobs(device)
         # The networks get one thread: faster as small as they are, and idle threads slow down other items.
-        prepare = partial(torch.set_num_threads, 1)
-        with display(len(items), Console()) as watch:
-            execute(_share_cores(items, jobs), jobs=jobs, logs=folder / "logs", watch=watch, prepare=prepare)
+        prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
+        with show(len(items), Console()) as watch:
+            if cluster is None:
+                jobs = jobs or _default_jobs(device)
+                execute(_share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+            else:
+                items = [_with_threads(item, 1) for item in items]
+                execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
 
 
 def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
@@ -141,16 +180,17 @@ def _default_jobs(device: str) -> int:
 def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
     """Tell the items that step the target's physics their share of the cores."""
     counts = Counter(map(stage_of, items))
-    shared = []
-    for item in items:
-        if item.is_threaded:
-            num_threads = max(1, cores() // min(jobs, counts[stage_of(item)]))
-            item = replace(item, call=partial(item.call, num_threads=num_threads))
-        shared.append(item)
-    return shared
+    return [_with_threads(item, max(1, cores() // min(jobs, counts[stage_of(item)]))) for item in items]
 
 
-def _finished(item: Item, experiment: Experiment) -> bool:
+def _with_threads(item: Item, num_threads: int) -> Item:
+    if not item.is_threaded:
+        return item
+    return replace(item, call=partial(item.call, num_threads=num_threads))
+
+
+def finished(item: Item, experiment: Experiment) -> bool:
+    """Tell whether the artefact of `item` is there, and is not to be made anew."""
     return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
 
 
@@ -175,11 +215,16 @@ def _check_stage(stage: str) -> None:
         raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
 
 
-def _check_device(device: str) -> None:
+def _check_device(device: str, cluster: str | None) -> None:
     try:
         wanted = torch.device(device)
     except RuntimeError:
         raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'") from None
+    if cluster is not None:
+        # Ray gives each task its own GPU, which is the only one that it sees.
+        if wanted.index:
+            raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
+        return
     count = torch.cuda.device_count()
     if wanted.type == "cuda" and (wanted.index or 0) >= count:
         raise BadInputError(f"device '{device}' is not here: torch sees {count} CUDA devices")

@@ -27,12 +27,14 @@ class Item:
         inputs: keys of the artefacts that it reads.
         call: makes it; called as `call(progress=...)` in another process, so it must be picklable.
         is_threaded: whether `call` also takes `num_threads`, which it works the faster with.
+        device: torch device that it computes on.
     """
 
     key: str
     inputs: tuple[str, ...]
     call: Callable[..., object]
     is_threaded: bool = False
+    device: str = "cpu"
 
 
 class Watcher(Protocol):
@@ -46,6 +48,9 @@ class Watcher(Protocol):
 
     def finished(self, key: str, seconds: float) -> None:
         """Say that an item is finished, and its wall-clock time."""
+
+    def failed(self, key: str) -> None:
+        """Say that an item has failed; no other goes on."""
 
 
 def execute(
@@ -134,8 +139,10 @@ class _Worker:
         try:
             message = self.connection.recv()
         except (EOFError, ConnectionResetError):
+            watch.failed(key)
             raise AstraDataError(f"{key} {self._death()}") from None
         if isinstance(message, AstraDataError):
+            watch.failed(key)
             raise type(message)(f"{key}: {message}")
         if message is not None:
             watch.progressed(key, *message)
@@ -177,7 +184,7 @@ def _serve(connection: Connection, prepare: Callable[[], object] | None) -> None
         # The log is in place before the item's modules are imported, which is when they may warn.
         call: Callable[..., object] = connection.recv()
         try:
-            call(progress=_Reporter(connection))
+            call(progress=Reporter(connection.send))
         except AstraDataError as error:
             connection.send(error)
         else:
@@ -196,15 +203,16 @@ def _leave_with_parent() -> None:
     os._exit(1)
 
 
-class _Reporter:
+class Reporter:
     """The `progress` of an item: sends at most ten notes a second."""
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+    def __init__(self, send: Callable[[tuple[float, str]], object]) -> None:
+        self._send = send
         self._next = 0.0
 
     def __call__(self, fraction: float, note: str) -> None:
+        """Send the fraction done and the note, unless another was sent just now."""
         now = time.monotonic()
         if now >= self._next:
             self._next = now + SECONDS_BETWEEN_NOTES
-            self._connection.send((fraction, note))
+            self._send((fraction, note))

@@ -6,7 +6,7 @@ import pytest
 from pydantic import create_model
 
 if TYPE_CHECKING:
-    from astra_data.plan import Recipe
+    from astra_data.request import Recipe
 
 
 @pytest.fixture
@@ -14,12 +14,16 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     """Replace the stages, methods and tasks by fake ones, and return the model of their recipes."""
     # Imported here, so that tests of other parts need not wait for every stage.
     plan = importlib.import_module("astra_data.plan")
-    sections = {name: (fake_stages.FakeConfig, ...) for name in (*plan.STAGES, "plus")}
-    model: type[Recipe] = create_model("FakeRecipe", __base__=plan.Recipe, **sections)  # type: ignore[call-overload]
+    request = importlib.import_module("astra_data.request")
+    tables = [name for name in (*plan.STAGES, "plus") if name in request.Recipe.model_fields]
+    sections = {name: (fake_stages.FakeConfig, ...) for name in tables}
+    sections["collect"] = (fake_stages.FakeCollectConfig, ...)
+    model: type[Recipe] = create_model("FakeRecipe", __base__=request.Recipe, **sections)  # type: ignore[call-overload]
     for stage in plan.STAGES:
         monkeypatch.setattr(plan, stage, getattr(fake_stages, stage))
-    monkeypatch.setattr(plan, "METHODS", fake_stages.METHODS)
-    monkeypatch.setattr(plan, "TASKS", {"maze": None})
+    for module in (plan, request):
+        monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
+    monkeypatch.setattr(request, "TASKS", {"maze": None})
     monkeypatch.setattr("astra_data.experiment.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)

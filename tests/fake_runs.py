@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
+from astra_data.rows import place
+
 ROWS = ("direct_transfer", "astra", "astra_plus", "follower")
 SEEDS = (0, 1, 2)
 SUCCESS = {
@@ -32,6 +34,7 @@ class FakeRecipe:
     methods: tuple[str, ...] = ROWS
     seeds: tuple[int, ...] = SEEDS
     groundings: Mapping[str, str] = field(default_factory=dict)
+    percents: tuple[int, ...] = ()
 
 
 def write_json(path: Path, values: object) -> None:
@@ -54,8 +57,10 @@ def outcomes(success: list[int], seed: int) -> dict[str, list[float]]:
     }
 
 
-def write_evaluation(root: Path, method: str, seed: int, *, name: str = "") -> None:
-    folder = root / "evaluate" / (name or method) / f"seed_{seed}"
+def write_evaluation(
+    root: Path, method: str, seed: int, percent: int | None = None, *, name: str = ""
+) -> None:
+    folder = root / "evaluate" / (name or method) / place(seed, percent)
     values: dict[str, object] = {
         "task": "antmaze-u",
         "method": name or method,

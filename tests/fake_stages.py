@@ -9,6 +9,8 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from astra_data.errors import BadInputError
 from astra_data.progress import Progress
@@ -22,12 +24,17 @@ class Reported:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     groundings: Mapping[str, str]
+    percents: tuple[int, ...]
 
 
 class FakeConfig(Config):
     steps: int = 1
     rate: float = 0.5
     fails: bool = False
+
+
+class FakeCollectConfig(FakeConfig):
+    episodes: int = 200
 
 
 class FakeMethod:
@@ -59,7 +66,13 @@ METHODS = {
 }
 
 
-def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -> None:
+def _write(
+    config: FakeConfig,
+    out: Path,
+    progress: Progress,
+    files: Mapping[str, object] = MappingProxyType({}),
+    **asked: Any,  # noqa: ANN401 - JSON
+) -> None:
     folder = out.with_name(f".{out.name}.partial")
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "attempts").open("a") as file:
@@ -68,17 +81,23 @@ def _write(config: FakeConfig, out: Path, progress: Progress, **asked: object) -
     if config.fails:
         raise BadInputError("told to fail")
     (folder / "asked.json").write_text(json.dumps(asked | {"steps": config.steps}, default=str))
+    for name, content in files.items():
+        (folder / f"{name}.json").write_text(json.dumps(content))
     os.replace(folder, out)
 
 
 def collect(
-    task: str, config: FakeConfig, *, seed: int, out: Path, progress: Progress, num_threads: int
+    task: str, config: FakeCollectConfig, *, seed: int, out: Path, progress: Progress, num_threads: int
 ) -> None:
-    _write(config, out, progress, task=task, seed=seed, num_threads=num_threads)
+    _write(config, out, progress, task=task, seed=seed, episodes=config.episodes, num_threads=num_threads)
 
 
 def pair(task: str, config: FakeConfig, *, dataset: Path, out: Path, progress: Progress) -> None:
     _write(config, out, progress, task=task, dataset=dataset)
+
+
+def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progress) -> None:
+    _write(FakeConfig(), out, progress, dataset=dataset, percent=percent, of=of)
 
 
 def ground(
@@ -94,7 +113,7 @@ def ground(
     progress: Progress,
 ) -> None:
     asked = {"settings": settings, "dataset": dataset, "seed": seed, "device": device}
-    _write(config, out, progress, task=task, method=method, **asked)
+    _write(config, out, progress, {"metrics": {"wall_seconds": 1.5}}, task=task, method=method, **asked)
 
 
 def train(
@@ -115,7 +134,7 @@ def train(
     asked: dict[str, object] = {"dataset": dataset, "grounding": grounding, "initial": initial, "seed": seed}
     if num_threads:
         asked |= {"num_threads": num_threads, "settings": settings}
-    _write(config, out, progress, task=task, method=method, **asked)
+    _write(config, out, progress, {"curve": {"wall_seconds": 20.0}}, task=task, method=method, **asked)
 
 
 def align(
@@ -128,7 +147,8 @@ def align(
     device: str,
     progress: Progress,
 ) -> None:
-    _write(config, out, progress, dataset=dataset, grounding=grounding, seed=seed)
+    asked = {"dataset": dataset, "grounding": grounding, "seed": seed}
+    _write(config, out, progress, {"metrics": {"wall_seconds": 0.25}}, **asked)
 
 
 def evaluate(
@@ -145,9 +165,28 @@ def evaluate(
     progress: Progress,
     num_threads: int,
 ) -> None:
-    asked = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
-    asked["reference"] = reference
-    _write(config, out, progress, task=task, method=method, seed=seed, num_threads=num_threads, **asked)
+    asked: dict[str, Any] = {"policy": policy, "grounding": grounding, "target_encoder": target_encoder}
+    asked |= {
+        "reference": reference,
+        "task": task,
+        "method": method,
+        "seed": seed,
+        "num_threads": num_threads,
+    }
+    outcomes = {name: [0.0, 1.0] for name in ("success", "topple", "wall_contact", "steps", "return")}
+    evaluation = {
+        "task": task,
+        "method": method,
+        "seed": seed,
+        "episodes": 2,
+        "dataset_version": "fake@data-1.0.0",
+        "dataset_hash": f"hash{seed}",
+        "git_commit": "abc",
+        "wall_seconds": 3.0,
+        "target": outcomes | {"success": [float(seed), 1.0]},
+        "simulated": None if policy is None else outcomes,
+    }
+    _write(config, out, progress, {"evaluation": evaluation}, **asked)
 
 
 def report(
@@ -159,7 +198,7 @@ def report(
     progress: Progress,
     config: FakeConfig,
 ) -> None:
-    asked: dict[str, object] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
+    asked: dict[str, Any] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
     asked |= {"command": command, "publish": publish}
     shutil.rmtree(root / "report", ignore_errors=True)
     _write(config, root / "report", progress, **asked)

@@ -32,3 +32,13 @@ def test_in_a_terminal_finished_items_become_lines_above_the_running_ones() -> N
     assert "train/nas/seed_0  finished in 3.0 s" in shown
     assert "1 of 2 finished" in shown
     assert "success 0.84" in shown
+
+
+def test_in_a_terminal_something_may_stand_above_the_items() -> None:
+    file = StringIO()
+    terminal = Console(file=file, width=120, force_terminal=True, no_color=True)
+    with display(2, terminal, above="3 of 7 points") as watch:
+        watch.started("train/nas/seed_0")
+        watch.failed("train/nas/seed_0")
+    last = file.getvalue().rpartition("3 of 7 points")[2]
+    assert "train/nas/seed_0" in last and "failed" in last

@@ -11,7 +11,9 @@ from astra_data.figures import (
     Foretold,
     OpenLoop,
     Panel,
+    Visits,
     coverage,
+    data_efficiency,
     dynamics_mismatch,
     learning_curves,
     method_colour,
@@ -218,3 +220,21 @@ def test_only_visited_cells_are_coloured() -> None:
     assert (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 1.0), (0.0, 3.0))
     assert axes.get_xlabel() == "x position (m)"
     assert png(figure).startswith(b"\x89PNG")
+
+
+def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
+    visits = [Visits(np.full((2, 3), count), (0.0, 3.0, 0.0, 2.0)) for count in (4, 1, 9)]
+    scores = {"nas": np.array([[0.6, 0.8], [0.1, 0.3], [0.7, 0.9]])}
+    intervals = {"nas": np.array([[0.7, 0.1, 0.8], [0.6, 0.0, 0.7], [0.8, 0.3, 0.9]])}
+    figure = data_efficiency([100, 25, 150], scores, intervals, {"position (m)": visits})
+    *maps, success = figure.axes
+    # Sizes are in order, however they are given.
+    assert [axes.get_title() for axes in maps] == ["25 %", "100 %", "150 %"]
+    assert [axes.images[0].get_array().max() for axes in maps] == [1, 4, 9]  # type: ignore[union-attr]
+    line = success.lines[0]
+    assert np.array(line.get_xdata()).tolist() == [25, 100, 150]
+    assert np.array(line.get_ydata()).tolist() == [0.1, 0.7, 0.8]
+    assert len(success.collections) == 1
+    alone = {"nas": np.full((3, 3), np.nan)}
+    assert not data_efficiency([100, 25, 150], scores, alone, {}).axes[0].collections
+    assert png(figure)

@@ -3,8 +3,9 @@ from pathlib import Path
 import pytest
 
 from astra_data.errors import RecipeError
-from astra_data.plan import Recipe, plan
+from astra_data.plan import plan
 from astra_data.recipe import load_recipe
+from astra_data.request import Part, Recipe
 
 HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
 
@@ -60,6 +61,42 @@ def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
     )
 
 
+def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    assert len(items) == 2 * (1 + 1 + 2 * (1 + 1 + 3 + 1 + 4)) + 1
+    assert items["collect/seed_7"].call.args[1].episodes == 300  # type: ignore[attr-defined]
+    assert items["subset/percent_050/seed_7"].inputs == ("pair/seed_7",)
+    assert items["ground/astra/percent_150/seed_0"].inputs == ("subset/percent_150/seed_0",)
+    assert items["evaluate/astra_plus/percent_050/seed_0"].inputs == (
+        "train/astra_plus/percent_050/seed_0",
+        "ground/astra/percent_050/seed_0",
+        "align/astra/percent_050/seed_0",
+    )
+    report = items["report"].call
+    assert report.args[0].percents == (50, 150)  # type: ignore[attr-defined]
+    assert report.keywords["command"] == f"astra-data sweep {tmp_path / 'r.toml'}"  # type: ignore[attr-defined]
+
+
+def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
+    part = Part.of(recipe, methods=["astra"], seeds=[7], percents=[50])
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
+    assert list(items) == [
+        "collect/seed_7",
+        "pair/seed_7",
+        "subset/percent_050/seed_7",
+        "ground/astra/percent_050/seed_7",
+        "train/astra/percent_050/seed_7",
+        "align/astra/percent_050/seed_7",
+        "evaluate/astra/percent_050/seed_7",
+        "report",
+    ]
+    assert items["collect/seed_7"].call.args[1].episodes == 300  # type: ignore[attr-defined]
+    options = "--method astra --seed 7 --percent 50"
+    assert items["report"].call.keywords["command"].endswith(f"r.toml {options}")  # type: ignore[attr-defined]
+
+
 def test_every_artefact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
     seen: set[str] = set()
     for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path):
@@ -87,6 +124,11 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
             "effect: leave out _plus",
         ),
         (HEAD.replace("7", "0"), "recipe: expected each of seeds once, got [0, 0]"),
+        (HEAD + "[sweep]\npercent = [5, 5]", "recipe: expected each of sweep.percent once, got [5, 5]"),
+        (
+            HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
+            "recipe: sweep.percent: 5 % of 9 episodes are none: expected more",
+        ),
         (HEAD.replace("[0, 7]", "[]"), "seeds: tuple should have at least 1 item after validation, not 0"),
     ],
 )

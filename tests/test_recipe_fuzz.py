@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from astra_data.errors import RecipeError
 from astra_data.experiment import load_experiment
-from astra_data.plan import Recipe
 from astra_data.recipe import validated
+from astra_data.request import Recipe
 
 fuzzed = settings(
     max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "60")),

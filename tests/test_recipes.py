@@ -10,9 +10,9 @@ HOUSE = Path(__file__).parents[1]
 
 @pytest.mark.parametrize("path", sorted((HOUSE / "recipes").glob("*.toml")), ids=lambda path: path.stem)
 def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
-    first = path.read_text().splitlines()[0]
-    assert first == f"# uv run astra-data run recipes/{path.name}"
-    experiment = load_experiment(path, Path("runs"))
+    first, experiment = path.read_text().splitlines()[0], load_experiment(path, Path("runs"))
+    command = "sweep" if experiment.recipe.sweep.percent else "run"
+    assert first == f"# uv run astra-data {command} recipes/{path.name}"
     assert plan(experiment.recipe, path, experiment.folder)
 
 

@@ -31,6 +31,9 @@ class Record:
         assert seconds >= 0
         self.events.append(("finished", key))
 
+    def failed(self, key: str) -> None:
+        self.events.append(("failed", key))
+
 
 def test_an_item_starts_when_its_inputs_are_finished(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"

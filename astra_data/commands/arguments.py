@@ -13,6 +13,15 @@ DatasetName = Annotated[
         show_default=False,
     ),
 ]
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="RECIPE|DATASET",
+        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for its highest version; "
+        "what follows is for a dataset.",
+        show_default=False,
+    ),
+]
 Out = Annotated[
     Path | None,
     typer.Option(

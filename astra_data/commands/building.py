@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.commands.arguments import NewName, Out
-from astra_data.commands.recipes import RUNS, Jobs, Root, Seeds, resumable, run_stage
+from astra_data.commands.arguments import NewName, Out, Source
+from astra_data.commands.recipes import RUNS, Jobs, Root, Seeds, refuse, resumable, run_stage
 from astra_data.errors import BadInputError
 
 Task = Annotated[
@@ -14,15 +14,6 @@ Task = Annotated[
     typer.Argument(
         metavar="RECIPE|TASK",
         help="A recipe (.toml), or a task such as antmaze-umaze; what follows is for a task.",
-        show_default=False,
-    ),
-]
-Source = Annotated[
-    str,
-    typer.Argument(
-        metavar="RECIPE|DATASET",
-        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for its highest version; "
-        "what follows is for a dataset.",
         show_default=False,
     ),
 ]
@@ -90,7 +81,7 @@ def collect(
     }
     given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
     if task.endswith(".toml"):
-        _refuse(given | _given(name=name, out=out, resume=resume), "collect")
+        refuse(given | _given(name=name, out=out, resume=resume), "collect")
         run_stage(Path(task), "collect", seeds=seeds or (), jobs=jobs, root=root)
         return
     if len(seeds or ()) > 1 or jobs is not None:
@@ -136,7 +127,7 @@ def pair(
     """Add to every transition where the abstract simulator lands from the same state."""
     given = _given(reset_tolerance=reset_tolerance)
     if dataset.endswith(".toml"):
-        _refuse(given | _given(simulator=simulator, name=name, out=out), "pair")
+        refuse(given | _given(simulator=simulator, name=name, out=out), "pair")
         run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
@@ -159,9 +150,3 @@ def pair(
 
 def _given(**options: Any) -> dict[str, Any]:  # noqa: ANN401 - of any type
     return {key: value for key, value in options.items() if value not in (None, False)}
-
-
-def _refuse(given: dict[str, Any], stage: str) -> None:
-    if given:
-        options = ", ".join(f"--{key.replace('_', '-')}" for key in given)
-        raise BadInputError(f"{stage}: a recipe says this itself, in [{stage}]: leave out {options}")

@@ -5,11 +5,13 @@ from typing import Annotated
 
 import typer
 
-from astra_data.commands.arguments import DatasetName, NewName, Out
+from astra_data.commands.arguments import DatasetName, NewName, Out, Source
+from astra_data.commands.recipes import RUNS, Jobs, Root, refuse, run_stage
+from astra_data.errors import BadInputError
 
 
 def subset(
-    dataset: DatasetName,
+    dataset: Source,
     episodes: Annotated[
         int | None, typer.Option(min=1, help="How many episodes.", show_default=False)
     ] = None,
@@ -21,8 +23,13 @@ def subset(
         int | None,
         typer.Option(min=1, help="What 100 per cent are.", show_default="all episodes of DATASET"),
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Of the permutation.", show_default="the one stored in DATASET")
+    seeds: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--seed",
+            help="Of the permutation; of a recipe, only these of its seeds.",
+            show_default="the one stored in DATASET; all of a recipe",
+        ),
     ] = None,
     stratify: Annotated[
         str | None,
@@ -33,8 +40,17 @@ def subset(
     ] = None,
     name: NewName = None,
     out: Out = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
 ) -> None:
     """Write a random subset; with one seed, smaller subsets lie inside larger ones."""
+    if dataset.endswith(".toml"):
+        options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
+        refuse(options | {"name": name, "out": out}, "subset", "sweep")
+        run_stage(Path(dataset), "subset", seeds=seeds or (), jobs=jobs, root=root)
+        return
+    if len(seeds or ()) > 1 or jobs is not None:
+        raise BadInputError("subset: a dataset takes one --seed and no --jobs; a recipe takes them")
     from astra_data.dataset.edit import subset as write
     from astra_data.dataset.versions import open_dataset
 
@@ -45,7 +61,7 @@ def subset(
             episodes=episodes,
             percent=percent,
             of=of,
-            seed=seed,
+            seed=seeds[0] if seeds else None,
             stratify=stratify,
             name=name,
             out=out,

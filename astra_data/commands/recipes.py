@@ -1,13 +1,13 @@
 """Commands that work on recipes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from astra_data.errors import AstraDataError
+from astra_data.errors import AstraDataError, BadInputError
 
 RecipePath = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="A recipe, a TOML file.", show_default=False)
@@ -141,6 +141,19 @@ def run_stage(
             recipe, stage, method=method, seeds=seeds, root=root, jobs=jobs, device=device, publish=publish
         )
         typer.echo(f"finished: {folder}")
+
+
+def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
+    """Refuse `options` that are given, since a recipe says them itself.
+
+    Raises:
+        BadInputError: one is given.
+    """
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
+        raise BadInputError(
+            f"{stage}: a recipe says this itself, in [{table or stage}]: leave out {', '.join(given)}"
+        )
 
 
 @contextmanager

@@ -51,7 +51,7 @@ def subset(
     """
     if (episodes is None) == (percent is None) or (of is not None and percent is None):
         raise BadInputError("a subset takes either a number of episodes, or a percentage (and of how many)")
-    count = episodes if percent is None else (percent * (of or len(source)) + 50) // 100
+    count = episodes if percent is None else share(percent, of or len(source))
     assert count is not None
     if not 1 <= count <= len(source):
         asked = f"{count} episodes" if percent is None else f"{percent} % of {of or len(source)} = {count}"
@@ -66,6 +66,11 @@ def subset(
         {"stratify": stratify, "strata": strata} if stratify else {}
     )
     return _write(source, set(order[:count]), stage="subset", config=config, name=name, out=out, seed=chosen)
+
+
+def share(percent: int, episodes: int) -> int:
+    """Return how many episodes `percent` per cent of `episodes` are, a half rounded up."""
+    return (percent * episodes + 50) // 100
 
 
 def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out: Path | None = None) -> Path:

@@ -5,6 +5,7 @@ scores        success_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
 coverage      coverage: which positions or velocities a dataset holds
 validity      predictive_validity: returns in the simulators against those in the target
+sizes         data_efficiency: success over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
 """
 
@@ -12,6 +13,7 @@ from astra_data.figures.coverage import coverage
 from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.figures.scores import Curve, learning_curves, success_bars
+from astra_data.figures.sizes import Visits, data_efficiency
 from astra_data.figures.style import ROLES, method_colour, method_title, png
 from astra_data.figures.validity import Foretold, predictive_validity
 
@@ -21,7 +23,9 @@ __all__ = [
     "Foretold",
     "OpenLoop",
     "Panel",
+    "Visits",
     "coverage",
+    "data_efficiency",
     "dynamics_mismatch",
     "learning_curves",
     "method_colour",

@@ -6,7 +6,8 @@ model         Results: what results.json holds
 costs         what the artefacts took
 assembly      artefacts → Results
 page          Results → Markdown
-making        its sections on cost and origin
-cells         its numbers and tables
+sizes         Results of each size of the dataset, and their page
+making        the sections of pages on cost and origin
+cells         their numbers and tables
 provenance    commit, machine and package versions, for every stage to record
 """

@@ -49,14 +49,17 @@ def assemble(
     command: str,
     replicates: int,
     groundings: Mapping[str, str] | None = None,
+    percent: int | None = None,
 ) -> Results:
     """Read the artefacts under `root` of every row, for those of the seeds `asked` for that it has finished.
+
+    Of one size of the dataset, `percent`, where there are several.
 
     Raises:
         MissingStageError: a row has no evaluation, or other artefacts for some of its finished seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
-    read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {})
+    read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, methods)
     episodes = _check_alike(evaluations, task)
@@ -64,7 +67,7 @@ def assemble(
     gaps = read.optional("ground", "gap.json", Gap)
     curves = read.optional("train", "curve.json", CurveFile)
     alignments = read.optional("align", "metrics.json", Metrics)
-    datasets = {stage: read.datasets(stage) for stage in ("collect", "pair")}
+    datasets = {stage: read.datasets(stage) for stage in ("collect", "pair", "subset")}
     gap_means = {owner: _gap_means(list(of_seeds.values())) for owner, of_seeds in gaps.items()}
     rows = {}
     for method, of_seeds in evaluations.items():

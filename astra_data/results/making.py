@@ -1,6 +1,6 @@
 """Sections of the page: what the results cost, and where they come from."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -65,11 +65,7 @@ def _unit(figure: str) -> str:
 
 def origin(results: Results) -> str:
     """Return the section on code, machine and datasets."""
-    lines = [
-        f"- Code: {_by_stage(results.origins, _commit)}.",
-        f"- Machine: {_by_stage(results.origins, machine)}.",
-        f"- Versions: {_by_stage(results.origins, _versions)}.",
-    ]
+    lines = [provenance(results.origins)]
     hashes_of: dict[tuple[str, str, str], list[str]] = {}
     for dataset in results.datasets:
         key = (dataset.stage, dataset.name, dataset.version)
@@ -83,6 +79,15 @@ def origin(results: Results) -> str:
         named = f"{versions or 'no dataset'}{f' ({hashes})' if hashes else ''}"
         lines.append(f"- Dataset named by the evaluations of {rows}: {named}.")
     return "## Where this comes from\n\n" + "\n".join(lines)
+
+
+def provenance(origins: Sequence[Origin]) -> str:
+    """Return lines on code, machine and versions."""
+    return (
+        f"- Code: {_by_stage(origins, _commit)}.\n"
+        f"- Machine: {_by_stage(origins, machine)}.\n"
+        f"- Versions: {_by_stage(origins, _versions)}."
+    )
 
 
 def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from astra_data.errors import BadInputError, MissingStageError
 from astra_data.results.artefacts import EVALUATION, Artefact, DatasetFile, read_json
-from astra_data.rows import base_method
+from astra_data.rows import base_method, place
 
 SHARED = ("ground", "align")
 """Stages whose artefacts a "_plus" row takes from its base row."""
@@ -23,6 +23,7 @@ class Runs:
         methods: the rows.
         seeds: to report, of each row those whose evaluation is finished.
         groundings: row → the folder of its grounding and alignment, where that is not its base's.
+        percent: the size of the dataset, where there are several.
     """
 
     recipe: str
@@ -30,6 +31,7 @@ class Runs:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     groundings: Mapping[str, str] = field(default_factory=dict)
+    percent: int | None = None
 
     def __post_init__(self) -> None:
         """Check that there is something to report."""
@@ -46,7 +48,7 @@ class Runs:
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:
         """Return where a stage leaves a file of one row and seed."""
-        return self.root / stage / self.owner(stage, method) / f"seed_{seed}" / name
+        return self.root / stage / self.owner(stage, method) / place(seed, self.percent) / name
 
     @cached_property
     def finished(self) -> dict[str, tuple[int, ...]]:
@@ -79,8 +81,9 @@ class Runs:
 
     def datasets(self, stage: str) -> dict[int, DatasetFile]:
         """Read what is known of the datasets that a stage wrote, by seed."""
+        percent = self.percent if stage == "subset" else None
         paths = {
-            seed: self.root / stage / f"seed_{seed}" / "meta" / "astra" / "dataset.json"
+            seed: self.root / stage / place(seed, percent) / "meta" / "astra" / "dataset.json"
             for seed in self.seeds
         }
         return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -12,12 +13,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from astra_data.checkpoint import finished_folder
+from astra_data.dataset.reader import Dataset
 from astra_data.errors import BadInputError
 from astra_data.figures import (
     Curve,
     Foretold,
     OpenLoop,
     Panel,
+    Visits,
+    data_efficiency,
     dynamics_mismatch,
     learning_curves,
     open_loop_error,
@@ -26,6 +30,7 @@ from astra_data.figures import (
     success_bars,
     trajectories,
 )
+from astra_data.inspection import visited
 from astra_data.mazes import Maze
 from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
@@ -34,10 +39,15 @@ from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, r
 from astra_data.results.assembly import assemble
 from astra_data.results.model import BandMeans, Results
 from astra_data.results.page import HOW_TO_READ, render
+from astra_data.results.sizes import HOW_TO_READ as HOW_TO_READ_SIZES
+from astra_data.results.sizes import SizeResults, SizesResults, render_sizes
+from astra_data.rows import place
 from astra_data.statistics import REPLICATES
 from astra_data.tasks import TASKS
 
 Floats = NDArray[np.float64]
+_Found = Results | SizesResults
+_Page = Callable[[Mapping[str, str]], str]
 
 
 class ReportConfig(Config):
@@ -79,6 +89,10 @@ class Reported(Protocol):
     def groundings(self) -> Mapping[str, str]:
         """Row → the method whose grounding and alignment it uses, where that is not its own."""
 
+    @property
+    def percents(self) -> Sequence[int]:
+        """Sizes of the dataset that every row is repeated on; none where it is made on the whole."""
+
 
 def report(
     recipe: Reported,
@@ -103,24 +117,35 @@ def report(
         MissingStageError: a row has no evaluation, or other artefacts for some of its finished seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
-    results = assemble(
-        recipe.name,
-        recipe.task,
-        tuple(recipe.methods),
-        tuple(recipe.seeds),
-        root=root,
-        command=command,
-        replicates=config.bootstrap_replicates,
-        groundings=recipe.groundings,
-    )
-    progress(0.5, f"{len(results.methods)} rows, {len(results.seeds)} seeds")
-    images = {name: png(figure) for name, figure in _figures(results, root, config).items()}
+    sizes = [
+        assemble(
+            recipe.name,
+            recipe.task,
+            tuple(recipe.methods),
+            tuple(recipe.seeds),
+            root=root,
+            command=command,
+            replicates=config.bootstrap_replicates,
+            groundings=recipe.groundings,
+            percent=percent,
+        )
+        for percent in recipe.percents or (None,)
+    ]
+    progress(0.5, f"{len(sizes[0].methods)} rows, {len(sizes[0].seeds)} seeds")
+    found: _Found
+    if recipe.percents:
+        found = _sizes(recipe, command, sizes)
+        page, figures = partial(render_sizes, found), {"data_efficiency": _data_efficiency(found, root)}
+    else:
+        found, figures = sizes[0], _figures(sizes[0], root, config)
+        page = partial(render, found)
+    images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
     with finished_folder(root / "report", replace=True) as folder:
-        _write(results, images, folder, "results", {name: f"{name}.png" for name in images})
+        _write(found, page, images, folder, "results")
     if publish is not None:
-        _publish(results, images, publish)
-    progress(1.0, _headline(results))
+        _publish(found, page, images, publish)
+    progress(1.0, _headline(sizes[-1]))
 
 
 def _figures(results: Results, root: Path, config: ReportConfig) -> dict[str, Figure]:
@@ -224,24 +249,59 @@ def _gaps(results: Results) -> dict[str, OpenLoop]:
     }
 
 
-def _publish(results: Results, images: dict[str, bytes], folder: Path) -> None:
+def _sizes(recipe: Reported, command: str, sizes: Sequence[Results]) -> SizesResults:
+    return SizesResults(
+        recipe=recipe.name,
+        task=recipe.task,
+        command=command,
+        sizes=[
+            SizeResults(percent=percent, results=results)
+            for percent, results in zip(recipe.percents, sizes, strict=True)
+        ],
+    )
+
+
+def _data_efficiency(found: SizesResults, root: Path) -> Figure:
+    first = found.sizes[0].results
+    rows = {method: [size.results.methods[method] for size in found.sizes] for method in first.methods}
+    summaries = {method: [row.summary["success"] for row in of] for method, of in rows.items()}
+    covered: dict[str, list[Visits]] = {}
+    for size in found.sizes:
+        dataset = Dataset.open(root / "subset" / place(first.seeds[0], size.percent))
+        for label, role in (("position (m)", "position"), ("velocity (m/s)", "vector")):
+            planar = visited(dataset, role)
+            if planar is not None:
+                covered.setdefault(label, []).append(Visits(planar.counts, planar.extent))
+    return data_efficiency(
+        [size.percent for size in found.sizes],
+        {method: np.array([row.success for row in of]) for method, of in rows.items()},
+        # Where there is a single seed, None becomes NaN.
+        {
+            method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T
+            for method, sizes in summaries.items()
+        },
+        covered,
+    )
+
+
+def _publish(found: _Found, page: _Page, images: dict[str, bytes], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for name in HOW_TO_READ:
-        (folder / f"{results.recipe}_{name}.png").unlink(missing_ok=True)
-    names = {name: f"{results.recipe}_{name}.png" for name in images}
-    _write(results, images, folder, results.recipe, names)
+    for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES):
+        (folder / f"{found.recipe}_{name}.png").unlink(missing_ok=True)
+    _write(found, page, images, folder, found.recipe, f"{found.recipe}_")
 
 
 def _write(
-    results: Results, images: dict[str, bytes], folder: Path, stem: str, names: dict[str, str]
+    found: _Found, page: _Page, images: dict[str, bytes], folder: Path, stem: str, prefix: str = ""
 ) -> None:
-    (folder / f"{stem}.json").write_text(_json(results), encoding="utf-8")
-    (folder / f"{stem}.md").write_text(render(results, names), encoding="utf-8")
+    names = {name: f"{prefix}{name}.png" for name in images}
+    (folder / f"{stem}.json").write_text(_json(found), encoding="utf-8")
+    (folder / f"{stem}.md").write_text(page(names), encoding="utf-8")
     for name, image in images.items():
         (folder / names[name]).write_bytes(image)
 
 
-def _json(results: Results) -> str:
+def _json(results: _Found) -> str:
     """Return indented JSON in which a list of numbers takes one line."""
     values = json.loads(results.model_dump_json(by_alias=True))
     text = json.dumps(values, indent=2, ensure_ascii=False)

@@ -38,3 +38,10 @@ def test_a_refused_edit_writes_nothing(fake: str) -> None:
     result = CliRunner().invoke(app, ["delete", fake, "--episode", "1"])
     assert isinstance(result.exception, BadInputError)
     assert len(versions_at_home("fake")) == 1
+
+
+def test_a_recipe_says_its_sizes_itself() -> None:
+    result = CliRunner().invoke(app, ["subset", "r.toml", "--percent", "50"])
+    assert str(result.exception) == "subset: a recipe says this itself, in [sweep]: leave out --percent"
+    result = CliRunner().invoke(app, ["subset", "fake", "--percent", "50", "--seed", "0", "--seed", "1"])
+    assert isinstance(result.exception, BadInputError)

@@ -9,9 +9,10 @@ from astra_data.errors import BadInputError
 from astra_data.fitting import Fitting, GroundConfig
 from astra_data.methods.compass import CompassConfig, identify
 from astra_data.models.grounding import Windows
-from astra_data.plan import Recipe, plan
+from astra_data.plan import plan
 from astra_data.progress import Progress, silent
 from astra_data.recipe import Config, load_recipe
+from astra_data.request import Recipe
 from astra_data.tasks import TASKS
 from astra_data.variation import PARAMETERS, Variation
 

@@ -6,13 +6,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_runs import MADE, ROWS, FakeRecipe, edit_json, write_iql, write_runs
+from fake_dataset import write_fake
+from fake_runs import (
+    MADE,
+    ROWS,
+    SEEDS,
+    FakeRecipe,
+    edit_json,
+    outcomes,
+    write_evaluation,
+    write_iql,
+    write_runs,
+)
 
 from astra_data.errors import BadInputError, MissingStageError
 from astra_data.mazes import U_MAZE
 from astra_data.mismatch import CommandReplay
 from astra_data.results import assembly
 from astra_data.results.page import HOW_TO_READ
+from astra_data.results.sizes import SizesResults
+from astra_data.rows import place
 from astra_data.stages import report as stage
 from astra_data.stages.report import ReportConfig, report
 
@@ -216,3 +229,32 @@ def test_a_cut_off_trajectory_file_is_refused(root: Path) -> None:
     path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(BadInputError, match="no whole safetensors file"):
         make(root)
+
+
+def test_sizes_are_set_side_by_side(tmp_path: Path) -> None:
+    root = tmp_path / "runs" / "sizes"
+    for percent in (50, 100):
+        for seed in SEEDS:
+            write_evaluation(root, "astra", seed, percent)
+            write_evaluation(root, "direct_transfer", seed, percent)
+            write_fake(root / "subset" / place(seed, percent))
+    # At 50 % one seed of ASTRA is worse.
+    path = root / "evaluate/astra" / place(2, 50) / "evaluation.json"
+    edit_json(path, target=outcomes([0, 0, 0, 0], 2))
+    sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(50, 100))
+    make(root, tmp_path / "results", sized)
+    found = SizesResults.model_validate_json((root / "report/results.json").read_text())
+    success = {size.percent: size.results.methods["astra"].success for size in found.sizes}
+    assert success == {50: [0.5, 0.25, 0.0], 100: [0.5, 0.25, 0.75]}
+    assert [dataset.stage for dataset in found.sizes[0].results.datasets] == ["subset"] * 3
+    page = (root / "report/results.md").read_text()
+    assert "| method | 50 % | 100 % |" in page
+    assert "| ASTRA | 0.25 ± 0.25 | 0.50 ± 0.25 |" in page
+    assert (root / "report/data_efficiency.png").stat().st_size > 0
+    published = (tmp_path / "results/sizes.md").read_text()
+    assert "](sizes_data_efficiency.png)" in published
+    assert sorted(path.name for path in (tmp_path / "results").iterdir()) == [
+        "sizes.json",
+        "sizes.md",
+        "sizes_data_efficiency.png",
+    ]

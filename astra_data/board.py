@@ -1,0 +1,151 @@
+"""How far the points of a sweep are: a table that a terminal shows above the running items."""
+
+import time
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping
+
+from rich.table import Table
+
+from astra_data.figures import method_title
+from astra_data.request import Point
+from astra_data.schedule import Item
+
+DOING = {
+    "collect": "collecting",
+    "pair": "pairing",
+    "subset": "cutting",
+    "ground": "grounding",
+    "train": "training",
+    "align": "aligning",
+    "evaluate": "evaluating",
+}
+"""What a point is at while a stage works for it."""
+
+
+class Board:
+    """The states of all points of a sweep: one per cell, or the seeds of a size in one.
+
+    Args:
+        points: in the order of the table.
+        items: every artefact that they need, finished or not.
+        success: of the points that are finished.
+        to_do: keys of the items that are not finished.
+    """
+
+    def __init__(
+        self,
+        points: Collection[Point],
+        items: Collection[Item],
+        success: Mapping[Point, float],
+        to_do: Collection[str],
+    ) -> None:
+        """Begin with nothing running."""
+        by_key = {item.key: item for item in items}
+        self._points = tuple(points)
+        self._needs = {point: frozenset(needed(point.key, by_key)) for point in points}
+        self._success = dict(success)
+        self._to_do = set(to_do) - {"report"}
+        self._running: dict[str, tuple[float, float]] = {}
+        self._failed: set[str] = set()
+        self._seconds: dict[str, list[float]] = defaultdict(list)
+        self._began = time.monotonic()
+
+    def started(self, key: str) -> None:
+        """Note that an item has begun."""
+        self._running[key] = (0.0, time.monotonic())
+
+    def progressed(self, key: str, fraction: float) -> None:
+        """Note how much of an item is done."""
+        self._running[key] = (fraction, self._running[key][1])
+
+    def finished(self, key: str, seconds: float) -> None:
+        """Note that an item is finished."""
+        del self._running[key]
+        self._to_do.discard(key)
+        self._seconds[key.partition("/")[0]].append(seconds)
+
+    def failed(self, key: str) -> None:
+        """Note that an item has failed."""
+        del self._running[key]
+        self._failed.add(key)
+
+    def done(self, point: Point, success: float) -> None:
+        """Note the success of a point whose evaluation is finished."""
+        self._success[point] = success
+
+    def state(self, point: Point) -> str:
+        """Say what the point is at, such as "training 43 %" or "done 0.72"."""
+        if point in self._success:
+            return f"done {self._success[point]:.2f}"
+        if not self._failed.isdisjoint(self._needs[point]):
+            return "failed"
+        running = [key for key in self._running if key in self._needs[point]]
+        if not running:
+            return "waiting"
+        stages = list(DOING)
+        key = max(running, key=lambda key: stages.index(key.partition("/")[0]))
+        fraction, _ = self._running[key]
+        return f"{DOING[key.partition('/')[0]]} {fraction:.0%}".replace("%", " %")
+
+    def whole(self) -> str:
+        """Say how many points are done, and how long the others may take."""
+        left = self._seconds_left()
+        when = "" if left is None else f", {_duration(left)} left"
+        return f"{len(self._success)} of {len(self._points)} points{when}"
+
+    def __rich__(self) -> Table:
+        """Draw methods by sizes, or by seeds where there are no sizes."""
+        sizes = list(dict.fromkeys(point.percent for point in self._points))
+        columns: dict[str, list[Point]] = defaultdict(list)
+        for point in self._points:
+            alone = len(sizes) == 1
+            columns[f"seed {point.seed}" if alone else f"{point.percent} %"].append(point)
+        table = Table(title=self.whole(), title_justify="left")
+        table.add_column("method")
+        for column in columns:
+            table.add_column(column, justify="right")
+        for method in dict.fromkeys(point.method for point in self._points):
+            rows = [[point for point in cell if point.method == method] for cell in columns.values()]
+            table.add_row(method_title(method), *map(self._cell, rows))
+        return table
+
+    def _cell(self, points: list[Point]) -> str:
+        """Return the state of a point; of several, how many are done, their mean and what one is at."""
+        states = [self.state(point) for point in points]
+        if len(points) == 1:
+            return states[0]
+        success = [self._success[point] for point in points if point in self._success]
+        lines = [f"{len(success)} of {len(points)} done"]
+        if success:
+            lines[0] += f" {sum(success) / len(success):.2f}"
+        lines += [state for state in states if not state.startswith(("done", "waiting"))][:1]
+        return "\n".join(lines)
+
+    def _seconds_left(self) -> float | None:
+        """Return the work that is left at the speed so far; None while a stage's duration is unknown."""
+        now = time.monotonic()
+        typical = {stage: sum(taken) / len(taken) for stage, taken in self._seconds.items()}
+        done, left = sum(map(sum, self._seconds.values())), 0.0
+        for key, (fraction, began) in self._running.items():
+            done += now - began
+            if fraction > 0:
+                typical.setdefault(key.partition("/")[0], (now - began) / fraction)
+        for key in self._to_do:
+            stage = key.partition("/")[0]
+            if stage not in typical:
+                return None
+            fraction, _ = self._running.get(key, (0.0, now))
+            left += (1 - fraction) * typical[stage]
+        return left * (now - self._began) / done if done else None
+
+
+def needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
+    """Yield `key` and the keys of all artefacts that it is made of."""
+    yield key
+    for read in items[key].inputs:
+        yield from needed(read, items)
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"

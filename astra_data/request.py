@@ -1,0 +1,219 @@
+"""What a recipe may say: task, rows, seeds and sizes, and a table of settings per stage and method."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from astra_data.dataset.edit import share
+from astra_data.errors import BadInputError
+from astra_data.fitting import GroundConfig
+from astra_data.learners.iql import IqlConfig
+from astra_data.learners.rma import RmaConfig
+from astra_data.methods import METHODS
+from astra_data.methods.compass import CompassConfig
+from astra_data.methods.nas_golemo import GolemoConfig
+from astra_data.recipe import Config, Count, did_you_mean
+from astra_data.rows import PLUS, base_method, is_plus, place
+from astra_data.stages.align import AlignConfig
+from astra_data.stages.collect import CollectConfig
+from astra_data.stages.evaluate import EvaluateConfig
+from astra_data.stages.pair import PairConfig
+from astra_data.stages.report import ReportConfig
+from astra_data.target_training import TargetConfig
+from astra_data.tasks import TASKS
+from astra_data.training import TrainConfig
+from astra_data.variation import Variation
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "collect": (),
+    "pair": ("collect",),
+    "subset": ("pair",),
+    "ground": ("pair", "subset"),
+    "train": ("pair", "subset", "ground"),
+    "align": ("pair", "subset", "ground"),
+    "evaluate": ("train", "ground", "align"),
+    "report": ("evaluate",),
+}
+"""Each stage, in order, and the stages whose artefacts it reads."""
+
+METHOD_TABLES = {
+    "domain_randomization": "train",
+    "compass": "ground",
+    "compass_uniform": "train",
+    "rma": "train",
+    "nas_golemo": "ground",
+    "iql": "train",
+    "direct_transfer_iql": "train",
+    "target": "train",
+}
+"""Methods with settings of their own in a recipe, and the stage that they are for."""
+
+
+WHOLE = 100
+"""Per cent of a dataset that is not swept over."""
+
+
+class SweepConfig(Config):
+    """Over which sizes of the dataset the rows are repeated."""
+
+    percent: tuple[Count, ...] = ()
+    """In per cent of `collect.episodes`; smaller ones lie inside larger ones. By default the whole."""
+
+
+class Recipe(Config):
+    """One experiment: which methods, on which task, with which seeds and settings."""
+
+    task: str
+    """A name in `astra_data.tasks.TASKS`."""
+    methods: tuple[str, ...] = Field(min_length=1)
+    """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
+    seeds: tuple[int, ...] = Field(min_length=1)
+    """Each seed repeats everything, from the collected dataset on."""
+    collect: CollectConfig
+    pair: PairConfig
+    ground: GroundConfig
+    train: TrainConfig
+    align: AlignConfig
+    evaluate: EvaluateConfig
+    report: ReportConfig
+    based_on: str | None = None
+    """The recipe that all that is not said here, and every artefact it leaves unchanged, is taken from."""
+    sweep: SweepConfig = SweepConfig()
+    plus: TrainConfig
+    """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
+    domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
+    """What domain randomization varies; by default as the paper prints it for navigation."""
+    nas_golemo: GolemoConfig = GolemoConfig()
+    """How the residual model of Golemo et al. is fitted."""
+    rma: RmaConfig = RmaConfig()
+    """How the student of rapid motor adaptation learns."""
+    target: TargetConfig = TargetConfig()
+    """The training of `target` and `full_obs`, laid over `[train]`."""
+    compass: CompassConfig = CompassConfig()
+    """The ranges of `compass` and `compass_uniform`, and how the former identifies its parameters."""
+    iql: IqlConfig = IqlConfig()
+    """How IQL learns."""
+    direct_transfer_iql: IqlConfig = IqlConfig(learning_rate=1e-4, policy_updates=100)
+    """How direct transfer is fine-tuned; by default gently, for it unlearns more than it learns."""
+
+    @property
+    def compass_uniform(self) -> Variation:
+        """What `compass_uniform` varies."""
+        return self.compass.variation
+
+    @model_validator(mode="before")
+    @classmethod
+    def _add_empty_sections(cls, tables: dict[str, Any]) -> dict[str, Any]:
+        return {table: {} for table in (*STAGES, "plus") if table in cls.model_fields} | tables
+
+    @field_validator("plus", mode="before")
+    @classmethod
+    def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
+        train = info.data.get("train")
+        if train is None or not isinstance(overrides, dict):
+            return overrides
+        return train.model_dump() | overrides
+
+    @field_validator("task")
+    @classmethod
+    def _is_known_task(cls, task: str) -> str:
+        if task not in TASKS:
+            raise ValueError(f"unknown task '{task}'{did_you_mean(task, TASKS)}")
+        return task
+
+    @field_validator("methods")
+    @classmethod
+    def _are_known_methods(cls, rows: tuple[str, ...]) -> tuple[str, ...]:
+        for row in rows:
+            if base_method(row) not in METHODS:
+                raise ValueError(f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}")
+            if is_plus(row) and not METHODS[base_method(row)].in_simulator:
+                raise ValueError(
+                    f"'{row}' trains nothing in a simulator, so the [plus] settings are without effect: "
+                    f"leave out {PLUS}"
+                )
+        return rows
+
+    @model_validator(mode="after")
+    def _has_no_repeats(self) -> Self:
+        axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
+        for name, values in axes.items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"expected each of {name} once, got {list(values)}")
+        return self
+
+    @model_validator(mode="after")
+    def _has_no_empty_size(self) -> Self:
+        for percent in self.sweep.percent:
+            if not share(percent, self.collect.episodes):
+                raise ValueError(
+                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
+                )
+        return self
+
+    @property
+    def largest(self) -> int:
+        """The largest size, in per cent of `collect.episodes`: as much is collected."""
+        return max(self.sweep.percent, default=WHOLE)
+
+
+@dataclass(frozen=True)
+class Point:
+    """What is trained and measured as one: a row on the dataset of one seed, or on one size of it."""
+
+    method: str
+    seed: int
+    percent: int | None = None
+
+    @property
+    def key(self) -> str:
+        """Key of the evaluation, with which the point is finished."""
+        return f"evaluate/{self.method}/{place(self.seed, self.percent)}"
+
+
+@dataclass(frozen=True)
+class Part:
+    """The rows, seeds and sizes of a recipe that are asked for; `percents` is empty where it has no sizes."""
+
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    percents: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls,
+        recipe: Recipe,
+        methods: Sequence[str] = (),
+        seeds: Sequence[int] = (),
+        percents: Sequence[int] = (),
+    ) -> "Part":
+        """Return what is asked for; where nothing is named, all.
+
+        Raises:
+            BadInputError: the recipe has no such method, seed or size.
+        """
+        for method in methods:
+            if method not in recipe.methods:
+                hint = did_you_mean(method, recipe.methods)
+                raise BadInputError(f"the recipe has no method '{method}'{hint}")
+        for what, asked, known in (("seed", seeds, recipe.seeds), ("size", percents, recipe.sweep.percent)):
+            unknown = next((value for value in asked if value not in known), None)
+            if unknown is not None:
+                listed = ", ".join(map(str, known)) or "none"
+                raise BadInputError(f"the recipe has no {what} {unknown}; its {what}s: {listed}")
+        return cls(
+            tuple(dict.fromkeys(methods)) or recipe.methods,
+            tuple(dict.fromkeys(seeds)) or recipe.seeds,
+            tuple(dict.fromkeys(percents)) or recipe.sweep.percent,
+        )
+
+    def points(self) -> tuple[Point, ...]:
+        """Return every row on every size of every seed."""
+        return tuple(
+            Point(method, seed, percent)
+            for method in self.methods
+            for percent in self.percents or (None,)
+            for seed in self.seeds
+        )

@@ -1,0 +1,29 @@
+from pathlib import Path
+
+import pytest
+from fake_dataset import write_fake
+
+from astra_data.dataset import Dataset
+from astra_data.errors import BadInputError
+from astra_data.progress import silent
+from astra_data.stages.subset import subset
+
+
+def test_sizes_are_datasets_of_their_own_one_inside_the_other(tmp_path: Path) -> None:
+    source = write_fake(tmp_path / "pair")
+    uids: set[int] = set()
+    for percent, count in ((50, 2), (100, 4), (125, 5)):
+        out = tmp_path / str(percent)
+        assert subset(tmp_path / "pair", percent=percent, of=4, out=out, progress=silent) == out
+        made = Dataset.open(out)
+        assert made.verify() == [] and len(made) == count
+        assert made.reference == f"fake-percent{percent:03d}@data-1.0.0"
+        assert made.description["parents"] == [source.identity]
+        assert uids < set(made.uids.tolist())
+        uids = set(made.uids.tolist())
+
+
+def test_episodes_are_never_repeated(tmp_path: Path) -> None:
+    write_fake(tmp_path / "pair")
+    with pytest.raises(BadInputError, match="has 5 episodes, a subset of 150 % of 4 = 6"):
+        subset(tmp_path / "pair", percent=150, of=4, out=tmp_path / "out", progress=silent)
