@@ -42,7 +42,8 @@ class Experiment:
         if self.base is None:
             return set()
         changed = _differences(_recorded(self.base.recipe), self.recipe)
-        return STAGES.keys() - ALWAYS_NEW - _stale_stages(changed)
+        absent = set() if self.recipe.sweep.percent else {"subset"}
+        return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed)
 
     def maker(self, stage: str) -> "Experiment":
         """Return the experiment that makes the artefacts of `stage`."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from astra_data.batched import BatchedEnv, Step
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.navigation import Navigation
-from astra_data.sims.point_mass import PointMass
+from astra_data.simulators import Simulator
 from astra_data.tasks import task_named
 from astra_data.world import NavigationWorld
 
@@ -40,9 +40,9 @@ class World(BatchedEnv, Protocol):
 
 
 class SeededNavigationWorld(NavigationWorld):
-    """The task in the abstract simulator, with starts and goals from a seed of its own."""
+    """The task in an abstract simulator, with starts and goals from a seed of its own."""
 
-    def __init__(self, navigation: Navigation, simulator: PointMass) -> None:
+    def __init__(self, navigation: Navigation, simulator: Simulator) -> None:
         """Put the task into `simulator`."""
         super().__init__(navigation, simulator)
         self.reseed(_fresh_seed())

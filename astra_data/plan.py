@@ -63,7 +63,9 @@ def plan(
     """
     part = part or Part.of(recipe)
     bases = tuple(dict.fromkeys(base_method(row) for row in part.methods))
-    groundings = tuple(dict.fromkeys(_grounded_as(base) for base in bases if METHODS[base].grounds))
+    reference = reference_of(recipe.methods)
+    grounded = [base for base in (*bases, *([reference] if reference else [])) if METHODS[base].grounds]
+    groundings = tuple(dict.fromkeys(map(_grounded_as, grounded)))
     trained = [row for row in part.methods if METHODS[base_method(row)].trains]
     initial = [METHODS[base].initial for base in bases]
     trained += [base for base in dict.fromkeys(initial) if base and base not in trained]

@@ -8,7 +8,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import astra_data.envs
-from astra_data.gymnasium_faces import Array, WorldEnv, WorldVectorEnv
+from astra_data.gymnasium_faces import Array, SeededNavigationWorld, WorldEnv, WorldVectorEnv
+from astra_data.models.grounding import GroundingModel, GroundingShape
+from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
 
 gymnasium.register_envs(astra_data.envs)
@@ -139,3 +141,20 @@ def test_ants_in_a_vector_env() -> None:
     assert observation.shape == (2, 31)
     assert not (terminated | truncated).any()
     assert infos["wall_contact"].tolist() == [False, False]
+
+
+def test_a_grounded_simulator_shows_its_latents() -> None:
+    task = TASKS["antmaze-umaze"]
+    model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
+    grounded = simulator_of(task, model.requires_grad_(False), 3, "cpu")
+    env = WorldVectorEnv(SeededNavigationWorld(task.navigation, grounded), max_episode_steps=5)
+    raw = point_mazes(3, max_episode_steps=5)
+    first, _ = env.reset(seed=1)
+    expected, _ = raw.reset(seed=1)
+    assert env.observation_space.shape == (3, 16 + 8)
+    for _ in range(4):
+        # An untrained model corrects nothing: behind the latents lies what the raw simulator shows.
+        np.testing.assert_allclose(first[:, 16:], expected, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(first[:, :16], axis=1), 1.0, rtol=1e-3)
+        command = np.full((3, 2), 0.5, dtype=np.float32)
+        first, expected = env.step(command)[0], raw.step(command)[0]

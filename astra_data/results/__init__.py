@@ -7,6 +7,7 @@ costs         what the artefacts took
 assembly      artefacts → Results
 page          Results → Markdown
 sizes         Results of each size of the dataset, and their page
+files         results, pages and figures → a folder
 making        the sections of pages on cost and origin
 cells         their numbers and tables
 provenance    commit, machine and package versions, for every stage to record

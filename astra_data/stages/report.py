@@ -1,8 +1,6 @@
 """Report: what all rows and seeds of a recipe gave, as results.json, results.md and figures."""
 
-import json
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -37,17 +35,15 @@ from astra_data.progress import Progress
 from astra_data.recipe import Config
 from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.results.assembly import assemble
+from astra_data.results.files import Found, publish_results, write_results
 from astra_data.results.model import BandMeans, Results
-from astra_data.results.page import HOW_TO_READ, render
-from astra_data.results.sizes import HOW_TO_READ as HOW_TO_READ_SIZES
+from astra_data.results.page import render
 from astra_data.results.sizes import SizeResults, SizesResults, render_sizes
 from astra_data.rows import place
 from astra_data.statistics import REPLICATES
 from astra_data.tasks import TASKS
 
 Floats = NDArray[np.float64]
-_Found = Results | SizesResults
-_Page = Callable[[Mapping[str, str]], str]
 
 
 class ReportConfig(Config):
@@ -132,7 +128,7 @@ def report(
         for percent in recipe.percents or (None,)
     ]
     progress(0.5, f"{len(sizes[0].methods)} rows, {len(sizes[0].seeds)} seeds")
-    found: _Found
+    found: Found
     if recipe.percents:
         found = _sizes(recipe, command, sizes)
         page, figures = partial(render_sizes, found), {"data_efficiency": _data_efficiency(found, root)}
@@ -142,9 +138,9 @@ def report(
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
     with finished_folder(root / "report", replace=True) as folder:
-        _write(found, page, images, folder, "results")
+        write_results(found, page, images, folder, "results")
     if publish is not None:
-        _publish(found, page, images, publish)
+        publish_results(found, page, images, publish)
     progress(1.0, _headline(sizes[-1]))
 
 
@@ -282,30 +278,6 @@ def _data_efficiency(found: SizesResults, root: Path) -> Figure:
         },
         covered,
     )
-
-
-def _publish(found: _Found, page: _Page, images: dict[str, bytes], folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES):
-        (folder / f"{found.recipe}_{name}.png").unlink(missing_ok=True)
-    _write(found, page, images, folder, found.recipe, f"{found.recipe}_")
-
-
-def _write(
-    found: _Found, page: _Page, images: dict[str, bytes], folder: Path, stem: str, prefix: str = ""
-) -> None:
-    names = {name: f"{prefix}{name}.png" for name in images}
-    (folder / f"{stem}.json").write_text(_json(found), encoding="utf-8")
-    (folder / f"{stem}.md").write_text(page(names), encoding="utf-8")
-    for name, image in images.items():
-        (folder / names[name]).write_bytes(image)
-
-
-def _json(results: _Found) -> str:
-    """Return indented JSON in which a list of numbers takes one line."""
-    values = json.loads(results.model_dump_json(by_alias=True))
-    text = json.dumps(values, indent=2, ensure_ascii=False)
-    return re.sub(r"\[\n[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def _headline(results: Results) -> str:

@@ -1,0 +1,41 @@
+"""Results as files: JSON, the page, and figures."""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from astra_data.results.model import Results
+from astra_data.results.page import HOW_TO_READ
+from astra_data.results.sizes import HOW_TO_READ as HOW_TO_READ_SIZES
+from astra_data.results.sizes import SizesResults
+
+Found = Results | SizesResults
+Page = Callable[[Mapping[str, str]], str]
+"""Returns the page with the figures of these names and files."""
+
+
+def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:
+    """Write to `folder` under the recipe's name, in place of what was there before."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES):
+        (folder / f"{found.recipe}_{name}.png").unlink(missing_ok=True)
+    write_results(found, page, images, folder, found.recipe, f"{found.recipe}_")
+
+
+def write_results(
+    found: Found, page: Page, images: dict[str, bytes], folder: Path, stem: str, prefix: str = ""
+) -> None:
+    """Write `stem`.json, `stem`.md and the PNG `images`, each with `prefix` before its name."""
+    names = {name: f"{prefix}{name}.png" for name in images}
+    (folder / f"{stem}.json").write_text(_json(found), encoding="utf-8")
+    (folder / f"{stem}.md").write_text(page(names), encoding="utf-8")
+    for name, image in images.items():
+        (folder / names[name]).write_bytes(image)
+
+
+def _json(results: Found) -> str:
+    """Return indented JSON in which a list of numbers takes one line."""
+    values = json.loads(results.model_dump_json(by_alias=True))
+    text = json.dumps(values, indent=2, ensure_ascii=False)
+    return re.sub(r"\[\n[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"

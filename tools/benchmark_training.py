@@ -1,0 +1,445 @@
+"""Measure how fast groundings are fitted and policies trained, against other ways to do the same work.
+
+    uv run python tools/benchmark_training.py
+    uv run python tools/benchmark_training.py --only ppo --only target --quick
+    uv run python tools/benchmark_training.py --json runs/training.json
+
+Stable-Baselines3 and d3rlpy run in processes with environments of their own, which `uv` makes. The
+candidates take turns over the same stretch of time, each with one torch thread. Rates are told by the clock
+and by the processors' time, of all processes of a candidate together: the latter's ratios hold also on a
+machine that does other work.
+"""
+
+import copy
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from itertools import cycle
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import gymnasium_robotics
+import numpy as np
+import psutil
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from astra_data.ant import POSITIONS, VelocityController
+from astra_data.cores import cores
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import AstraDataError
+from astra_data.fitting import Fitting, HistoryFit
+from astra_data.learners.iql import Experience, Iql, IqlConfig
+from astra_data.learners.ppo import Ppo
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.plan import Recipe
+from astra_data.progress import silent
+from astra_data.recipe import load_recipe
+from astra_data.simulators import simulator_of
+from astra_data.tasks import TASKS
+from astra_data.world import NavigationWorld
+
+SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
+TASK = TASKS[SETTINGS.task]
+SHAPE = GroundingShape(state_size=4, action_size=2, goal_size=2)
+WEIGHTS = LossWeights(latent=0.1)
+"""Of ASTRA."""
+OURS = "ours"
+PEERS = Path(__file__).parent / "peers"
+GYMNASIUM_ID = "AntMaze_UMaze-v5"
+ANTS = 128
+TORCH = torch.__version__.partition("+")[0]
+
+gymnasium.register_envs(gymnasium_robotics)
+
+Stretch = Callable[[], float]
+"""Do some work; return how much that was."""
+Candidates = dict[str, Stretch]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Work per second: by the clock, and by the processors' time."""
+
+    clock: float
+    processor: float
+
+
+class Part(StrEnum):
+    """What can be measured."""
+
+    ppo = "ppo"
+    recurrent = "recurrent"
+    iql = "iql"
+    grounding = "grounding"
+    target = "target"
+
+
+def main(
+    only: Annotated[list[Part] | None, typer.Option(help="Measure this alone; may be repeated.")] = None,
+    dataset: Annotated[Path, typer.Option(help="Paired, of the Long Maze; to ground.")] = Path(
+        "runs/antmaze_long/pair/seed_0"
+    ),
+    rounds: Annotated[int, typer.Option(help="Turns that each candidate takes.")] = 4,
+    quick: Annotated[bool, typer.Option("--quick", help="One turn, and shorter ones.")] = False,
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures there.")] = None,
+) -> None:
+    """Print rates, and ours over each of the others'."""
+    torch.set_num_threads(1)
+    figures: dict[str, dict[str, Rate]] = {}
+    for part in only or list(Part):
+        with ExitStack() as stack:
+            try:
+                title, candidates = MEASUREMENTS[part](dataset, quick, stack)
+            except AstraDataError as error:
+                raise typer.Exit(_complain(str(error))) from None
+            figures[title] = measure(candidates, 1 if quick else rounds)
+    table = Table("", "per second", "ours is", "per processor second", "ours is")
+    for title, rates in figures.items():
+        table.add_section()
+        table.add_row(f"[bold]{title}")
+        ours = rates[OURS]
+        for candidate, rate in rates.items():
+            cells = [(rate.clock, ours.clock), (rate.processor, ours.processor)]
+            words = [word for one, best in cells for word in (f"{one:,.0f}", f"{best / one:,.1f} x")]
+            table.add_row(f"  {candidate}", *words)
+    Console().print(table)
+    if json_path is not None:
+        rates_of = {
+            title: {name: asdict(rate) for name, rate in rates.items()} for title, rates in figures.items()
+        }
+        report = {"rounds": rounds, "quick": quick, "cores": cores(), "per_second": rates_of}
+        json_path.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def _complain(message: str) -> int:
+    Console(stderr=True).print(message)
+    return 1
+
+
+def grounded_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+    """Train on latents in the grounded simulator; what the model has learned is the same to the speed."""
+    return (
+        "PPO in the grounded simulator, steps",
+        {
+            OURS: ppo_stretch(GroundingModel(SHAPE).requires_grad_(False), memory_size=0),
+            "Stable-Baselines3, one vector environment": stable_baselines(stack, "ppo", "vector"),
+            "Stable-Baselines3, DummyVecEnv of 16": stable_baselines(stack, "ppo", "single"),
+        },
+    )
+
+
+def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+    """Train a policy with a memory of its own in the raw simulator."""
+    return (
+        "PPO with a memory in the raw simulator, steps",
+        {
+            OURS: ppo_stretch(None, memory_size=SETTINGS.train.memory_size),
+            "sb3-contrib, LSTM, one vector environment": stable_baselines(stack, "recurrent_ppo", "vector"),
+            "sb3-contrib, LSTM, DummyVecEnv of 16": stable_baselines(stack, "recurrent_ppo", "single"),
+        },
+    )
+
+
+def ppo_stretch(model: GroundingModel | None, memory_size: int) -> Stretch:
+    """Make one iteration of the recipe's training."""
+    config = SETTINGS.train
+    env = NavigationWorld(TASK.navigation, simulator_of(TASK, model, config.num_envs, "cpu"))
+    shape = ActorCriticShape(
+        observation_size=env.observation_size,
+        action_size=env.action_size,
+        memory_size=memory_size,
+        hidden_sizes=config.hidden_sizes,
+    )
+    ppo = Ppo(env, ActorCritic(shape), config, horizon=TASK.navigation.horizon, seed=0)
+
+    def stretch() -> int:
+        ppo.iterate()
+        return config.num_envs * config.rollout_steps
+
+    return stretch
+
+
+def stable_baselines(stack: ExitStack, *arguments: str) -> Stretch:
+    """Let Stable-Baselines3 make one iteration of the same size, in batches of the same number."""
+    command = ["--with", "stable-baselines3", "--with", "sb3-contrib", "python"]
+    return peer(stack, *command, str(PEERS / "stable_baselines.py"), *arguments)
+
+
+def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+    """Update critics and policy from single transitions, as the others do; random ones, for speed alone."""
+    observation_size, action_size, updates = 8, 2, 20 if quick else 100
+    episodes, steps = 100, 500
+    torch.manual_seed(0)
+    experience = Experience(
+        observation=torch.randn(episodes, steps, observation_size),
+        previous_action=torch.zeros(episodes, steps, action_size),
+        action=2 * torch.rand(episodes, steps, action_size) - 1,
+        reward=torch.randn(episodes, steps),
+        next_observation=torch.randn(episodes, steps, observation_size),
+        terminated=torch.zeros(episodes, steps, dtype=torch.bool),
+        lengths=torch.full((episodes,), steps),
+    )
+    values, policy = (
+        Iql(
+            ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(256, 256))),
+            experience,
+            IqlConfig(
+                critic_updates=critic_updates,
+                critic_batch=256,
+                critic_sizes=(256, 256),
+                return_steps=1,
+                policy_updates=1_000_000,
+                batch_windows=256,
+                window=1,
+                burn_in=0,
+            ),
+            seed=0,
+        )
+        for critic_updates in (1_000_000, 1)
+    )
+    policy.iterate()  # The one update of the critics.
+
+    def ours() -> int:
+        for _ in range(updates):
+            values.iterate()
+            policy.iterate()
+        return updates
+
+    command = ["--no-project", "--python", "3.12", "--with", "d3rlpy", "--with", f"torch=={TORCH}", "python"]
+    command += [str(PEERS / "d3rlpy_iql.py"), "time", str(observation_size), str(action_size)]
+    single_file = SingleFileIql(experience)
+    return (
+        "implicit Q-learning, updates of critics and policy",
+        {
+            OURS: ours,
+            "d3rlpy": peer(stack, *command),
+            "plain torch in one file": lambda: single_file.learn(updates),
+        },
+    )
+
+
+class SingleFileIql:
+    """The method as single-file implementations have it: plain torch, an optimizer per network."""
+
+    def __init__(self, experience: Experience) -> None:
+        """Learn from the transitions of `experience`."""
+        columns = ("observation", "action", "reward", "next_observation", "terminated")
+        self._table = {name: getattr(experience, name).flatten(0, 1) for name in columns}
+        observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
+        self._value = self._network(observed, 1)
+        self._action_values = torch.nn.ModuleList(self._network(observed + acted, 1) for _ in range(2))
+        self._targets = copy.deepcopy(self._action_values).requires_grad_(False)
+        self._actor = torch.nn.Sequential(self._network(observed, acted), torch.nn.Tanh())
+        self._log_std = torch.nn.Parameter(torch.zeros(acted))
+        self._value_optimizer, self._action_value_optimizer, self._actor_optimizer = (
+            torch.optim.Adam(parameters, lr=3e-4)
+            for parameters in (
+                self._value.parameters(),
+                self._action_values.parameters(),
+                [*self._actor.parameters(), self._log_std],
+            )
+        )
+
+    @staticmethod
+    def _network(inputs: int, outputs: int) -> torch.nn.Sequential:
+        linear, relu = torch.nn.Linear, torch.nn.ReLU
+        return torch.nn.Sequential(
+            linear(inputs, 256), relu(), linear(256, 256), relu(), linear(256, outputs)
+        )
+
+    def learn(self, updates: int) -> int:
+        """Make `updates` updates with batches of 256; return their number."""
+        for _ in range(updates):
+            rows = torch.randint(len(self._table["reward"]), (256,))
+            batch = {name: values[rows] for name, values in self._table.items()}
+            pair = torch.cat([batch["observation"], batch["action"]], dim=-1)
+            with torch.no_grad():
+                slow = torch.minimum(*(target(pair).squeeze(-1) for target in self._targets))
+                following = self._value(batch["next_observation"]).squeeze(-1)
+                wanted = batch["reward"] + 0.99 * following * ~batch["terminated"]
+            advantage = slow - self._value(batch["observation"]).squeeze(-1)
+            weight = (0.9 - (advantage < 0).float()).abs()
+            self._descend(self._value_optimizer, (weight * advantage.square()).mean())
+            errors = [(network(pair).squeeze(-1) - wanted).square().mean() for network in self._action_values]
+            self._descend(self._action_value_optimizer, errors[0] + errors[1])
+            mean = self._actor(batch["observation"])
+            likelihood = (
+                torch.distributions.Normal(mean, self._log_std.exp()).log_prob(batch["action"]).sum(-1)
+            )
+            regressed = (10.0 * advantage.detach()).exp().clamp_max(100.0) * likelihood
+            self._descend(self._actor_optimizer, -regressed.mean())
+            with torch.no_grad():
+                for slow_one, fast in zip(
+                    self._targets.parameters(), self._action_values.parameters(), strict=True
+                ):
+                    slow_one.lerp_(fast, 0.005)
+        return updates
+
+    @staticmethod
+    def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+
+def peer(stack: ExitStack, *command: str) -> Stretch:
+    """Start `uv run *command` and have it do some work at each call: a line in, a line with a number out."""
+    process = subprocess.Popen(
+        ["uv", "run", "--quiet", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    stack.enter_context(process)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    given, answered = stack.enter_context(process.stdin), process.stdout
+
+    def stretch() -> float:
+        given.write("\n")
+        given.flush()
+        answer = answered.readline()
+        if not answer:
+            raise typer.Exit(_complain(f"the process ended early: uv run {' '.join(command)}"))
+        return float(answer)
+
+    return stretch
+
+
+def grounding(dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+    """Fit ASTRA's history model."""
+    episodes = PairedEpisodes.load(dataset)
+    config = SETTINGS.ground.model_copy(update={"updates": 20 if quick else 100})
+    training, held_out = episodes.split(config.held_out_share, seed=0)
+
+    def ours() -> int:
+        with tempfile.TemporaryDirectory() as folder:
+            HistoryFit(WEIGHTS)(
+                Fitting(TASK, config, None, training, held_out, 0, "cpu", Path(folder), silent)
+            )
+        return config.updates * config.batch_windows
+
+    return (
+        f"grounding, windows of {config.window} steps",
+        {OURS: ours, "Algorithm 1, step by step": step_by_step(training, config.window)},
+    )
+
+
+def step_by_step(episodes: PairedEpisodes, window: int) -> Stretch:
+    """Take Algorithm 1 of the paper literally: an update per trajectory, a turn of the loop per step."""
+    model = GroundingModel(SHAPE, "online")
+    optimizer = torch.optim.Adam(model.parameters(), lr=SETTINGS.ground.learning_rate)
+    order = cycle(range(len(episodes)))
+
+    def stretch() -> float:
+        number = next(order)
+        windows, length = episodes.select(torch.tensor([number])).windows, int(episodes.lengths[number])
+        hidden, loss = torch.zeros(1, SHAPE.latent_size), torch.zeros(())
+        expected: tuple[torch.Tensor, torch.Tensor] | None = None
+        for step in range(length):
+            state, action, goal = (
+                values[:, step] for values in (windows.state, windows.action, windows.goal)
+            )
+            seen = model.encoder_input(state, goal, windows.previous_action[:, step])
+            hidden = model.encoder.step(seen, hidden)
+            latent = model.encoder.latent(hidden)
+            if expected is not None:
+                mean, log_variance = expected
+                surprise = (latent - mean).square() / log_variance.exp() + log_variance
+                loss = loss + WEIGHTS.latent * 0.5 * surprise.mean()
+            expected = model.predict_latent(latent, action)
+            reward = model.predict_reward_parts(latent, action)
+            loss = loss + WEIGHTS.reward * (reward - windows.reward[:, step]).square().mean()
+            corrected = model.correct(latent, action, windows.simulated_next[:, step])
+            loss = loss + WEIGHTS.state * (corrected - windows.next_state[:, step]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        return length / window
+
+    return stretch
+
+
+def target(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+    """Step the ants by random commands through their low-level controller."""
+    env = TASKS["antmaze-umaze"].target(ANTS, seed=0)
+    env.reset()
+    rng = np.random.default_rng(0)
+
+    def ours(steps: int = 25) -> int:
+        env.reset(env.toppled)
+        for _ in range(steps):
+            env.step(torch.from_numpy(rng.uniform(-1, 1, (ANTS, 2))))
+        return steps * ANTS
+
+    count = cores()
+    theirs = gymnasium.vector.AsyncVectorEnv([DrivenAnt] * count)
+    stack.callback(theirs.close)
+    theirs.reset(seed=0)
+
+    def processes(steps: int = 200 if quick else 1000) -> int:
+        for _ in range(steps):
+            theirs.step(rng.uniform(-1, 1, (count, 2)))
+        return steps * count
+
+    return (
+        f"AntMaze, steps of {ANTS} ants",
+        {OURS: ours, f"Gymnasium's AsyncVectorEnv, {count} processes": processes},
+    )
+
+
+class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
+    """Gymnasium's own AntMaze, given velocity commands (2,) through our low-level controller."""
+
+    def __init__(self) -> None:
+        """Make one."""
+        super().__init__(gymnasium.make(GYMNASIUM_ID))
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float64)
+        self._controller = VelocityController.load()
+        self._data: Any = self.unwrapped.ant_env.data  # type: ignore[attr-defined]
+
+    def action(self, action: Any) -> Any:  # noqa: ANN401
+        """Return the torques (8,)."""
+        qpos, qvel = self._data.qpos[None, :POSITIONS], self._data.qvel[None]
+        return self._controller(qpos, qvel, action[None])[0]
+
+
+MEASUREMENTS = {
+    Part.ppo: grounded_ppo,
+    Part.recurrent: recurrent_ppo,
+    Part.iql: iql,
+    Part.grounding: grounding,
+    Part.target: target,
+}
+
+
+def measure(candidates: Candidates, rounds: int) -> dict[str, Rate]:
+    """Let the candidates take turns; return the rate of each, after one turn to warm up."""
+    done, clock, processor = ({name: 0.0 for name in candidates} for _ in range(3))
+    for turn in range(rounds + 1):
+        for name, stretch in candidates.items():
+            began, used = time.perf_counter(), processor_seconds()
+            amount = stretch()
+            if turn > 0:
+                done[name] += amount
+                clock[name] += time.perf_counter() - began
+                processor[name] += processor_seconds() - used
+    return {name: Rate(done[name] / clock[name], done[name] / processor[name]) for name in candidates}
+
+
+def processor_seconds() -> float:
+    """Return the time that this process and those that it started have kept processors busy."""
+    this = psutil.Process()
+    times = [process.cpu_times() for process in (this, *this.children(recursive=True))]
+    return float(sum(time.user + time.system for time in times))
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,143 @@
+"""Train with Stable-Baselines3 in the abstract worlds of recipes/antmaze_long.toml, to be timed.
+
+    uv run --with stable-baselines3 --with sb3-contrib python tools/peers/stable_baselines.py ppo vector
+
+Makes one iteration per line of its input, and answers each with the number of environment steps.
+"""
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+import typer
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from astra_data.gymnasium_faces import Array, SeededNavigationWorld, WorldEnv, WorldVectorEnv
+from astra_data.models.grounding import GroundingModel, GroundingShape
+from astra_data.plan import Recipe
+from astra_data.recipe import load_recipe
+from astra_data.simulators import simulator_of
+from astra_data.tasks import TASKS
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "antmaze_long.toml"
+SINGLE_WORLDS = 16
+
+
+class Algorithm(StrEnum):
+    """PPO in the grounded simulator, or RecurrentPPO in the raw one."""
+
+    ppo = "ppo"
+    recurrent_ppo = "recurrent_ppo"
+
+
+class Face(StrEnum):
+    """All rows of one batched world, or a few worlds of one row each (all of them would take minutes)."""
+
+    vector = "vector"
+    single = "single"
+
+
+def main(algorithm: Algorithm, face: Face) -> None:
+    """Train on demand."""
+    torch.set_num_threads(1)
+    settings = load_recipe(RECIPE, Recipe)
+    task, config = TASKS[settings.task], settings.train
+    shape = GroundingShape(state_size=4, action_size=2, goal_size=2)
+    model = GroundingModel(shape).requires_grad_(False) if algorithm is Algorithm.ppo else None
+    horizon = task.navigation.horizon
+
+    def world(num_envs: int) -> SeededNavigationWorld:
+        return SeededNavigationWorld(task.navigation, simulator_of(task, model, num_envs, "cpu"))
+
+    def single() -> gymnasium.Env[Array, Array]:
+        return gymnasium.wrappers.TimeLimit(WorldEnv(world(1)), horizon)
+
+    count = config.num_envs if face is Face.vector else SINGLE_WORLDS
+    env = (
+        Rows(WorldVectorEnv(world(count), horizon)) if face is Face.vector else DummyVecEnv([single] * count)
+    )
+    sizes: dict[str, Any] = {"net_arch": list(config.hidden_sizes), "activation_fn": torch.nn.ELU}
+    if algorithm is Algorithm.recurrent_ppo:
+        # One memory for actor and critic, as ours has.
+        sizes |= {"lstm_hidden_size": config.memory_size, "shared_lstm": True, "enable_critic_lstm": False}
+    build = PPO if algorithm is Algorithm.ppo else RecurrentPPO
+    steps = config.rollout_steps * count
+    learner = build(
+        "MlpPolicy" if algorithm is Algorithm.ppo else "MlpLstmPolicy",
+        env,
+        learning_rate=config.learning_rate,
+        n_steps=config.rollout_steps,
+        batch_size=steps // config.minibatches,
+        n_epochs=config.epochs,
+        gamma=config.discount,
+        gae_lambda=config.gae_lambda,
+        clip_range=config.clip,
+        ent_coef=config.entropy_weight,
+        vf_coef=config.value_weight,
+        max_grad_norm=config.gradient_norm,
+        policy_kwargs=sizes,
+        device="cpu",
+    )
+    for _ in sys.stdin:
+        learner.learn(steps, reset_num_timesteps=False)
+        print(steps, flush=True)
+
+
+class Rows(VecEnv):  # type: ignore[misc]
+    """Gymnasium's vector environment as Stable-Baselines3 wants it."""
+
+    def __init__(self, env: WorldVectorEnv) -> None:
+        """Show `env`."""
+        self.env = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> Array:
+        """Start all rows."""
+        return self.env.reset()[0]
+
+    def step_async(self, actions: Array) -> None:
+        """Keep `actions` for `step_wait`."""
+        self.actions = actions
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        """Step all rows."""
+        observation, reward, terminated, truncated, infos = self.env.step(self.actions)
+        done = terminated | truncated
+        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(done):
+            told[row] = {
+                "terminal_observation": infos["final_obs"][row],
+                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+            }
+        return observation, reward, done, told
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def get_attr(self, attr_name: str, indices: object = None) -> list[object]:
+        """Know of no attributes."""
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
+        """Refuse."""
+        raise NotImplementedError
+
+    def env_method(
+        self, method_name: str, *args: object, indices: object = None, **kwargs: object
+    ) -> list[Any]:
+        """Refuse."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
+        """Know of no wrappers."""
+        return [False] * self.num_envs
+
+
+if __name__ == "__main__":
+    typer.run(main)
