@@ -41,9 +41,9 @@ from astra_data.learners.iql import Experience, Iql, IqlConfig
 from astra_data.learners.ppo import Ppo
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights
-from astra_data.plan import Recipe
 from astra_data.progress import silent
 from astra_data.recipe import load_recipe
+from astra_data.request import Recipe
 from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
 from astra_data.world import NavigationWorld

@@ -45,7 +45,7 @@ COLOURS = {
     "iql": "#D55E00",
     "direct_transfer_iql": "#7B3294",
     "target": "#4D4D4D",
-    "full_obs": "#0072B2",
+    "full_obs": "#1A1A1A",
     "follower": "#9A9A9A",
 }
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""

@@ -20,8 +20,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from astra_data.gymnasium_faces import Array, SeededNavigationWorld, WorldEnv, WorldVectorEnv
 from astra_data.models.grounding import GroundingModel, GroundingShape
-from astra_data.plan import Recipe
 from astra_data.recipe import load_recipe
+from astra_data.request import Recipe
 from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
 
