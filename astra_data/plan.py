@@ -17,7 +17,7 @@ from pathlib import Path
 from astra_data.dataset.edit import share
 from astra_data.methods import METHODS
 from astra_data.recipe import Config
-from astra_data.request import METHOD_TABLES, STAGES, WHOLE, Part, Recipe
+from astra_data.request import METHOD_TABLES, WHOLE, Part, Recipe
 from astra_data.rows import base_method, is_plus, place, reference_of
 from astra_data.schedule import Item
 from astra_data.stages.align import align
@@ -51,7 +51,7 @@ def plan(
     device: str = "cpu",
     publish: bool = False,
 ) -> tuple[Item, ...]:
-    """Return every artefact of `recipe`, each after those it reads.
+    """Return every artefact of `recipe`, each after those it reads, seed after seed.
 
     Args:
         recipe: what to make.
@@ -66,9 +66,9 @@ def plan(
     reference = reference_of(recipe.methods)
     grounded = [base for base in (*bases, *([reference] if reference else [])) if METHODS[base].grounds]
     groundings = tuple(dict.fromkeys(map(_grounded_as, grounded)))
-    trained = [row for row in part.methods if METHODS[base_method(row)].trains]
+    rows = [row for row in part.methods if METHODS[base_method(row)].trains]
     initial = [METHODS[base].initial for base in bases]
-    trained += [base for base in dict.fromkeys(initial) if base and base not in trained]
+    trained = tuple(dict.fromkeys([base for base in initial if base] + rows))
     aligned = [base for base in groundings if METHODS[base].aligns]
     items: list[Item] = []
     for seed in part.seeds:
@@ -81,9 +81,7 @@ def plan(
             items += (_train(data, row) for row in trained)
             items += (_align(data, base) for base in aligned)
             items += (_evaluate(data, row) for row in part.methods)
-    items.append(_report(recipe, path, folder, part, publish))
-    # Stage by stage, so that work on every seed begins before any seed is finished.
-    return tuple(sorted(items, key=lambda item: list(STAGES).index(stage_of(item))))
+    return (*items, _report(recipe, path, folder, part, publish))
 
 
 def stage_of(item: Item) -> str:

@@ -15,11 +15,11 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     # Imported here, so that tests of other parts need not wait for every stage.
     plan = importlib.import_module("astra_data.plan")
     request = importlib.import_module("astra_data.request")
-    tables = [name for name in (*plan.STAGES, "plus") if name in request.Recipe.model_fields]
+    tables = [name for name in (*request.STAGES, "plus") if name in request.Recipe.model_fields]
     sections = {name: (fake_stages.FakeConfig, ...) for name in tables}
     sections["collect"] = (fake_stages.FakeCollectConfig, ...)
     model: type[Recipe] = create_model("FakeRecipe", __base__=request.Recipe, **sections)  # type: ignore[call-overload]
-    for stage in plan.STAGES:
+    for stage in request.STAGES:
         monkeypatch.setattr(plan, stage, getattr(fake_stages, stage))
     for module in (plan, request):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
