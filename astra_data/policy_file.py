@@ -11,6 +11,7 @@ from astra_data.deployment import DeployedPolicy, Observed
 from astra_data.grounding_file import Grounding
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.adaptation import AdaptiveShape, Student
+from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
 from astra_data.tasks import Task
 from astra_data.training_world import WorldConfig
@@ -101,13 +102,19 @@ class PolicyFile:
         )
 
 
-def deploy(task: Task, trained: PolicyFile, grounding: Grounding | None) -> DeployedPolicy:
-    """Return the policy, ready to be started in the target; its latents, if any, come from ψ^s."""
+def deploy(
+    task: Task,
+    trained: PolicyFile,
+    grounding: Grounding | None = None,
+    target_encoder: TargetEncoder | None = None,
+) -> DeployedPolicy:
+    """Return the policy, ready to be started; its latents, if any, come from ψ^t, or from ψ^s without one."""
     world = trained.simulation.world if trained.simulation else WorldConfig()
     return DeployedPolicy(
         task,
         trained.policy,
         grounding if isinstance(grounding, GroundingModel) else None,
+        target_encoder,
         command_limit_m_s=world.command_limit_m_s,
         observed=trained.observed,
     )

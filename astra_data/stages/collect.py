@@ -1,7 +1,6 @@
 """Collect: a behaviour in the target environment, stored as a LeRobot dataset."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -174,7 +173,7 @@ def _behavior(
     trained = PolicyFile.load(files["policy"])
     model = load_grounding(files["grounding"]) if "grounding" in files else None
     encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
-    deployed = replace(deploy(task, trained, model), target_encoder=encoder)
+    deployed = deploy(task, trained, model, encoder)
     if deployed.observation_size != trained.policy.shape.observation_size:
         raise BadInputError(
             f"{files['policy']} sees {trained.policy.shape.observation_size} values, the task shows "
