@@ -8,12 +8,12 @@ knowledge   geometry  mazes  free_space  navigation  ant  physics  abstraction  
             recording  import_mapping  conversion  variation
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
 exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
-worlds      envs/ (targets)  sims/ (abstract simulators: raw, randomized, grounded)
+worlds      envs/ (targets)  sims/ (abstract simulators: raw, varied, scattered, grounded)
 learning    tasks  simulators  world  target_world  training_world  policy_file  deployment  behaviors
             suboptimal  gap  mismatch  outcome  gymnasium_faces  pairing  relocation  fitting  training
             target_training  method  learners/
 methods     methods/ (one file each: what is different about it)
-stages      stages/ (one file per step: collect augment pair ground train align evaluate report)
+stages      stages/ (one file per step: collect augment pair subset ground train align evaluate report)
 roof        request  plan  experiment  schedule  cluster  display  board  inspection_page  run  sweep
             commands/  cli
 """

@@ -8,14 +8,17 @@ differs for are not run again: links in its folder lead to the other recipe's ar
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from astra_data.errors import RecipeError
+from astra_data.methods import METHODS
 from astra_data.recipe import did_you_mean, load_tables, validated
-from astra_data.request import METHOD_TABLES, STAGES, WHOLE, Recipe
+from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Recipe
+from astra_data.rows import base_method
 
 ALWAYS_NEW = {"report"}
 """Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
@@ -95,14 +98,32 @@ class Experiment:
         if not record.is_file():
             return
         changed = _differences(json.loads(record.read_text()), self.recipe)
-        stale = _stale_stages(changed) - self.borrowed - ALWAYS_NEW
-        own = [stage for stage in STAGES if stage in stale and not self._is_link(stage)]
-        present = [str(self.folder / stage) for stage in own if (self.folder / stage).exists()]
+        whole = _stale_stages(changed - METHOD_TABLES.keys())
+        own = STAGES.keys() - self.borrowed - ALWAYS_NEW
+        own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
+        present = [str(self.folder / stage) for stage in STAGES if stage in whole & own]
+        for table in sorted(changed & METHOD_TABLES.keys()):
+            for stage in sorted((_stale_stages({table}) - whole) & own):
+                present += map(str, self._rows_of(table, stage))
         if present:
             raise RecipeError(
                 f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
                 f"give the recipe another name, or remove {' '.join(present)}"
             )
+
+    def _rows_of(self, table: str, stage: str) -> list[Path]:
+        """Return the folders in `stage` of the rows that `table` has settings for, or whose policy has."""
+
+        def reads(base: str) -> bool:
+            method = METHODS.get(base)
+            if method is None:
+                return False
+            ours = method.table or base
+            return table in (ours, DERIVED.get(ours)) or (
+                method.initial is not None and reads(method.initial)
+            )
+
+        return [row for row in sorted((self.folder / stage).iterdir()) if reads(base_method(row.name))]
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
@@ -149,10 +170,11 @@ def _stale_stages(changed: set[str]) -> set[str]:
 def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     """Return the settings of `recipe` that differ from those recorded `before`.
 
-    A table that was not known then has its defaults, which are what was done.
+    What was not known then has its default, which is what was done.
     """
-    before = _recorded(type(recipe).model_construct()) | dict(before)
-    before, now = _told(before), _told(_recorded(recipe))
+    with suppress(RecipeError):
+        before = _recorded(validated(before, type(recipe), "recipe.json"))
+    before, now = _told(dict(before)), _told(_recorded(recipe))
     return {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
 
 

@@ -12,6 +12,7 @@ from astra_data.grounding_file import Grounding
 from astra_data.seeding import derive, generator
 from astra_data.simulators import hidden_before, simulator_of, start_simulator
 from astra_data.tasks import Task
+from astra_data.variation import Variation
 
 HORIZONS = (1, 10, 50, 200)
 _START_EVERY = 25
@@ -34,6 +35,9 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         for step in range(0, length, _START_EVERY)
     ]
     episode, start = torch.tensor(pairs, device=lengths.device).T
+    if isinstance(grounding, Variation):
+        # The noise of its sensors is no part of where a simulator goes.
+        grounding = grounding.noiseless()
     before = hidden_before(grounding, windows)
     device = str(windows.state.device)
     horizons = [horizon for horizon in HORIZONS if horizon <= int(lengths.max())]

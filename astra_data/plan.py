@@ -65,7 +65,7 @@ def plan(
     bases = tuple(dict.fromkeys(base_method(row) for row in part.methods))
     reference = reference_of(recipe.methods)
     grounded = [base for base in (*bases, *([reference] if reference else [])) if METHODS[base].grounds]
-    groundings = tuple(dict.fromkeys(map(_grounded_as, grounded)))
+    groundings = tuple(dict.fromkeys(map(grounded_as, grounded)))
     rows = [row for row in part.methods if METHODS[base_method(row)].trains]
     initial = [METHODS[base].initial for base in bases]
     trained = tuple(dict.fromkeys([base for base in initial if base] + rows))
@@ -193,7 +193,7 @@ def _evaluate(data: _Data, row: str) -> Item:
     policy = data.read("train", row if METHODS[base].trains else None)
     grounding = data.read("ground", _grounding(base))
     reference = data.read("ground", _grounding(reference_of(data.recipe.methods) or base))
-    target_encoder = data.read("align", _grounded_as(base) if METHODS[base].aligns else None)
+    target_encoder = data.read("align", grounded_as(base) if METHODS[base].aligns else None)
     call = partial(
         evaluate,
         data.recipe.task,
@@ -211,7 +211,7 @@ def _evaluate(data: _Data, row: str) -> Item:
 
 
 def _report(recipe: Recipe, path: Path, folder: Path, part: Part, publish: bool) -> Item:
-    groundings = {row: _grounded_as(base_method(row)) for row in part.methods}
+    groundings = {row: grounded_as(base_method(row)) for row in part.methods}
     reported = Reported(path.stem, recipe.task, part.methods, part.seeds, groundings, part.percents)
     call = partial(
         report,
@@ -235,10 +235,11 @@ def _command(recipe: Recipe, path: Path, part: Part) -> str:
 
 
 def _grounding(base: str) -> str | None:
-    return _grounded_as(base) if METHODS[base].grounds else None
+    return grounded_as(base) if METHODS[base].grounds else None
 
 
-def _grounded_as(base: str) -> str:
+def grounded_as(base: str) -> str:
+    """Return the method whose grounding and alignment a method uses."""
     return METHODS[base].grounded_as or base
 
 

@@ -51,6 +51,9 @@ METHOD_TABLES = {
 """Methods with settings of their own in a recipe, and the stage that they are for."""
 
 
+DERIVED = {"compass_uniform": "compass"}
+"""Those of them that are read off another one."""
+
 WHOLE = 100
 """Per cent of a dataset that is not swept over."""
 

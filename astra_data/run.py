@@ -17,7 +17,7 @@ from astra_data.display import display
 from astra_data.errors import BadInputError, MissingStageError
 from astra_data.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.lock import held
-from astra_data.plan import plan, stage_of
+from astra_data.plan import grounded_as, plan, stage_of
 from astra_data.recipe import did_you_mean
 from astra_data.request import STAGES, Part, Recipe
 from astra_data.rows import base_method
@@ -198,7 +198,7 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
     if method is not None and method not in recipe.methods:
         raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
     if method is not None and stage in ("ground", "align"):
-        method = base_method(method)
+        method = grounded_as(base_method(method))
 
     def is_asked_for(key: str) -> bool:
         made_by, *row_and_seed = key.split("/")

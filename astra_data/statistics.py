@@ -4,7 +4,7 @@ Follows "Deep reinforcement learning at the edge of the statistical precipice" (
 of its own library, rliable. One score per seed and task; resampling is over seeds, within each task.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -102,26 +102,44 @@ def probability_of_improvement(scores: Floats, others: Floats, *, replicates: in
 
 
 def correlation(
-    first: Floats, second: Floats, *, ranks: bool = False, replicates: int = REPLICATES
+    first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False, replicates: int = REPLICATES
 ) -> Correlation | None:
-    """Correlate `first` (N,) with `second` (N,): Pearson's coefficient, or of `ranks`, Spearman's.
+    """Correlate two scores of every seed of some rows: Pearson's coefficient, or of `ranks`, Spearman's.
 
-    The interval resamples the N pairs. None where there are fewer than three, or one side does not vary.
+    The seeds of a row are alike, so the interval resamples rows, and seeds within each.
+
+    Args:
+        first: one score, an array (seeds,) per row.
+        second: the other, likewise.
+        ranks: correlate ranks.
+        replicates: bootstrap resamples.
+
+    Returns:
+        None where there are fewer than three seeds in all, or one side does not vary.
     """
-    if len(first) < 3 or not np.ptp(first) or not np.ptp(second):
+    rng = np.random.default_rng(0)
+
+    def of(rows: NDArray[np.intp], seeds: Sequence[NDArray[np.intp]]) -> float:
+        pairs = [
+            np.concatenate([scores[row][drawn] for row, drawn in zip(rows, seeds, strict=True)])
+            for scores in (first, second)
+        ]
+        # A resample in which one side does not vary has no correlation.
+        if not all(map(np.ptp, pairs)):
+            return np.nan
+        one, other = map(rankdata, pairs) if ranks else pairs
+        return float(np.corrcoef(one, other)[0, 1])
+
+    def resampled() -> float:
+        rows = rng.integers(len(first), size=len(first))
+        return of(rows, [rng.integers(len(first[row]), size=len(first[row])) for row in rows])
+
+    value = of(np.arange(len(first)), [np.arange(len(scores)) for scores in first])
+    if sum(map(len, first)) < 3 or np.isnan(value):
         return None
-    draws = np.random.default_rng(0).integers(len(first), size=(replicates, len(first)))
-    every = np.concatenate([np.arange(len(first))[None], draws])
-    pairs = [values[every] for values in (first, second)]
-    if ranks:
-        pairs = [rankdata(values, axis=1) for values in pairs]
-    one, other = (values - values.mean(axis=1, keepdims=True) for values in pairs)
-    scale = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
-    # A resample in which one side does not vary has no correlation.
-    scale[np.any([np.ptp(values, axis=1) == 0 for values in pairs], axis=0)] = np.nan
-    value, *resampled = (one * other).sum(axis=1) / scale
-    low, high = np.nanquantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Correlation(float(value), float(low), float(high))
+    replicated = [resampled() for _ in range(replicates)]
+    low, high = np.nanquantile(replicated, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Correlation(value, float(low), float(high))
 
 
 def _matrix(scores: Floats) -> Floats:

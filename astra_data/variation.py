@@ -46,6 +46,11 @@ class Variation(Config):
         """Return what `model_dump` gave, after a way through JSON."""
         return cls(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
 
+    def noiseless(self) -> "Variation":
+        """Return the same ranges without any noise."""
+        names = (name for name in PARAMETERS if "noise" in name)
+        return self.model_copy(update=dict.fromkeys(names, (0.0, 0.0)))
+
     def ranges(self) -> Tensor:
         """Return lower and upper end of every parameter, (P, 2), in the order of `PARAMETERS`."""
         return torch.tensor([getattr(self, name) for name in PARAMETERS])

@@ -224,7 +224,8 @@ def test_only_visited_cells_are_coloured() -> None:
 
 def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
     visits = [Visits(np.full((2, 3), count), (0.0, 3.0, 0.0, 2.0)) for count in (4, 1, 9)]
-    scores = {"nas": np.array([[0.6, 0.8], [0.1, 0.3], [0.7, 0.9]])}
+    # One size has a seed less than the others.
+    scores = {"nas": [np.array([0.6, 0.8]), np.array([0.2]), np.array([0.7, 0.9])]}
     intervals = {"nas": np.array([[0.7, 0.1, 0.8], [0.6, 0.0, 0.7], [0.8, 0.3, 0.9]])}
     figure = data_efficiency([100, 25, 150], scores, intervals, {"position (m)": visits})
     *maps, success = figure.axes

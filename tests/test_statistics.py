@@ -74,7 +74,9 @@ def test_correlations_are_those_of_scipy(ranks: bool, reference: Callable[..., A
     generator = np.random.default_rng(0)
     first = generator.integers(0, 6, 30).astype(float)  # with ties
     second = np.exp(first) + generator.normal(0, 30, 30)
-    found = correlation(first, second, ranks=ranks)
+    # With a seed per row, resampling rows is the ordinary bootstrap.
+    alone = np.split(first, 30), np.split(second, 30)
+    found = correlation(*alone, ranks=ranks)
     assert found is not None
     assert found.value == pytest.approx(reference(first, second).statistic)
     expected = bootstrap(
@@ -87,13 +89,27 @@ def test_correlations_are_those_of_scipy(ranks: bool, reference: Callable[..., A
         rng=generator,
     ).confidence_interval
     assert (found.low, found.high) == pytest.approx(tuple(expected), abs=0.05)
-    assert correlation(first, second, ranks=ranks) == found
+    assert correlation(*alone, ranks=ranks) == found
+
+
+def test_seeds_of_a_row_are_no_independent_evidence() -> None:
+    generator = np.random.default_rng(0)
+    misses = 0
+    for _ in range(100):
+        row, other_row = generator.normal(0, 1, (2, 8, 1))
+        scores, others = (values + generator.normal(0, 0.3, (8, 10)) for values in (row, other_row))
+        found = correlation(list(scores), list(others), replicates=200)
+        assert found is not None
+        misses += not found.low <= 0.0 <= found.high
+    # A bootstrap of eight rows covers somewhat less than 95 %; of eighty policies, a third.
+    assert misses <= 25
 
 
 def test_what_does_not_vary_correlates_with_nothing() -> None:
-    two, three = np.array([1.0, 2.0]), np.array([0.1, 0.1, 0.3])
+    two, three = [np.array([1.0, 2.0])], np.split(np.array([0.1, 0.1, 0.3]), 3)
+    same = np.split(np.full(3, 0.1), 3)
     assert correlation(two, two) is None
-    assert correlation(three, np.full(3, 0.1)) is correlation(np.full(3, 0.1), three) is None
+    assert correlation(three, same) is correlation(same, three) is None
     # Nor do the resamples in which chance left no variation.
     found = correlation(three, three)
     assert found is not None

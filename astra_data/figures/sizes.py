@@ -31,7 +31,7 @@ class Visits:
 
 def data_efficiency(
     percents: Sequence[int],
-    scores: Mapping[str, Floats],
+    scores: Mapping[str, Sequence[Floats]],
     intervals: Mapping[str, Floats],
     covered: Mapping[str, Sequence[Visits]],
 ) -> Figure:
@@ -39,7 +39,7 @@ def data_efficiency(
 
     Args:
         percents: the K sizes.
-        scores: success of each row's seeds, (K, seeds), in [0, 1].
+        scores: success of each row's seeds, K times (seeds,), in [0, 1].
         intervals: interquartile mean, low and high of each row, (3, K); low and high NaN for a single seed.
         covered: what is mapped, such as "position (m)" → the visits of each size.
     """
@@ -64,7 +64,7 @@ def data_efficiency(
             _band(
                 axes,
                 np.array(percents, dtype=float)[order],
-                seeds[order],
+                [seeds[k] for k in order],
                 intervals[method][:, order],
                 method,
             )
@@ -96,11 +96,11 @@ def _maps(panels: Sequence[Axes], visits: Sequence[Visits], label: str) -> None:
     panels[0].set_ylabel(label)
 
 
-def _band(axes: Axes, percents: Floats, seeds: Floats, interval: Floats, method: str) -> None:
+def _band(axes: Axes, percents: Floats, seeds: Sequence[Floats], interval: Floats, method: str) -> None:
     middle, low, high = interval
     colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
     if np.isfinite(low).all():
         axes.fill_between(percents, low, high, color=colour, alpha=0.18, lw=0)
     axes.plot(percents, middle, dashes, color=colour, marker="o", ms=4, label=method_title(method))
-    places = np.repeat(percents, seeds.shape[1])
-    axes.plot(places, seeds.ravel(), ".", color=colour, alpha=0.45, ms=4, zorder=1)
+    places = np.repeat(percents, [len(of_size) for of_size in seeds])
+    axes.plot(places, np.concatenate(seeds), ".", color=colour, alpha=0.45, ms=4, zorder=1)

@@ -276,11 +276,11 @@ def _validity(rows: Mapping[str, MethodResults], replicates: int) -> dict[str, V
     found = {}
     for world in SHARED_WORLDS:
         tested = [row for row in rows.values() if world in row.simulator_returns]
-        simulated = np.array([value for row in tested for value in row.simulator_returns[world]])
-        target = np.array([value for row in tested for value in row.returns])
+        simulated = [np.array(row.simulator_returns[world]) for row in tested]
+        target = [np.array(row.returns) for row in tested]
         if tested:
             found[world] = Validity(
-                policies=len(target),
+                policies=sum(map(len, target)),
                 pearson=correlation(simulated, target, replicates=replicates),
                 spearman=correlation(simulated, target, ranks=True, replicates=replicates),
             )

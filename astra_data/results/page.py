@@ -174,7 +174,8 @@ def _validity(results: Results) -> str:
     ]
     note = (
         "How well the return in a simulator foretells the return in the target, over policies: every row and "
-        "seed, each tested from the task's starts and paid the task's reward. Intervals resample policies."
+        "seed, each tested from the task's starts and paid the task's reward. Intervals resample rows, and "
+        "seeds within each."
     )
     if "grounded" in found:
         reference = reference_of(results.methods)

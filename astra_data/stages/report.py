@@ -12,7 +12,6 @@ from pydantic import Field
 
 from astra_data.checkpoint import finished_folder
 from astra_data.dataset.reader import Dataset
-from astra_data.errors import BadInputError
 from astra_data.figures import (
     Curve,
     Foretold,
@@ -30,6 +29,7 @@ from astra_data.figures import (
 )
 from astra_data.inspection import visited
 from astra_data.mazes import Maze
+from astra_data.methods import method_named
 from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
 from astra_data.recipe import Config
@@ -50,7 +50,7 @@ class ReportConfig(Config):
     """How a report is drawn."""
 
     trajectory_methods: tuple[str, ...] = ()
-    """Rows whose trajectories are drawn; all rows when empty."""
+    """Rows whose trajectories are drawn where they are reported; all rows when none of them is."""
 
     trajectory_episodes: int = Field(default=12, ge=1)
     """Episodes drawn per row and world, the first ones of the row's first seed."""
@@ -182,10 +182,10 @@ def _success(results: Results) -> Figure:
 
 def _trajectories(results: Results, root: Path, maze: Maze, config: ReportConfig) -> Figure:
     panels = []
-    unknown = [method for method in config.trajectory_methods if method not in results.methods]
-    if unknown:
-        raise BadInputError(f"report.trajectory_methods: expected rows of the recipe, got '{unknown[0]}'")
-    for method in config.trajectory_methods or results.methods:
+    for row in config.trajectory_methods:
+        method_named(row)
+    drawn = [row for row in config.trajectory_methods if row in results.methods]
+    for method in drawn or results.methods:
         folder = root / "evaluate" / method / f"seed_{results.methods[method].seeds[0]}"
         evaluation = read_json(Evaluation, folder / EVALUATION)
         tensors = read_tensors(folder / TRAJECTORIES, ("target.position", "goal"))
@@ -270,7 +270,7 @@ def _data_efficiency(found: SizesResults, root: Path) -> Figure:
                 covered.setdefault(label, []).append(Visits(planar.counts, planar.extent))
     return data_efficiency(
         [size.percent for size in found.sizes],
-        {method: np.array([row.success for row in of]) for method, of in rows.items()},
+        {method: [np.array(row.success) for row in of] for method, of in rows.items()},
         # Where there is a single seed, None becomes NaN.
         {
             method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T
