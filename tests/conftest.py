@@ -21,7 +21,8 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     model: type[Recipe] = create_model("FakeRecipe", __base__=request.Recipe, **sections)  # type: ignore[call-overload]
     for stage in request.STAGES:
         monkeypatch.setattr(plan, stage, getattr(fake_stages, stage))
-    for module in (plan, request):
+    experiment = importlib.import_module("astra_data.experiment")
+    for module in (plan, request, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setattr(request, "TASKS", {"maze": None})
     monkeypatch.setattr("astra_data.experiment.Recipe", model)

@@ -195,6 +195,20 @@ def test_a_table_that_the_folder_s_recipe_did_not_have_is_no_change(base: Path, 
     del kept["target"]
     record.write_text(json.dumps(kept))
     assert check(base, root=tmp_path)["train/astra/seed_0"]
-    base.write_text(BASE + "[target]\nnum_envs = 3\n")
-    with pytest.raises(RecipeError, match="target changed in the recipe"):
+    kept["collect"].pop("episodes")
+    record.write_text(json.dumps(kept))
+    assert check(base, root=tmp_path)["train/astra/seed_0"]
+
+
+def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_path: Path) -> None:
+    base.write_text(BASE.replace('"follower"', '"full_obs"'))
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(base.read_text() + "[target]\nnum_envs = 3\n")
+    with pytest.raises(RecipeError) as caught:
         check(base, root=tmp_path)
+    stale = f"{folder / 'evaluate/full_obs'} {folder / 'train/full_obs'}"
+    assert str(caught.value).endswith(f"or remove {stale}")
+    base.write_text(BASE + "[target]\nnum_envs = 3\n[iql]\ndiscount = 0.9\n")
+    for stage in ("train", "evaluate"):
+        shutil.rmtree(folder / stage / "full_obs")
+    assert check(base, root=tmp_path)["train/astra/seed_0"]

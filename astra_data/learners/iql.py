@@ -245,7 +245,7 @@ def _iql_loss(policy: ActorCritic, experience: Experience, config: IqlConfig) ->
     loss = IQLLoss(
         actor,
         ValueOperator(_ActionValue(observed, acted, config), in_keys=["observation", "action"]),
-        ValueOperator(mlp((observed, *config.critic_sizes, 1)), in_keys=["observation"]),
+        ValueOperator(mlp((observed, *config.critic_sizes, 1), nn.ReLU), in_keys=["observation"]),
         loss_function="l2",
         temperature=config.temperature,
         expectile=config.expectile,
@@ -259,7 +259,7 @@ def _iql_loss(policy: ActorCritic, experience: Experience, config: IqlConfig) ->
 class _ActionValue(nn.Module):
     def __init__(self, observed: int, acted: int, config: IqlConfig) -> None:
         super().__init__()
-        self.network = mlp((observed + acted, *config.critic_sizes, 1))
+        self.network = mlp((observed + acted, *config.critic_sizes, 1), nn.ReLU)
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         return torch.as_tensor(self.network(torch.cat([observation, action], dim=-1)))

@@ -7,11 +7,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
-def mlp(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Build linear layers of `sizes` with ELU between them."""
+def mlp(sizes: tuple[int, ...], activation: type[nn.Module] = nn.ELU) -> nn.Sequential:
+    """Build linear layers of `sizes` with `activation` between them."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), nn.ELU()]
+        layers += [nn.Linear(size_in, size_out), activation()]
     return nn.Sequential(*layers[:-1])
 
 
