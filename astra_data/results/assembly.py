@@ -56,12 +56,13 @@ def assemble(
     Of one size of the dataset, `percent`, where there are several.
 
     Raises:
-        MissingStageError: a row has no evaluation, or other artefacts for some of its finished seeds only.
+        MissingStageError: no row has an evaluation, or one has other artefacts for some of its finished
+            seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
     read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
-    read.require("evaluate", TRAJECTORIES, methods)
+    read.require("evaluate", TRAJECTORIES, tuple(read.finished))
     episodes = _check_alike(evaluations, task)
     metrics = read.optional("ground", "metrics.json", Metrics)
     gaps = read.optional("ground", "gap.json", Gap)
@@ -116,6 +117,7 @@ def assemble(
         seeds=[seed for seed in asked if seed in reported],
         episodes=episodes,
         methods=rows,
+        unfinished=[method_title(method) for method in methods if method not in rows],
         probability_of_improvement=_improvement(rows, replicates),
         predictive_validity=_validity(rows, replicates),
         throughput=throughput(files),

@@ -157,6 +157,8 @@ class Results(Part):
     episodes: int
     """Per row and seed."""
     methods: dict[str, MethodResults]
+    unfinished: list[str] = Field(default_factory=list)
+    """Titles of the recipe's rows that no seed of is finished yet."""
     probability_of_improvement: dict[str, dict[str, Comparison]]
     """ASTRA's row → another that is trained alike → how likely a seed of the one beats one of the other."""
     predictive_validity: dict[str, Validity]

@@ -52,10 +52,10 @@ class Runs:
 
     @cached_property
     def finished(self) -> dict[str, tuple[int, ...]]:
-        """The seeds of each row whose evaluation is finished.
+        """The seeds of each row whose evaluation is finished; rows without any are left out.
 
         Raises:
-            MissingStageError: a row has none.
+            MissingStageError: no row has one.
         """
         seeds = {
             method: tuple(
@@ -63,12 +63,13 @@ class Runs:
             )
             for method in self.methods
         }
-        self._require("evaluate", EVALUATION, {row: self.seeds for row, found in seeds.items() if not found})
-        return seeds
+        if not any(seeds.values()):
+            self._require("evaluate", EVALUATION, dict.fromkeys(self.methods, self.seeds))
+        return {method: found for method, found in seeds.items() if found}
 
     def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
         """Read a file of every row and its finished seeds: row → seed → file."""
-        return self._read(stage, name, model, self.methods)
+        return self._read(stage, name, model, tuple(self.finished))
 
     def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
         """Read a file of the rows that have it, by `owner`: for all of their finished seeds, or for none."""

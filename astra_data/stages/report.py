@@ -110,10 +110,11 @@ def report(
         config: how to draw.
 
     Raises:
-        MissingStageError: a row has no evaluation, or other artefacts for some of its finished seeds only.
+        MissingStageError: no row has an evaluation, or one has other artefacts for some of its finished
+            seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
-    sizes = [
+    sizes = _with_common_rows(
         assemble(
             recipe.name,
             recipe.task,
@@ -126,7 +127,7 @@ def report(
             percent=percent,
         )
         for percent in recipe.percents or (None,)
-    ]
+    )
     progress(0.5, f"{len(sizes[0].methods)} rows, {len(sizes[0].seeds)} seeds")
     found: Found
     if recipe.percents:
@@ -142,6 +143,16 @@ def report(
     if publish is not None:
         publish_results(found, page, images, publish)
     progress(1.0, _headline(sizes[-1]))
+
+
+def _with_common_rows(sizes: Iterable[Results]) -> list[Results]:
+    """Leave out the rows that are not finished at every size."""
+    found = list(sizes)
+    rows = [row for row in found[0].methods if all(row in results.methods for results in found)]
+    return [
+        results.model_copy(update={"methods": {row: results.methods[row] for row in rows}})
+        for results in found
+    ]
 
 
 def _figures(results: Results, root: Path, config: ReportConfig) -> dict[str, Figure]:

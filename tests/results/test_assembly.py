@@ -96,12 +96,15 @@ def test_each_row_has_the_seeds_that_it_has_finished(root: Path) -> None:
     assert list(assembled(root, ("astra_plus",)).seeds) == [1, 2]
 
 
-def test_a_row_of_no_seed_is_named_with_the_command_for_its_first(root: Path) -> None:
+def test_rows_of_no_seed_are_left_out_and_told_where_nothing_else_is_there(root: Path) -> None:
     for seed in SEEDS:
         (root / f"evaluate/astra/seed_{seed}/evaluation.json").unlink()
     (root / "evaluate/follower/seed_2/evaluation.json").unlink()
+    results = assembled(root)
+    assert list(results.methods) == [row for row in ROWS if row != "astra"]
+    assert results.unfinished == ["ASTRA"]
     with pytest.raises(MissingStageError) as error:
-        assembled(root)
+        assembled(root, ("astra",))
     message = str(error.value)
     assert "found none for astra seed 0, 1, 2; run" in message
     assert "astra-data evaluate recipes/antmaze_u.toml --method astra --seed 0" in message
