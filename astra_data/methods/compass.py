@@ -26,7 +26,7 @@ from astra_data.recipe import Count
 from astra_data.seeding import derive
 from astra_data.tasks import Task
 from astra_data.training import SimulatorPpo
-from astra_data.variation import PARAMETERS, Range, Variation
+from astra_data.variation import PARAMETERS, FactorRange, NoiseRange, Range, Variation
 
 STEERING = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
 """What is identified. The others are noise, with which no replay comes closer to a recording, however noisy
@@ -46,19 +46,19 @@ class CompassConfig(Variation, CausalConfig):
     nothing of what follows the ranges.
     """
 
-    friction: Range = (0.8, 1.2)
+    friction: FactorRange = (0.8, 1.2)
     """Factor on the speed that a command gives."""
     action_scale: Range = (-0.1, 0.1)
     """Share by which commands are too long."""
-    action_noise: Range = (0.05, 0.05)
+    action_noise: NoiseRange = (0.05, 0.05)
     """Standard deviation of Gaussian noise on commands, in m/s."""
-    position_noise_m: Range = (0.03, 0.03)
+    position_noise_m: NoiseRange = (0.03, 0.03)
     """Half width of the uniform noise on shown positions."""
-    velocity_noise_m_s: Range = (0.0, 0.02)
+    velocity_noise_m_s: NoiseRange = (0.0, 0.02)
     """Half width of the uniform noise on shown velocities."""
     heading_bias_deg: Range = (-5.0, 5.0)
     """Commands are turned by this angle."""
-    timestep_scale: Range = (0.75, 1.25)
+    timestep_scale: FactorRange = (0.75, 1.25)
     """Factor on the control period."""
 
     iterations: Count = 5
