@@ -65,8 +65,8 @@ class Board:
         self._seconds[key.partition("/")[0]].append(seconds)
 
     def failed(self, key: str) -> None:
-        """Note that an item has failed."""
-        del self._running[key]
+        """Note that an item has failed, whether it had begun or not."""
+        self._running.pop(key, None)
         self._failed.add(key)
 
     def done(self, point: Point, success: float) -> None:

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,39 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except json.JSONDecodeError:
         raise BadInputError(f"{path} was not written by astra-data: its metadata is not JSON") from None
     return tensors, metadata
+
+
+@contextmanager
+def understood(
+    path: Path, what: str, kinds: Collection[str], device: str
+) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
+    """Yield the tensors (on `device`) and the metadata of `path`, from which the block builds `what`.
+
+    Args:
+        path: written by `save_tensors`.
+        what: for messages, such as "a policy".
+        kinds: what the metadata's "kind" may be.
+        device: torch device.
+
+    Raises:
+        BadInputError: the file cannot be read, is of another kind, or the block does not find in it what it
+            needs, as in one from an older version.
+    """
+    tensors, metadata = load_tensors(path)
+    kind = metadata.get("kind")
+    if kind not in kinds:
+        found = "a file without a kind" if kind is None else f"kind {kind}"
+        raise BadInputError(
+            f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again"
+        )
+    moved = {name: tensor.to(device) for name, tensor in tensors.items()}
+    try:
+        yield moved, metadata
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        found = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise BadInputError(
+            f"{path}: expected {what} as this version writes it, found {found}: run that stage again"
+        ) from error
 
 
 @contextmanager

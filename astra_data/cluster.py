@@ -5,11 +5,12 @@ An item computes there what it computes in a process of this machine, so its art
 
 import os
 import pickle
+import platform
 import sys
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,23 +57,25 @@ def execute_on_cluster(
         prepare: called in each task before its item.
 
     Raises:
-        BadInputError: Ray is not installed, or no cluster answers.
+        BadInputError: Ray is not installed, no cluster answers, or it lacks the GPU that an item wants.
         AstraDataError: an item failed; its own error, with its key before the message, or where its
-            traceback is when it crashed.
+            traceback is when it crashed. Or the cluster was lost.
     """
     ray = _connect(address, jobs)
-    mailbox = ray.remote(num_cpus=0)(Mailbox).remote()
-    task = ray.remote(num_cpus=1, max_retries=0)(_work)
     waiting = {item.key: item for item in items}
     unfinished = set(waiting)
     running: dict[Any, str] = {}
     try:
+        if any(map(_wants_gpu, items)) and not ray.cluster_resources().get("GPU"):
+            raise BadInputError(f"the Ray cluster at {address} has no GPU: use --device cpu")
+        mailbox = ray.remote(num_cpus=0)(Mailbox).remote()
+        task = ray.remote(num_cpus=1, max_retries=0)(_work)
         while unfinished:
             for item in [item for item in waiting.values() if unfinished.isdisjoint(item.inputs)]:
                 if len(running) == jobs:
                     break
                 del waiting[item.key]
-                share = GPU_SHARE if item.device.startswith("cuda") else 0
+                share = GPU_SHARE if _wants_gpu(item) else 0
                 # Unpickled inside the task, when its log is in place.
                 call = pickle.dumps((prepare, item.call))
                 log = logs / f"{item.key}.txt"
@@ -88,12 +91,10 @@ def execute_on_cluster(
                 key = running.pop(task_id)
                 _finish(ray, task_id, key, watch)
                 unfinished.discard(key)
+    except (ray.exceptions.RayError, ConnectionError) as error:
+        raise AstraDataError(f"the Ray cluster at {address} was lost: {_first_line(error)}") from None
     finally:
-        for task_id in running:
-            ray.cancel(task_id, force=True)
-        if running:
-            ray.wait(list(running), num_returns=len(running), timeout=PATIENCE_S)
-        ray.shutdown()
+        _leave(ray, list(running))
 
 
 class Mailbox:
@@ -121,12 +122,29 @@ def _connect(address: str, jobs: int | None) -> Any:  # noqa: ANN401 - the modul
     try:
         ray.init(address, log_to_driver=False, logging_level="ERROR", **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        reason = str(error).partition("\n")[0]
         raise BadInputError(
-            f"no Ray cluster can be used at {address}: {reason}; `ray status` tells which run, "
+            f"no Ray cluster can be used at {address}: {_first_line(error)}; `ray status` tells which run, "
             "`ray start --head` starts one"
         ) from None
     return ray
+
+
+def _leave(ray: Any, running: list[Any]) -> None:  # noqa: ANN401 - Ray's
+    """Stop the tasks `running`, as far as the cluster is still there, and disconnect."""
+    with suppress(ray.exceptions.RayError, ConnectionError):
+        for task_id in running:
+            ray.cancel(task_id, force=True)
+        if running:
+            ray.wait(running, num_returns=len(running), timeout=PATIENCE_S)
+    ray.shutdown()
+
+
+def _wants_gpu(item: Item) -> bool:
+    return item.device.startswith("cuda")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0]
 
 
 def _pass_on(key: str, note: tuple[float, str] | None, watch: Watcher) -> None:
@@ -141,8 +159,7 @@ def _finish(ray: Any, task_id: Any, key: str, watch: Watcher) -> None:  # noqa: 
         outcome = ray.get(task_id)
     except ray.exceptions.RayError as error:
         watch.failed(key)
-        reason = str(error).strip().partition("\n")[0]
-        raise AstraDataError(f"{key} was lost with its worker: {reason}") from None
+        raise AstraDataError(f"{key} was lost with its worker: {_first_line(error)}") from None
     if isinstance(outcome, AstraDataError):
         watch.failed(key)
         raise outcome
@@ -160,7 +177,13 @@ def _work(
     # The tasks of a worker follow each other, and what they import stays.
     ray = sys.modules["ray"]
     folder, modules = here
-    os.chdir(folder)
+    try:
+        os.chdir(folder)
+    except OSError as error:
+        return AstraDataError(
+            f"{key}: {platform.node()} cannot work in {folder}, which the machines of a cluster must share: "
+            f"{error.strerror}"
+        )
     sys.path.extend(place for place in modules if place not in sys.path)
     began = time.perf_counter()
 

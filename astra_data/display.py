@@ -103,5 +103,6 @@ class LiveDisplay:
         self._progress.console.print(f"{key}  finished in {seconds:.1f} s", markup=False, highlight=False)
 
     def failed(self, key: str) -> None:
-        """Leave the item's line where it stopped."""
-        self._progress.update(self._tasks[key], note="failed")
+        """Leave the item's line where it stopped, if it had begun."""
+        if key in self._tasks:
+            self._progress.update(self._tasks[key], note="failed")

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.checkpoint import save_tensors, understood
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.models.grounding import GroundingModel, GroundingShape
@@ -32,19 +32,23 @@ def save_grounding(path: Path, grounding: Grounding, episodes: PairedEpisodes) -
 
 
 def load_grounding(path: Path, device: str = "cpu") -> Grounding:
-    """Read a grounding; the parameters of its networks are frozen."""
-    tensors, told = load_tensors(path)
-    if told["kind"] == "variation":
-        return Variation.of_json(told["variation"])
-    shape: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in told["shape"].items()
-    }
-    model: GroundingModel | ResidualModel
-    if told["kind"] == "residual":
-        model = ResidualModel(ResidualShape(**shape))
-    else:
-        model = GroundingModel(GroundingShape(**shape), told["target"])
-    model.load_state_dict(tensors)
+    """Read a grounding; the parameters of its networks are frozen.
+
+    Raises:
+        BadInputError: it is something else, or from an older version.
+    """
+    with understood(path, "a grounding", ("history", "residual", "variation"), device) as (tensors, told):
+        if told["kind"] == "variation":
+            return Variation.of_json(told["variation"])
+        shape: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in told["shape"].items()
+        }
+        model: GroundingModel | ResidualModel
+        if told["kind"] == "residual":
+            model = ResidualModel(ResidualShape(**shape))
+        else:
+            model = GroundingModel(GroundingShape(**shape), told["target"])
+        model.load_state_dict(tensors)
     return model.to(device).requires_grad_(False).eval()
 
 

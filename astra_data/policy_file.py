@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.checkpoint import save_tensors, understood
 from astra_data.deployment import DeployedPolicy, Observed
 from astra_data.grounding_file import Grounding
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
@@ -73,33 +73,37 @@ class PolicyFile:
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> "PolicyFile":
-        """Read a policy; its parameters are frozen."""
-        tensors, told = load_tensors(path)
-        told["shape"]["hidden_sizes"] = tuple(told["shape"]["hidden_sizes"])
-        if told.get("kind") == "adaptive":
-            policy: ActorCritic = Student(AdaptiveShape(**told["shape"]))
-        else:
-            policy = ActorCritic(ActorCriticShape(**told["shape"]))
-        prefix = "policy."
-        policy.load_state_dict(
-            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        )
-        simulation = None
-        if said := told.get("simulation"):
-            varied = said["variation"]
-            simulation = Simulation(
-                tensors["thinness"].to(device),
-                tensors["scatter"].to(device),
-                WorldConfig(**said["world"]),
-                Variation.of_json(varied) if varied else None,
+        """Read a policy; its parameters are frozen.
+
+        Raises:
+            BadInputError: it is something else, or from an older version.
+        """
+        with understood(path, "a policy", ("actor_critic", "adaptive"), device) as (tensors, told):
+            shape = told["shape"] | {"hidden_sizes": tuple(told["shape"]["hidden_sizes"])}
+            if told["kind"] == "adaptive":
+                policy: ActorCritic = Student(AdaptiveShape(**shape))
+            else:
+                policy = ActorCritic(ActorCriticShape(**shape))
+            prefix = "policy."
+            policy.load_state_dict(
+                {
+                    name.removeprefix(prefix): value
+                    for name, value in tensors.items()
+                    if name.startswith(prefix)
+                }
             )
-        return cls(
-            policy.to(device).requires_grad_(False),
-            simulation,
-            told["dataset"],
-            told["hash"],
-            told["observed"],
-        )
+            simulation = None
+            if said := told.get("simulation"):
+                varied = said["variation"]
+                simulation = Simulation(
+                    tensors["thinness"],
+                    tensors["scatter"],
+                    WorldConfig(**said["world"]),
+                    Variation.of_json(varied) if varied else None,
+                )
+            read = cls(policy, simulation, told["dataset"], told["hash"], told["observed"])
+        policy.to(device).requires_grad_(False)
+        return read
 
 
 def deploy(

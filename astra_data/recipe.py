@@ -1,5 +1,6 @@
 """Recipes: TOML files read into strict, frozen models, with every fault of a file told at once."""
 
+import json
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -28,6 +29,12 @@ class Config(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+
+def as_json(**configs: Config | None) -> str:
+    """Return the settings of several parts, by their names; of a part that has none, null."""
+    told = {name: config and config.model_dump(mode="json") for name, config in configs.items()}
+    return json.dumps(told, indent=1)
 
 
 def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:

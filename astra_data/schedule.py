@@ -50,7 +50,7 @@ class Watcher(Protocol):
         """Say that an item is finished, and its wall-clock time."""
 
     def failed(self, key: str) -> None:
-        """Say that an item has failed; no other goes on."""
+        """Say that an item has failed, perhaps before it had begun; no other goes on."""
 
 
 def execute(

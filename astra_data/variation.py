@@ -16,7 +16,21 @@ def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
+def _above_zero(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] <= 0:
+        raise ValueError(f"expected a range above 0, got {list(ends)}")
+    return ends
+
+
+def _not_below_zero(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] < 0:
+        raise ValueError(f"expected a range from 0 up, got {list(ends)}")
+    return ends
+
+
 Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+FactorRange = Annotated[Range, AfterValidator(_above_zero)]
+NoiseRange = Annotated[Range, AfterValidator(_not_below_zero)]
 
 
 class Variation(Config):
@@ -26,19 +40,19 @@ class Variation(Config):
     positions tell their product only; velocities, that of the first two.
     """
 
-    friction: Range = (1.0, 1.0)
+    friction: FactorRange = (1.0, 1.0)
     """Factor on the speed that a command gives."""
     action_scale: Range = (0.0, 0.0)
     """Share by which commands are too long."""
-    action_noise: Range = (0.0, 0.0)
+    action_noise: NoiseRange = (0.0, 0.0)
     """Standard deviation of Gaussian noise on commands, in m/s."""
-    position_noise_m: Range = (0.0, 0.0)
+    position_noise_m: NoiseRange = (0.0, 0.0)
     """Half width of the uniform noise on shown positions."""
-    velocity_noise_m_s: Range = (0.0, 0.0)
+    velocity_noise_m_s: NoiseRange = (0.0, 0.0)
     """Half width of the uniform noise on shown velocities."""
     heading_bias_deg: Range = (0.0, 0.0)
     """Commands are turned by this angle."""
-    timestep_scale: Range = (1.0, 1.0)
+    timestep_scale: FactorRange = (1.0, 1.0)
     """Factor on the control period."""
 
     @classmethod

@@ -80,3 +80,11 @@ def test_the_time_left_follows_from_the_work_done_and_its_speed(monkeypatch: pyt
     for seed in (2, 3):
         board.progressed(f"train/nas/seed_{seed}", 0.5)
     assert board.whole() == "2 of 4 points, 12 min left"
+
+
+def test_an_item_may_fail_before_it_has_begun() -> None:
+    nas = Point("nas", 0)
+    planned = items(nas)
+    board = Board([nas], planned, {}, [item.key for item in planned])
+    board.failed("pair/seed_0")
+    assert board.state(nas) == "failed"

@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fake_items import crash, fail, hang, kill_itself, rendezvous, touch
@@ -16,16 +17,16 @@ from astra_data.sweep import sweep
 
 # Ray looks when it is imported.
 os.environ |= SETTINGS
-pytest.importorskip("ray", reason="ray is not installed: uv sync --extra ray")
+ray = pytest.importorskip("ray", reason="ray is not installed: uv sync --extra ray")
 
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - only where Ray is installed
 
-    node = {"num_cpus": 1, "include_dashboard": False}
+    node = {"num_cpus": 1, "num_gpus": 0, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=node)
-    cluster.add_node(num_cpus=1)
+    cluster.add_node(num_cpus=1, num_gpus=0)
     yield cluster.address
     cluster.shutdown()  # type: ignore[no-untyped-call]
 
@@ -98,3 +99,42 @@ def test_a_cluster_that_does_not_answer_is_told(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("ray.init", refuse)
     with pytest.raises(BadInputError, match=r"^no Ray cluster can be used at head:1: nobody there; `ray"):
         execute_on_cluster([], address="head:1", jobs=None, logs=tmp_path, watch=Record())
+
+
+def test_a_worker_that_does_not_share_the_folder_is_told(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = SimpleNamespace(cwd=lambda: tmp_path / "elsewhere")
+    monkeypatch.setattr("astra_data.cluster.Path", own)
+    record = Record()
+    items = [Item("a", (), partial(touch, tmp_path / "a", ()))]
+    with pytest.raises(
+        AstraDataError,
+        match=r"^a: .* cannot work in .*elsewhere, which .* must share: No such file or directory$",
+    ):
+        execute_on_cluster(items, address=address, jobs=None, logs=tmp_path / "logs", watch=record)
+    assert record.events == [("failed", "a")]
+
+
+def test_a_gpu_that_is_not_there_is_told_at_once(address: str, tmp_path: Path) -> None:
+    items = [
+        Item("a", (), partial(touch, tmp_path / "a", ())),
+        Item("b", ("a",), partial(touch, tmp_path / "b", ()), device="cuda"),
+    ]
+    with pytest.raises(BadInputError, match=r"^the Ray cluster at .* has no GPU: use --device cpu$"):
+        execute_on_cluster(items, address=address, jobs=None, logs=tmp_path / "logs", watch=Record())
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("lost", [ConnectionError("gone\nfor good"), ray.exceptions.RaySystemError("gone")])
+def test_a_cluster_that_is_lost_is_told(
+    lost: Exception, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lose(*_: object, **__: object) -> None:
+        raise lost
+
+    monkeypatch.setattr("ray.wait", lose)
+    monkeypatch.setattr("ray.cancel", lose)
+    items = [Item("a", (), partial(touch, tmp_path / "a", ()))]
+    with pytest.raises(AstraDataError, match=r"^the Ray cluster at .* was lost: .*gone$"):
+        execute_on_cluster(items, address=address, jobs=None, logs=tmp_path / "logs", watch=Record())

@@ -1,5 +1,6 @@
 from io import StringIO
 
+import pytest
 from rich.console import Console
 
 from astra_data.display import display
@@ -42,3 +43,10 @@ def test_in_a_terminal_something_may_stand_above_the_items() -> None:
         watch.failed("train/nas/seed_0")
     last = file.getvalue().rpartition("3 of 7 points")[2]
     assert "train/nas/seed_0" in last and "failed" in last
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_an_item_may_fail_before_it_has_begun(is_terminal: bool) -> None:
+    console = Console(file=StringIO(), force_terminal=is_terminal)
+    with display(1, console) as watch:
+        watch.failed("train/nas/seed_0")

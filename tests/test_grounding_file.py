@@ -1,12 +1,16 @@
 from pathlib import Path
 
+import pytest
 import torch
 
-from astra_data.checkpoint import load_tensors
+from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding, load_history_model, save_grounding
+from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.models.residual import ResidualModel, ResidualShape
+from astra_data.policy_file import PolicyFile
 
 
 def no_episodes() -> PairedEpisodes:
@@ -45,3 +49,40 @@ def test_a_residual_model_comes_back_frozen(tmp_path: Path) -> None:
     # Not to the bit: torch's LSTM rounds differently in training.
     for ours, theirs in zip(model.correct(*given), loaded.correct(*given), strict=True):
         torch.testing.assert_close(ours, theirs)
+
+
+def test_what_is_no_grounding_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "grounding.safetensors"
+    policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8))
+    PolicyFile(policy, None, "toy@data-1.0.0", "abc").save(path)
+    with pytest.raises(
+        BadInputError,
+        match=r"grounding.safetensors: expected a grounding \(kind history or residual or variation\), "
+        r"found kind actor_critic: run that stage again$",
+    ):
+        load_grounding(path)
+
+
+@pytest.mark.parametrize(
+    ("lacks", "found"),
+    [("kind", "a file without a kind"), ("shape", "no 'shape'"), ("target", "no 'target'")],
+)
+def test_a_grounding_of_an_older_version_is_told(lacks: str, found: str, tmp_path: Path) -> None:
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), no_episodes())
+    tensors, told = load_tensors(path)
+    save_tensors(path, tensors, {key: value for key, value in told.items() if key != lacks})
+    with pytest.raises(BadInputError, match=f"expected a grounding .*found {found}: run that stage again$"):
+        load_grounding(path)
+
+
+def test_a_grounding_with_other_sizes_or_weights_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, ResidualModel(ResidualShape(4, 2, hidden_size=8)), no_episodes())
+    tensors, told = load_tensors(path)
+    save_tensors(path, tensors, told | {"shape": told["shape"] | {"depth": 2}})
+    with pytest.raises(BadInputError, match=r"found .* unexpected keyword argument 'depth': run that stage"):
+        load_grounding(path)
+    save_tensors(path, {"weight": torch.zeros(1)}, told)
+    with pytest.raises(BadInputError, match=r'found .*Unexpected key.*"weight".*: run that stage again$'):
+        load_grounding(path)

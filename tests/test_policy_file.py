@@ -1,9 +1,15 @@
 from pathlib import Path
 
+import pytest
 import torch
+from test_grounding_file import no_episodes
 
+from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.errors import BadInputError
+from astra_data.grounding_file import Grounding, save_grounding
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.adaptation import AdaptiveShape, Student
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.training_world import WorldConfig
 from astra_data.variation import Variation
@@ -42,3 +48,31 @@ def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn_like(student.initial_hidden(4))
     for one, other in zip(loaded.remember(*step), student.remember(*step), strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("grounding", "kind"),
+    [(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), "history"), (Variation(), "variation")],
+)
+def test_a_grounding_is_no_policy(grounding: Grounding, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    save_grounding(path, grounding, no_episodes())
+    with pytest.raises(
+        BadInputError,
+        match=r"policy.safetensors: expected a policy \(kind actor_critic or adaptive\), "
+        f"found kind {kind}: run that stage again$",
+    ):
+        PolicyFile.load(path)
+
+
+@pytest.mark.parametrize(
+    ("lacks", "found"),
+    [("kind", "a file without a kind"), ("shape", "no 'shape'"), ("observed", "no 'observed'")],
+)
+def test_a_policy_of_an_older_version_is_told(lacks: str, found: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    PolicyFile(ActorCritic(ActorCriticShape(3, 2, memory_size=8)), None, "toy@data-1.0.0", "abc").save(path)
+    tensors, told = load_tensors(path)
+    save_tensors(path, tensors, {key: value for key, value in told.items() if key != lacks})
+    with pytest.raises(BadInputError, match=f"expected a policy .*found {found}: run that stage again$"):
+        PolicyFile.load(path)

@@ -1,7 +1,10 @@
 import pytest
 import torch
-from pydantic import ValidationError
+from pydantic import ValidationError, create_model
 
+from astra_data.errors import RecipeError
+from astra_data.methods.compass import CompassConfig
+from astra_data.recipe import Config, validated
 from astra_data.variation import PARAMETERS, Variation
 
 
@@ -30,3 +33,22 @@ def test_it_survives_json_and_refuses_an_upside_down_range() -> None:
     assert Variation.of_json({name: list(ends) for name, ends in variation.model_dump().items()}) == variation
     with pytest.raises(ValidationError, match="expected the lower end first"):
         Variation(friction=(1.2, 0.8))
+
+
+@pytest.mark.parametrize("model", [Variation, CompassConfig])
+@pytest.mark.parametrize(
+    ("name", "ends", "expected"),
+    [
+        ("friction", (0.0, 1.0), "a range above 0"),
+        ("timestep_scale", (-0.5, 1.0), "a range above 0"),
+        ("action_noise", (-0.1, 0.1), "a range from 0 up"),
+        ("position_noise_m", (-0.1, 0.1), "a range from 0 up"),
+        ("velocity_noise_m_s", (-0.1, 0.1), "a range from 0 up"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(
+    model: type[Config], name: str, ends: tuple[float, float], expected: str
+) -> None:
+    with pytest.raises(RecipeError) as caught:
+        validated({"row": {name: list(ends)}}, create_model("Rows", row=(model, ...)), "r.toml")
+    assert str(caught.value) == f"r.toml: row.{name}: expected {expected}, got {list(ends)}"

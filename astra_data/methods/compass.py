@@ -6,7 +6,6 @@ and simulators are set back to the target's state at the beginning of short wind
 drift too far apart to tell anything.
 """
 
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +23,10 @@ from astra_data.method import Method
 from astra_data.models.causal import CausalConfig, descend, fit_causes
 from astra_data.recipe import Count
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 from astra_data.training import SimulatorPpo
-from astra_data.variation import PARAMETERS, Range, Variation
+from astra_data.variation import PARAMETERS, FactorRange, NoiseRange, Range, Variation
 
 STEERING = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
 """What is identified. The others are noise, with which no replay comes closer to a recording, however noisy
@@ -46,19 +46,19 @@ class CompassConfig(Variation, CausalConfig):
     nothing of what follows the ranges.
     """
 
-    friction: Range = (0.8, 1.2)
+    friction: FactorRange = (0.8, 1.2)
     """Factor on the speed that a command gives."""
     action_scale: Range = (-0.1, 0.1)
     """Share by which commands are too long."""
-    action_noise: Range = (0.05, 0.05)
+    action_noise: NoiseRange = (0.05, 0.05)
     """Standard deviation of Gaussian noise on commands, in m/s."""
-    position_noise_m: Range = (0.03, 0.03)
+    position_noise_m: NoiseRange = (0.03, 0.03)
     """Half width of the uniform noise on shown positions."""
-    velocity_noise_m_s: Range = (0.0, 0.02)
+    velocity_noise_m_s: NoiseRange = (0.0, 0.02)
     """Half width of the uniform noise on shown velocities."""
     heading_bias_deg: Range = (-5.0, 5.0)
     """Commands are turned by this angle."""
-    timestep_scale: Range = (0.75, 1.25)
+    timestep_scale: FactorRange = (0.75, 1.25)
     """Factor on the control period."""
 
     iterations: Count = 5
@@ -155,23 +155,23 @@ class Search:
 
     Attributes:
         box: where the parameters are sought. point: the best so far, of `STEERING`.
-        found: what each finished iteration tells. seconds: how long they took.
+        found: what each finished iteration tells. spent: the time that they took; None before the first.
     """
 
     box: Variation
     point: dict[str, float]
     found: list[dict[str, Any]]
-    seconds: float
+    spent: dict[str, float] | None
 
     @classmethod
     def begin(cls, ranges: Variation, checkpoint: Path) -> "Search":
         """Go on from `checkpoint`; without one, begin at the plain simulator, as far as it is in `ranges`."""
         if checkpoint.exists():
             _, told = load_tensors(checkpoint)
-            return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["seconds"])
+            return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
         plain = Variation()
         point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in STEERING}
-        return cls(ranges, point, [], 0.0)
+        return cls(ranges, point, [], None)
 
     def save(self, checkpoint: Path) -> None:
         """Write what `begin` goes on from."""
@@ -216,24 +216,24 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
         return dict(zip(GAPS, gaps.mean((0, 1)).tolist(), strict=True))
 
     search, plain = Search.begin(config.variation, checkpoint), held_out_gap({})
-    began = time.perf_counter() - search.seconds
+    stopwatch, replays = Stopwatch(search.spent), config.contexts * config.windows
     for iteration in range(len(search.found), config.iterations):
         mask = _iterate(search, config, fitting, f"compass {iteration}")
         gap = held_out_gap(search.point)
         search.found.append({"mask": mask, "point": dict(search.point), "held_out_gap": gap})
-        search.seconds = time.perf_counter() - began
+        search.spent = stopwatch.spent()
         search.save(checkpoint)
-        rate = (iteration + 1) * config.contexts * config.windows / search.seconds
+        rate = (iteration + 1) * replays / stopwatch.seconds
         closed = f"held-out gap {plain['position_m']:.3f} → {gap['position_m']:.3f} m"
-        note = f"{rate:,.0f} windows/s  {closed}"
+        note = f"{rate:,.0f} replays/s  {closed}"
         fitting.progress((iteration + 1) / config.iterations, note)
     grounding = search.box
     if config.policy_at == "point":
         ends = {name: (value, value) for name, value in search.point.items()}
         grounding = Variation(**(search.box.model_dump() | ends))
     return grounding, {
-        "windows_per_second": config.iterations * config.contexts * config.windows / search.seconds,
-        "wall_seconds": search.seconds,
+        "replays_per_second": config.iterations * replays / stopwatch.seconds,
+        **stopwatch.spent(),
         "mask": search.found[0]["mask"],
         "point": search.point,
         "held_out_gap": {"plain": plain, "identified": search.found[-1]["held_out_gap"]},

@@ -7,7 +7,6 @@ sines and cosines of the position as well; but of 0.41 without those where the c
 """
 
 import copy
-import time
 from typing import Any
 
 import torch
@@ -21,6 +20,7 @@ from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.history import PositionFeatures
 from astra_data.policy_file import PolicyFile
 from astra_data.seeding import derive
+from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 from astra_data.training import Training
 from astra_data.world import policy_observation
@@ -80,24 +80,25 @@ def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
     """Learn to the end, from the checkpoint in the folder if there is one; return the losses."""
     checkpoint = training.folder / "checkpoint.safetensors"
     points: list[dict[str, float | None]] = []
-    seconds = 0.0
+    spent: dict[str, float] | None = None
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
         iql.load_state_dict(unflatten(tensors))
-        points, seconds = told["points"], told["seconds"]
-    began = time.perf_counter() - seconds
+        points, spent = told["points"], told["spent"]
+    stopwatch = Stopwatch(spent)
     while not iql.done:
         losses = iql.iterate()
-        seconds = time.perf_counter() - began
         if iql.updates % 10 == 0 or iql.done:
             said = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
-            note = f"{iql.updates / seconds:,.0f} updates/s  {said}"
+            note = f"{iql.updates / stopwatch.seconds:,.0f} updates/s  {said}"
             training.progress(iql.updates / iql.total_updates, note)
         if iql.updates % _CHECKPOINT_EVERY == 0 or iql.done:
             # Nobody acts while learning from records, so there is no success to tell.
             points.append({"steps": iql.updates, "success": None, **losses})
-            save_tensors(checkpoint, flatten(iql.state_dict()), {"points": points, "seconds": seconds})
-    return {"updates_per_second": iql.updates / max(seconds, 1e-9), "wall_seconds": seconds, "points": points}
+            save_tensors(
+                checkpoint, flatten(iql.state_dict()), {"points": points, "spent": stopwatch.spent()}
+            )
+    return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}
 
 
 IQL = Method(name="iql", title="IQL", learn=learn_from_episodes)

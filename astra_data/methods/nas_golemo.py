@@ -3,7 +3,6 @@
 The policy sees no latent, so it has a memory of its own; its reward is the task's own on corrected states.
 """
 
-import time
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from astra_data.method import Method
 from astra_data.models.residual import ResidualModel, ResidualShape
 from astra_data.recipe import Config, Count, Positive
 from astra_data.seeding import derive, generator
+from astra_data.stopwatch import Stopwatch
 
 
 class GolemoConfig(Config):
@@ -55,33 +55,32 @@ def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> d
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     episodes, count = fitting.training, len(fitting.training)
     points: list[dict[str, float | None]] = []
-    seconds = 0.0
+    spent: dict[str, float] | None = None
     checkpoint = fitting.folder / "checkpoint.safetensors"
     if checkpoint.exists():
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
-        points, seconds = told["epochs"], told["seconds"]
-    began = time.perf_counter() - seconds
+        points, spent = told["epochs"], told["spent"]
+    stopwatch = Stopwatch(spent)
     for epoch in range(len(points), config.epochs):
         order = generator(fitting.seed, f"grounding epoch {epoch}").permutation(count)
         losses = 0.0
         for index, episode in enumerate(order.tolist()):
             losses += _update(model, optimizer, episodes.select(torch.tensor([episode]))) / count
             done = epoch * count + index + 1
-            rate = done / (time.perf_counter() - began)
+            rate = done / stopwatch.seconds
             note = f"{rate:,.0f} episodes/s"
             if points and (explained := points[-1]["r2_state"]) is not None:
                 note += f"  held-out R² of the correction {explained:.3f}"
             fitting.progress(done / (config.epochs * count), note)
-        seconds = time.perf_counter() - began
         points.append({"step": done, "loss_state": losses, "r2_state": _r2(model, fitting.held_out)})
         state = {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
-        save_tensors(checkpoint, flatten(state), {"epochs": points, "seconds": seconds})
+        save_tensors(checkpoint, flatten(state), {"epochs": points, "spent": stopwatch.spent()})
     return {
-        "windows_per_second": config.epochs * count / seconds,
-        "wall_seconds": seconds,
+        "episodes_per_second": config.epochs * count / stopwatch.seconds,
+        **stopwatch.spent(),
         "parameters": sum(parameter.numel() for parameter in model.parameters()),
         "epochs": points,
     }

@@ -110,6 +110,8 @@ class Metrics(Artefact):
     """metrics.json of one row and seed's grounding or alignment."""
 
     windows_per_second: float | None = None
+    episodes_per_second: float | None = None
+    replays_per_second: float | None = None
 
 
 class Band(BaseModel):

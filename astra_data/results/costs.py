@@ -11,7 +11,7 @@ from astra_data.results.model import Cost
 THROUGHPUT = {
     "collect": ("target_steps_per_second",),
     "pair": ("pairs_per_second",),
-    "ground": ("windows_per_second",),
+    "ground": ("windows_per_second", "episodes_per_second", "replays_per_second"),
     "train": ("simulator_steps_per_second", "steps_per_second", "updates_per_second"),
     "align": ("windows_per_second",),
     "evaluate": ("target_steps_per_second",),

@@ -11,7 +11,7 @@ from astra_data.gap import gap_report
 from astra_data.grounding_file import save_grounding
 from astra_data.methods import method_named
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, as_json
 from astra_data.results.provenance import origin
 from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import task_named
@@ -61,5 +61,5 @@ def ground(
         save_grounding(folder / "grounding.safetensors", grounding, episodes)
         (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
-        (folder / "config.json").write_text((settings or config).model_dump_json(indent=1))
+        (folder / "config.json").write_text(as_json(ground=config, settings=settings))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)

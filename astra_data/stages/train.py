@@ -10,7 +10,7 @@ from astra_data.grounding_file import load_grounding
 from astra_data.methods import method_named
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, as_json
 from astra_data.results.provenance import origin
 from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import task_named
@@ -78,6 +78,6 @@ def train(
         policy, curve = base.learn(training)
         policy.save(folder / "policy.safetensors")
         (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
-        (folder / "config.json").write_text(config.model_dump_json(indent=1))
+        (folder / "config.json").write_text(as_json(train=config, settings=settings))
         for checkpoint in folder.glob("*checkpoint.safetensors"):
             checkpoint.unlink()

@@ -3,6 +3,7 @@ from typing import Any
 
 import pytest
 import torch
+from spending import SPENT, spend
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
@@ -114,13 +115,16 @@ def test_after_an_interruption_it_goes_on(tmp_path: Path) -> None:
     whole, expected = identify(fitting(tmp_path / "whole", settings))
     with pytest.raises(Stopped):
         identify(fitting(tmp_path / "interrupted", settings, stop))
+    spend(tmp_path / "interrupted" / "checkpoint.safetensors")
     seen: list[str] = []
     resumed, metrics = identify(
         fitting(tmp_path / "interrupted", settings, lambda _, note: seen.append(note))
     )
-    assert len(seen) == 2 and "windows/s  held-out gap 0." in seen[0]
+    assert len(seen) == 2 and "replays/s  held-out gap 0." in seen[0]
     assert resumed == whole
     assert metrics["iterations"] == expected["iterations"]
+    assert all(seconds < metrics[clock] < seconds + 500 for clock, seconds in SPENT.items())
+    assert metrics["replays_per_second"] == pytest.approx(4 * 8 * 60 / metrics["wall_seconds"], rel=0.01)
 
 
 def test_around_the_point_is_within_the_ranges(

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from spending import SPENT, spend
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.learners.iql import IqlConfig
@@ -150,10 +151,11 @@ def test_after_an_interruption_it_goes_on(
     assert not checkpoint.exists()
     with pytest.raises(Stopped):
         learn(given, lambda done, note: stop(done, note) if done == 1.0 else None)
-    assert checkpoint.exists()
+    spend(checkpoint)
     resumed, again = learn(given, watch)
     assert seen == [1.0]
     assert again["points"] == curve["points"]
+    assert all(seconds < again[clock] < seconds + 500 for clock, seconds in SPENT.items())
     whole.save(tmp_path / "whole")
     resumed.save(tmp_path / "resumed")
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()

@@ -1,7 +1,9 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from spending import SPENT, spend
 from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
@@ -98,3 +100,24 @@ def test_what_lies_beyond_an_episodes_end_teaches_nothing(tmp_path: Path) -> Non
         both.windows.next_state[0, 25:] = 100.0
     for ours, theirs in zip(models[0].parameters(), models[1].parameters(), strict=True):
         assert torch.equal(ours, theirs)
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def stop(fraction: float, note: str) -> None:
+    if fraction > 0.5:
+        raise Stopped
+
+
+def test_the_time_before_an_interruption_counts(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    both = episodes(32, torch.randn(32, STEPS, 4), torch.randn(32, STEPS, 2))
+    given = fitting(both, tmp_path, GolemoConfig(epochs=2, hidden_size=4, layers=1))
+    with pytest.raises(Stopped):
+        fit_residual(replace(given, progress=stop))
+    spend(tmp_path / "checkpoint.safetensors")
+    _, metrics = fit_residual(given)
+    assert all(seconds < metrics[clock] < seconds + 500 for clock, seconds in SPENT.items())
+    assert metrics["episodes_per_second"] == pytest.approx(2 * 24 / metrics["wall_seconds"], rel=0.01)

@@ -44,6 +44,13 @@ def test_results_are_the_ones_worked_out_by_hand(results: Results) -> None:
     assert (results.seeds, results.episodes) == ([0, 1, 2], 4)
 
 
+GROUND_SPEEDS = {
+    "windows_per_second": {"astra": [0.0, 100.0, 200.0]},
+    "episodes_per_second": {},
+    "replays_per_second": {},
+}
+
+
 def test_plus_rows_share_the_grounding_of_their_base_row(results: Results) -> None:
     for row in ("astra", "astra_plus"):
         assert results.methods[row].grounding == "astra"
@@ -56,12 +63,20 @@ def test_plus_rows_share_the_grounding_of_their_base_row(results: Results) -> No
         assert gap.raw["position_m"].mean == [1.0, 2.0]
     assert list(results.gaps()) == ["astra"]
     assert results.methods["direct_transfer"].gap is None
-    assert results.throughput["ground"] == {"windows_per_second": {"astra": [0.0, 100.0, 200.0]}}
+    assert results.throughput["ground"] == GROUND_SPEEDS
     assert results.throughput["evaluate"]["target_steps_per_second"]["astra"] == [
         1000.0,
         1001.0,
         1002.0,
     ]
+
+
+@pytest.mark.parametrize("figure", ["episodes_per_second", "replays_per_second"])
+def test_groundings_count_what_they_learn_from(figure: str, root: Path) -> None:
+    for seed in range(3):
+        edit_json(root / f"ground/astra/seed_{seed}/metrics.json", windows_per_second=None, **{figure: 5.0})
+    speeds = assembled(root).throughput["ground"]
+    assert {name: rows for name, rows in speeds.items() if rows} == {figure: {"astra": [5.0] * 3}}
 
 
 def test_horizons_that_a_seed_lacks_are_left_out(root: Path) -> None:
@@ -83,7 +98,7 @@ def test_each_row_has_the_seeds_that_it_has_finished(root: Path) -> None:
     assert (astra.success, plus.success) == ([0.5, 0.25], [0.75, 1.0])
     assert (len(astra.learning), len(plus.learning)) == (2, 2)
     # Together they have every seed of the grounding that they share.
-    assert results.throughput["ground"] == {"windows_per_second": {"astra": [0.0, 100.0, 200.0]}}
+    assert results.throughput["ground"] == GROUND_SPEEDS
     assert astra.gap is not None
     assert astra.gap.grounded["position_m"].mean == pytest.approx([0.2, 0.4])
     assert results.wall_seconds["evaluate"] == 10.0 * (3 + 2 + 2 + 3)

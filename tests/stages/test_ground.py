@@ -39,6 +39,8 @@ def stop_after(updates: int) -> Progress:
 def test_the_artefact_is_complete(grounded: Path) -> None:
     files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}
     assert {file.name for file in grounded.iterdir()} == files
+    told = json.loads((grounded / "config.json").read_text())
+    assert told == {"ground": json.loads(GROUND.model_dump_json()), "settings": None}
     metrics = json.loads((grounded / "metrics.json").read_text())
     assert metrics["parameters"] > 1000
     assert {"git_commit", "packages", "machine"} <= metrics.keys()
@@ -136,7 +138,8 @@ def test_whole_episodes_go_on_after_an_interruption(
     }
     for name in ("grounding.safetensors", "gap.json", "config.json"):
         assert (out / name).read_bytes() == (augmented / name).read_bytes()
-    assert json.loads((out / "config.json").read_text()) == GOLEMO.model_dump()
+    told = json.loads((out / "config.json").read_text())
+    assert told == {"ground": json.loads(GROUND.model_dump_json()), "settings": GOLEMO.model_dump()}
     epochs = [json.loads((folder / "metrics.json").read_text())["epochs"] for folder in (out, augmented)]
     assert epochs[0] == epochs[1]
     with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):

@@ -50,6 +50,8 @@ def stop(fraction: float, note: str) -> None:
 
 def test_the_artefact_is_complete(trained: Path) -> None:
     assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
+    told = json.loads((trained / "config.json").read_text())
+    assert told == {"train": json.loads(TRAIN.model_dump_json()), "settings": None}
     curve = json.loads((trained / "curve.json").read_text())
     assert {"git_commit", "packages", "machine"} <= curve.keys()
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
@@ -128,6 +130,8 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
         "curve.json",
         "policy.safetensors",
     }
+    told = json.loads((tmp_path / "train" / "config.json").read_text())
+    assert told == {"train": json.loads(TRAIN.model_dump_json()), "settings": RMA.model_dump()}
     curve = json.loads((tmp_path / "train" / "curve.json").read_text())
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     adaptation = curve["adaptation"]["points"]
