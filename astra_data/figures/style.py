@@ -50,7 +50,7 @@ COLOURS = {
 }
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
-SPARE_COLOURS = ("#882255", "#44AA99", "#999933", "#AA4499", "#332288", "#661100")
+SPARE_COLOURS = ("#882255", "#AA4499", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a colour of their own."""
 
 ROLES = {"direct_transfer": "floor", "target": "ceiling", "full_obs": "ceiling", "follower": "ceiling"}

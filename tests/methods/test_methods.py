@@ -1,6 +1,8 @@
 import pytest
 
 from astra_data.errors import BadInputError
+from astra_data.figures import method_colour, method_title
+from astra_data.figures.style import SPARE_COLOURS
 from astra_data.fitting import HistoryFit
 from astra_data.methods import METHODS, method_named
 from astra_data.models.grounding import LossWeights
@@ -23,6 +25,15 @@ def test_methods_are_known_by_their_names() -> None:
     assert method_named("astra_plus") is method_named("astra") is METHODS["astra"]
     with pytest.raises(BadInputError, match="unknown method 'astro'; known: direct_transfer, "):
         method_named("astro")
+
+
+def test_figures_call_methods_by_their_titles_in_colours_of_their_own() -> None:
+    assert {name: method_title(name) for name in METHODS} == {
+        name: method.title for name, method in METHODS.items()
+    }
+    colours = [method_colour(name) for name in METHODS]
+    assert len(set(colours)) == len(colours)
+    assert not set(colours).intersection(SPARE_COLOURS)
 
 
 def test_what_the_rows_of_the_paper_differ_in() -> None:
