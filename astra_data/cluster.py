@@ -1,6 +1,7 @@
 """Items as tasks of a Ray cluster, whose machines share the run's folder and have astra-data installed.
 
-An item computes there what it computes in a process of this machine, so its artefact has the same bytes.
+An item computes there what it computes in a process of this machine: on a processor of the same kind, the
+same bytes.
 """
 
 import os

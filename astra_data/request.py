@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from astra_data.dataset.edit import share
 from astra_data.errors import BadInputError
 from astra_data.fitting import GroundConfig
-from astra_data.learners.iql import IqlConfig
+from astra_data.learners.iql import FINE_TUNING, IqlConfig
 from astra_data.learners.rma import RmaConfig
 from astra_data.methods import METHODS
 from astra_data.methods.compass import CompassConfig
@@ -24,7 +24,7 @@ from astra_data.stages.report import ReportConfig
 from astra_data.target_training import TargetConfig
 from astra_data.tasks import TASKS
 from astra_data.training import TrainConfig
-from astra_data.variation import Variation
+from astra_data.variation import RANDOMIZED_ACTIONS, Variation
 
 STAGES: dict[str, tuple[str, ...]] = {
     "collect": (),
@@ -86,7 +86,7 @@ class Recipe(Config):
     sweep: SweepConfig = SweepConfig()
     plus: TrainConfig
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
-    domain_randomization: Variation = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
+    domain_randomization: Variation = RANDOMIZED_ACTIONS
     """What domain randomization varies; by default as the paper prints it for navigation."""
     nas_golemo: GolemoConfig = GolemoConfig()
     """How the residual model of Golemo et al. is fitted."""
@@ -98,7 +98,7 @@ class Recipe(Config):
     """The ranges of `compass` and `compass_uniform`, and how the former identifies its parameters."""
     iql: IqlConfig = IqlConfig()
     """How IQL learns."""
-    direct_transfer_iql: IqlConfig = IqlConfig(learning_rate=1e-4, policy_updates=100)
+    direct_transfer_iql: IqlConfig = FINE_TUNING
     """How direct transfer is fine-tuned; by default gently, for it unlearns more than it learns."""
 
     @property

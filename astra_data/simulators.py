@@ -34,7 +34,7 @@ def simulator_of(
         grounding: what a method learned about the simulator, if anything.
         num_envs: B.
         device: torch device.
-        variation: of its parameters from episode to episode, where there is no grounding.
+        variation: of its parameters from episode to episode, unless the grounding is one.
         scatter: factor (X, X) of noise that is added after each step.
     """
     if isinstance(grounding, Variation):

@@ -84,3 +84,18 @@ class Variation(Config):
 
 PARAMETERS = tuple(Variation.model_fields)
 """The names of the parameters, in the order of their columns."""
+
+RANDOMIZED_ACTIONS = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
+"""Of domain randomization in navigation, as printed (Section V-A)."""
+
+WIDE_RANGES = Variation(
+    friction=(0.8, 1.2),
+    action_scale=(-0.1, 0.1),
+    action_noise=(0.05, 0.05),
+    position_noise_m=(0.03, 0.03),
+    velocity_noise_m_s=(0.0, 0.02),
+    heading_bias_deg=(-5.0, 5.0),
+    timestep_scale=(0.75, 1.25),
+)
+"""Of COMPASS in navigation, as printed (Section V-A): a control period of 0.015 to 0.025 s is read as shares
+of one of 0.02 s."""

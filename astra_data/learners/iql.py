@@ -78,6 +78,10 @@ class IqlConfig(Config):
         return self
 
 
+FINE_TUNING = IqlConfig(learning_rate=1e-4, policy_updates=100)
+"""For a policy that has learned already: gentle, for otherwise it unlearns more than it learns."""
+
+
 @dataclass(frozen=True)
 class Experience:
     """E recorded episodes of up to T steps, as a policy sees them; padded at the end.

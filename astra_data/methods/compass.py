@@ -26,7 +26,7 @@ from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 from astra_data.training import SimulatorPpo
-from astra_data.variation import PARAMETERS, FactorRange, NoiseRange, Range, Variation
+from astra_data.variation import PARAMETERS, WIDE_RANGES, FactorRange, NoiseRange, Range, Variation
 
 STEERING = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
 """What is identified. The others are noise, with which no replay comes closer to a recording, however noisy
@@ -46,19 +46,19 @@ class CompassConfig(Variation, CausalConfig):
     nothing of what follows the ranges.
     """
 
-    friction: FactorRange = (0.8, 1.2)
+    friction: FactorRange = WIDE_RANGES.friction
     """Factor on the speed that a command gives."""
-    action_scale: Range = (-0.1, 0.1)
+    action_scale: Range = WIDE_RANGES.action_scale
     """Share by which commands are too long."""
-    action_noise: NoiseRange = (0.05, 0.05)
+    action_noise: NoiseRange = WIDE_RANGES.action_noise
     """Standard deviation of Gaussian noise on commands, in m/s."""
-    position_noise_m: NoiseRange = (0.03, 0.03)
+    position_noise_m: NoiseRange = WIDE_RANGES.position_noise_m
     """Half width of the uniform noise on shown positions."""
-    velocity_noise_m_s: NoiseRange = (0.0, 0.02)
+    velocity_noise_m_s: NoiseRange = WIDE_RANGES.velocity_noise_m_s
     """Half width of the uniform noise on shown velocities."""
-    heading_bias_deg: Range = (-5.0, 5.0)
+    heading_bias_deg: Range = WIDE_RANGES.heading_bias_deg
     """Commands are turned by this angle."""
-    timestep_scale: FactorRange = (0.75, 1.25)
+    timestep_scale: FactorRange = WIDE_RANGES.timestep_scale
     """Factor on the control period."""
 
     iterations: Count = 5
@@ -294,6 +294,6 @@ COMPASS = Method(name="compass", title="COMPASS", fit=identify)
 COMPASS_UNIFORM = Method(
     name="compass_uniform",
     title="COMPASS, uniform",
-    learn=SimulatorPpo(variation=CompassConfig().variation),
+    learn=SimulatorPpo(variation=WIDE_RANGES),
 )
 """COMPASS as the paper describes it: every episode draws its parameters from the ranges."""

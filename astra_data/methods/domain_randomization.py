@@ -5,10 +5,10 @@ The paper's N(0, 0.05) is read as a standard deviation of 0.05 m/s; δ is drawn 
 
 from astra_data.method import Method
 from astra_data.training import SimulatorPpo
-from astra_data.variation import Variation
+from astra_data.variation import RANDOMIZED_ACTIONS
 
 DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",
     title="Domain randomization",
-    learn=SimulatorPpo(variation=Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))),
+    learn=SimulatorPpo(variation=RANDOMIZED_ACTIONS),
 )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.learners.iql import Experience, Iql, IqlConfig
+from astra_data.learners.iql import FINE_TUNING, Experience, Iql, IqlConfig
 from astra_data.method import Method
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.history import PositionFeatures
@@ -35,7 +35,8 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     Returns:
         the policy, which begins as `training.initial` where there is one, and the losses every few updates.
     """
-    config = training.settings if isinstance(training.settings, IqlConfig) else IqlConfig()
+    usual = FINE_TUNING if training.initial else IqlConfig()
+    config = training.settings if isinstance(training.settings, IqlConfig) else usual
     episodes = training.episodes
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))

@@ -20,7 +20,7 @@ from astra_data.policy_file import PolicyFile
 from astra_data.progress import part
 from astra_data.seeding import derive
 from astra_data.training import SimulatorPpo, Training, optimise
-from astra_data.variation import Variation
+from astra_data.variation import WIDE_RANGES
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,5 @@ class TeacherThenStudent(SimulatorPpo):
 RMA = Method(
     name="rma",
     title="RMA",
-    learn=TeacherThenStudent(
-        variation=Variation(
-            friction=(0.8, 1.2),
-            action_scale=(-0.1, 0.1),
-            action_noise=(0.05, 0.05),
-            position_noise_m=(0.03, 0.03),
-            velocity_noise_m_s=(0.0, 0.02),
-            heading_bias_deg=(-5.0, 5.0),
-            timestep_scale=(0.75, 1.25),
-        )
-    ),
+    learn=TeacherThenStudent(variation=WIDE_RANGES),
 )
