@@ -11,6 +11,8 @@ can bootstrap from it; nothing restarts behind the caller's back.
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -44,4 +46,54 @@ class BatchedEnv(Protocol):
 
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A) to every row."""
+        ...
+
+
+class TargetEnv(BatchedEnv, Protocol):
+    """B target environments.
+
+    Attributes:
+        goal: (B, G) float32.
+    """
+
+    goal: Tensor
+
+    @property
+    def state(self) -> Tensor:
+        """The full target states, (B, S) float32."""
+        ...
+
+    @property
+    def position(self) -> Tensor:
+        """Where the robots really are, (B, 2) float32 in m."""
+        ...
+
+    @property
+    def failed(self) -> Tensor:
+        """Which robots ended badly in their last step, (B,) bool."""
+        ...
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Which robots touched a wall in their last step, (B,) bool."""
+        ...
+
+    def reseed(self, seed: int) -> None:
+        """Draw whatever is drawn later from `seed`."""
+        ...
+
+    def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
+        """Set the robots `rows` (n,) to `state` (n, S)."""
+        ...
+
+    def step(self, action: Tensor, active: Tensor | None = None) -> Step:
+        """Apply `action` (B, A); rows outside `active` (B,) stand frozen."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state`."""
         ...

@@ -23,7 +23,7 @@ def target_observation(
 
     It is what it would see of φ(s), and where the full state is observed, everything else of it behind that.
     """
-    abstract = policy_observation(task.maze, task.abstraction(state), goal, latent)
+    abstract = policy_observation(task.objective, task.abstraction(state), goal, latent)
     return abstract if observed == "abstract" else torch.cat([abstract, task.beyond(state)], dim=-1)
 
 
@@ -70,7 +70,7 @@ class DeployedPolicy:
     def act_in_simulator(self, abstract: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for abstract states (B, X) and goals (B, G); latents come from ψ^s."""
         latent = self._latent(self.model, abstract, goal)
-        return self._act(policy_observation(self.task.maze, abstract, goal, latent))
+        return self._act(policy_observation(self.task.objective, abstract, goal, latent))
 
     @torch.no_grad()
     def _latent(

@@ -1,6 +1,6 @@
 """Where a point may be: an occupancy grid that positions slide along, and distances to a goal. Batched torch.
 
-Grids have square cells of `FIELD_CELL_M` and are indexed [y, x] from the maze's lower left corner.
+Grids have square cells of the maze's `fine_m` and are indexed [y, x] from the maze's lower left corner.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
-from astra_data.mazes import FIELD_CELL_M, Maze
+from astra_data.mazes import Maze
 
 _EDGE_M = 1e-4
 """How far from the face of a blocked cell a sliding point is stopped."""
@@ -22,11 +22,13 @@ class FreeSpace:
     Attributes:
         blocked: (height, width) bool, True where the centre may not be.
         half_extent: half of the maze's width and height in m, (2,).
+        cell_m: side of a cell.
     """
 
-    def __init__(self, blocked: Tensor, half_extent: Tensor) -> None:
+    def __init__(self, blocked: Tensor, half_extent: Tensor, cell_m: float) -> None:
         self.blocked = blocked
         self.half_extent = half_extent
+        self.cell_m = cell_m
         depth = torch.from_numpy(distance_transform_edt(blocked.cpu().numpy()))
         # How far a blocked cell is from the free ones, in cells; 0 in free ones.
         self._depth = depth.float().to(blocked.device)
@@ -35,12 +37,13 @@ class FreeSpace:
     @classmethod
     def of_maze(cls, maze: Maze, *, radius_m: float, device: str = "cpu") -> "FreeSpace":
         """Return the free space of a disc of `radius_m`, a multiple of the grid's cell."""
-        reach = round(radius_m / FIELD_CELL_M)
+        reach = round(radius_m / maze.fine_m)
         square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
         blocked = binary_dilation(maze.fine_walls, square, border_value=1)
         return cls(
             torch.from_numpy(blocked).to(device),
             torch.tensor(maze.half_extent, dtype=torch.float32, device=device),
+            maze.fine_m,
         )
 
     def cells(self, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,12 +71,12 @@ class FreeSpace:
         return torch.stack([x, y], dim=-1), stop_x | stop_y
 
     def _cells(self, position: Tensor) -> Tensor:
-        cells = ((position + self.half_extent) / FIELD_CELL_M).floor().long()
+        cells = ((position + self.half_extent) / self.cell_m).floor().long()
         return torch.minimum(cells.clamp_min(0), self._limits)
 
     def _face(self, start: Tensor, here: Tensor, there: Tensor, axis: int) -> Tensor:
         onward = there > here
-        face = (here + onward) * FIELD_CELL_M - self.half_extent[axis]
+        face = (here + onward) * self.cell_m - self.half_extent[axis]
         return torch.where(onward, face - _EDGE_M, face + _EDGE_M)
 
 
@@ -87,16 +90,18 @@ class GoalDistance:
         fields: (goals, height, width) in m.
         lattice: the goals that the fields belong to, (goals, 2) in m.
         half_extent: (2,) in m.
+        cell_m: side of a field's cell.
     """
 
     fields: Tensor
     lattice: Tensor
     half_extent: Tensor
+    cell_m: float
 
     @classmethod
-    def of_maze(cls, maze: Maze, *, reach_m: float = 0.6, spacing_m: float = 0.2) -> "GoalDistance":
-        """Compute the fields for goals within `reach_m` of the maze's goal cell's centre."""
-        steps = np.arange(-round(reach_m / spacing_m), round(reach_m / spacing_m) + 1) * spacing_m
+    def of_maze(cls, maze: Maze, *, spacing_m: float) -> "GoalDistance":
+        """Compute the fields for 7 x 7 goals, `spacing_m` apart, around the middle of the goal's cell."""
+        steps = np.arange(-3, 4) * spacing_m
         centre = np.array(maze.cell_centre(*maze.goal))
         lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + centre
         fields = np.stack([maze.distance_field(goal) for goal in lattice])
@@ -104,18 +109,22 @@ class GoalDistance:
             torch.from_numpy(fields).float(),
             torch.from_numpy(lattice).float(),
             torch.tensor(maze.half_extent, dtype=torch.float32),
+            maze.fine_m,
         )
 
     def to(self, device: str | torch.device) -> "GoalDistance":
         """Return the same fields on `device`."""
-        return GoalDistance(self.fields.to(device), self.lattice.to(device), self.half_extent.to(device))
+        fields, lattice, half_extent = (
+            values.to(device) for values in (self.fields, self.lattice, self.half_extent)
+        )
+        return GoalDistance(fields, lattice, half_extent, self.cell_m)
 
     def __call__(self, position: Tensor, goal: Tensor) -> Tensor:
         """Return the distance in m (B,) from `position` (B, 2) to `goal` (B, 2), bilinear in position."""
         field = (goal[:, None] - self.lattice).square().sum(-1).argmin(dim=1)
         _, height, width = self.fields.shape
         # Cell centres carry the values.
-        grid = (position + self.half_extent) / FIELD_CELL_M - 0.5
+        grid = (position + self.half_extent) / self.cell_m - 0.5
         grid = torch.stack([grid[:, 0].clamp(0, width - 1.001), grid[:, 1].clamp(0, height - 1.001)], dim=-1)
         corner = grid.floor()
         (fx, fy), (column, row) = (grid - corner).unbind(-1), corner.long().unbind(-1)

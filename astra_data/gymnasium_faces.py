@@ -18,10 +18,10 @@ from torch import Tensor
 
 from astra_data.batched import BatchedEnv, Step
 from astra_data.envs.antmaze import AntMazeEnv
-from astra_data.navigation import Navigation
+from astra_data.objective import Objective
 from astra_data.simulators import Simulator
 from astra_data.tasks import task_named
-from astra_data.world import NavigationWorld
+from astra_data.world import SimulatorWorld
 
 Array = NDArray[Any]
 
@@ -39,12 +39,12 @@ class World(BatchedEnv, Protocol):
         ...
 
 
-class SeededNavigationWorld(NavigationWorld):
+class SeededSimulatorWorld(SimulatorWorld):
     """The task in an abstract simulator, with starts and goals from a seed of its own."""
 
-    def __init__(self, navigation: Navigation, simulator: Simulator) -> None:
+    def __init__(self, objective: Objective, simulator: Simulator) -> None:
         """Put the task into `simulator`."""
-        super().__init__(navigation, simulator)
+        super().__init__(objective, simulator)
         self.reseed(_fresh_seed())
 
     @property
@@ -156,7 +156,7 @@ def _fresh_seed() -> int:
 
 def ant_maze(task: str, **options: Any) -> WorldEnv:  # noqa: ANN401 - handed on
     """Build one target environment of `task`; `options` as for `AntMazeEnv`."""
-    return WorldEnv(AntMazeEnv(task_named(task).navigation, 1, seed=_fresh_seed(), **options))
+    return WorldEnv(AntMazeEnv(task_named(task).objective, 1, seed=_fresh_seed(), **options))
 
 
 def ant_maze_vector(
@@ -166,19 +166,17 @@ def ant_maze_vector(
     **options: Any,  # noqa: ANN401 - handed on
 ) -> WorldVectorEnv:
     """Build `num_envs` target environments of `task`; `options` as for `AntMazeEnv`."""
-    world = AntMazeEnv(task_named(task).navigation, num_envs, seed=_fresh_seed(), **options)
+    world = AntMazeEnv(task_named(task).objective, num_envs, seed=_fresh_seed(), **options)
     return WorldVectorEnv(world, max_episode_steps)
 
 
 def point_maze(task: str) -> WorldEnv:
     """Build one abstract environment of `task`."""
     found = task_named(task)
-    return WorldEnv(SeededNavigationWorld(found.navigation, found.simulator(1)))
+    return WorldEnv(SeededSimulatorWorld(found.objective, found.simulator(1)))
 
 
 def point_maze_vector(num_envs: int, task: str, max_episode_steps: int) -> WorldVectorEnv:
     """Build `num_envs` abstract environments of `task`."""
     found = task_named(task)
-    return WorldVectorEnv(
-        SeededNavigationWorld(found.navigation, found.simulator(num_envs)), max_episode_steps
-    )
+    return WorldVectorEnv(SeededSimulatorWorld(found.objective, found.simulator(num_envs)), max_episode_steps)

@@ -15,9 +15,6 @@ from scipy.sparse.csgraph import dijkstra
 
 Floats = NDArray[np.float64]
 
-FIELD_CELL_M = 0.1
-"""Resolution of the distance fields."""
-
 
 @dataclass(frozen=True)
 class Maze:
@@ -28,12 +25,14 @@ class Maze:
         scale: side of a cell in m.
         start: (row, column) of the usual start cell.
         goal: (row, column) of the usual goal cell.
+        fine_m: resolution of everything that is measured on a grid; divides the scale.
     """
 
     rows: tuple[str, ...]
     scale: float
     start: tuple[int, int]
     goal: tuple[int, int]
+    fine_m: float = 0.1
 
     @cached_property
     def walls(self) -> NDArray[np.bool_]:
@@ -65,18 +64,18 @@ class Maze:
 
     @cached_property
     def fine_walls(self) -> NDArray[np.bool_]:
-        """The walls on a grid of `FIELD_CELL_M`, indexed [y, x] from the lower left corner."""
-        per_cell = round(self.scale / FIELD_CELL_M)
+        """The walls on a grid of `fine_m`, indexed [y, x] from the lower left corner."""
+        per_cell = round(self.scale / self.fine_m)
         return np.kron(self.walls[::-1], np.ones((per_cell, per_cell), dtype=bool)).astype(bool)
 
     @cached_property
     def clearance_field(self) -> Floats:
         """Distance in m from each fine grid cell to the nearest wall, indexed [y, x]."""
-        return np.asarray(distance_transform_edt(~self.fine_walls)) * FIELD_CELL_M
+        return np.asarray(distance_transform_edt(~self.fine_walls)) * self.fine_m
 
     def fine_index(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the fine grid indices (y, x) of `points` (..., 2), clipped to the grid."""
-        cells = np.floor((points + self.half_extent) / FIELD_CELL_M).astype(np.intp)
+        cells = np.floor((points + self.half_extent) / self.fine_m).astype(np.intp)
         height, width = self.fine_walls.shape
         return cells[..., 1].clip(0, height - 1), cells[..., 0].clip(0, width - 1)
 
@@ -108,11 +107,11 @@ class Maze:
         entries = (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets)))
         graph = coo_array(entries, shape=(count, count)).tocsr()
         source = int(numbers[self.fine_index(goal)])
-        lengths = np.asarray(dijkstra(graph, directed=False, indices=source)) * FIELD_CELL_M
+        lengths = np.asarray(dijkstra(graph, directed=False, indices=source)) * self.fine_m
         into_wall, nearest = distance_transform_edt(self.fine_walls, return_indices=True)
         field = np.zeros(free.shape)
         field[free] = lengths
-        return np.asarray(field[tuple(nearest)] + into_wall * FIELD_CELL_M)
+        return np.asarray(field[tuple(nearest)] + into_wall * self.fine_m)
 
 
 def _shifted(shape: tuple[int, ...], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

@@ -1,7 +1,7 @@
 """The navigation task: reach a goal in a maze. The same in every world, so that rewards compare.
 
 The paper prints no reward. Ours: metres of progress along the shortest free path to the goal, +10 for
-reaching it, -10 for toppling; sparse and Euclidean-dense forms are options.
+reaching it, -10 for ending badly; sparse and Euclidean-dense forms are options.
 """
 
 from dataclasses import dataclass
@@ -14,18 +14,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.free_space import GoalDistance
-from astra_data.mazes import Maze
+from astra_data.objective import Objective
 
 RewardKind = Literal["geodesic", "euclidean", "sparse"]
 
 
 @dataclass(frozen=True)
-class Navigation:
+class Navigation(Objective):
     """Reach the goal of `maze` within `horizon` steps.
 
     Attributes:
-        maze: where.
-        horizon: steps until an episode is cut off.
         reward_kind: "geodesic" (metres of progress along the corridors), "euclidean" (of the straight
             distance) or "sparse" (none), each plus the bonuses below.
         success_radius_m: closer to the goal than this is success and ends the episode.
@@ -33,19 +31,15 @@ class Navigation:
         start_clearance_m: distance from the walls kept by starts drawn anywhere.
     """
 
-    maze: Maze
-    horizon: int
     reward_kind: RewardKind = "geodesic"
     success_radius_m: float = 0.45
     spread_m: float = 0.2
     start_clearance_m: float = 0.8
-    success_reward: float = 10.0
-    topple_reward: float = -10.0
 
     @cached_property
     def goal_distance(self) -> GoalDistance:
         """Path lengths to goals near the maze's goal cell."""
-        return GoalDistance.of_maze(self.maze)
+        return GoalDistance.of_maze(self.maze, spacing_m=self.spread_m)
 
     @cached_property
     def _goal_distances(self) -> dict[torch.device, GoalDistance]:
@@ -58,32 +52,39 @@ class Navigation:
         return self._goal_distances[device]
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw start positions (count, 2) in m around the maze's start cell."""
-        return self._around(self.maze.start, rng, count)
+        """Draw states [x, y, vx, vy] (count, 4) at rest around the maze's start cell."""
+        return _at_rest(self._around(self.maze.start, rng, count))
 
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw goals (count, 2) in m around the maze's goal cell."""
         return self._around(self.maze.goal, rng, count)
 
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw positions (count, 2) in m uniformly from the free space away from walls."""
+        """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls."""
         rows, columns = np.nonzero(self.maze.clearance_field > self.start_clearance_m)
         chosen = rng.integers(len(rows), size=count)
         cell = self.maze.half_extent * 2 / self.maze.fine_walls.shape[::-1]
         within = rng.random((count, 2))
         corner = np.stack([columns[chosen], rows[chosen]], axis=-1)
-        return np.asarray((corner + within) * cell - self.maze.half_extent)
+        return _at_rest((corner + within) * cell - self.maze.half_extent)
 
     def _around(self, cell: tuple[int, int], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         noise = rng.normal(0.0, self.spread_m, (count, 2)).clip(-3 * self.spread_m, 3 * self.spread_m)
         return np.asarray(np.array(self.maze.cell_centre(*cell)) + noise)
 
-    def reached(self, position: Tensor, goal: Tensor) -> Tensor:
-        """Tell which of `position` (B, 2) are at their `goal` (B, 2)."""
-        return (position - goal).square().sum(-1).le(self.success_radius_m**2)
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return position, velocity, goal and the way to it, (..., 8)."""
+        half = torch.tensor(self.maze.half_extent, dtype=state.dtype, device=state.device)
+        position, velocity = state[..., :2], state[..., 2:]
+        return torch.cat([position / half, velocity, goal / half, (goal - position) / half], dim=-1)
+
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell which of `state` (B, 2 or more), which begin with the position, are at their `goal` (B, 2)."""
+        return (state[:, :2] - goal).square().sum(-1).le(self.success_radius_m**2)
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
-        """Return the metres gained toward `goal` between `before` and `after`, all (B, 2); (B,)."""
+        """Return the metres gained toward `goal` (B, 2) from `before` to `after`, (B, 2 or more); (B,)."""
+        before, after = before[:, :2], after[:, :2]
         if self.reward_kind == "geodesic":
             distance = self._goal_distance_on(goal.device)
             return distance(before, goal) - distance(after, goal)
@@ -91,7 +92,11 @@ class Navigation:
             return torch.pairwise_distance(before, goal, eps=0) - torch.pairwise_distance(after, goal, eps=0)
         return torch.zeros(len(goal), device=goal.device)
 
-    def reward(self, before: Tensor, after: Tensor, goal: Tensor, toppled: Tensor) -> Tensor:
-        """Return the reward (B,) of moving from `before` to `after`, all (B, 2), perhaps toppling (B,)."""
-        bonus = self.success_reward * self.reached(after, goal) + self.topple_reward * toppled
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states that begin with the position, (B, 2 or more)."""
+        bonus = self.success_reward * self.reached(after, goal) + self.failure_reward * failed
         return self.progress(before, after, goal) + bonus
+
+
+def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([position, np.zeros_like(position)], axis=1)

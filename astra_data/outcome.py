@@ -12,7 +12,7 @@ class Outcome:
 
     Attributes:
         success: 1 or 0.
-        topple: 1 or 0.
+        failed: 1 or 0.
         wall_contact: share of the steps.
         steps: until the end.
         returns: sum of rewards.
@@ -20,7 +20,7 @@ class Outcome:
     """
 
     success: list[float]
-    topple: list[float]
+    failed: list[float]
     wall_contact: list[float]
     steps: list[int]
     returns: list[float]
@@ -30,7 +30,7 @@ class Outcome:
         """Return the lists by name."""
         return {
             "success": self.success,
-            "topple": self.topple,
+            "failed": self.failed,
             "wall_contact": self.wall_contact,
             "steps": [float(steps) for steps in self.steps],
             "return": self.returns,
@@ -38,7 +38,7 @@ class Outcome:
 
 
 class EpisodeRecord:
-    """Follow N episodes until each has ended, in success or in a topple.
+    """Follow N episodes until each has ended, in success or badly.
 
     Attributes:
         active: (N,) bool, not ended yet. total_steps: of all episodes so far.
@@ -49,28 +49,26 @@ class EpisodeRecord:
         count = len(position)
         self.active = torch.ones(count, dtype=torch.bool)
         self.total_steps = 0
-        self._success, self._topple, self._contact, self._steps, self._return = torch.zeros(5, count)
+        self._success, self._failed, self._contact, self._steps, self._return = torch.zeros(5, count)
         self._positions = [position.clone()]
 
-    def add(
-        self, position: Tensor, reward: Tensor, success: Tensor, toppled: Tensor, contact: Tensor
-    ) -> None:
+    def add(self, position: Tensor, reward: Tensor, success: Tensor, failed: Tensor, contact: Tensor) -> None:
         """Add one step; what ended episodes do is ignored."""
         active = self.active
         self._success += success & active
-        self._topple += toppled & active
+        self._failed += failed & active
         self._contact += contact & active
         self._steps += active
         self._return += reward * active
         self._positions.append(torch.where(active.unsqueeze(-1), position, torch.nan))
         self.total_steps += int(active.sum())
-        self.active = active & ~success & ~toppled
+        self.active = active & ~success & ~failed
 
     def outcome(self) -> Outcome:
         """Return what happened so far."""
         return Outcome(
             success=self._success.tolist(),
-            topple=self._topple.tolist(),
+            failed=self._failed.tolist(),
             wall_contact=(self._contact / self._steps).tolist(),
             steps=self._steps.long().tolist(),
             returns=self._return.tolist(),

@@ -19,7 +19,7 @@ from astra_data.columns import (
     Episode,
 )
 from astra_data.geometry import PlanarMap
-from astra_data.navigation import Navigation
+from astra_data.objective import Objective
 from astra_data.tasks import Task
 
 Rotations = Literal["quarter", "any", "none"]
@@ -110,7 +110,7 @@ class Relocation:
 
 
 def outcomes(
-    navigation: Navigation, before: Array, after: Array, goal: Array, toppled: Array
+    objective: Objective, before: Array, after: Array, goal: Array, toppled: Array
 ) -> dict[str, Array]:
     """Judge an episode that moves from `before` to `after`, both (T, 2) in m, perhaps toppling (T,).
 
@@ -118,12 +118,12 @@ def outcomes(
     """
     start, end = torch.from_numpy(before), torch.from_numpy(after)
     goals, fallen = torch.from_numpy(goal).expand(len(start), 2), torch.from_numpy(toppled)
-    success = navigation.reached(end, goals)
+    success = objective.reached(end, goals)
     terminated = (success | fallen).numpy()
     length = int(terminated.argmax()) + 1 if terminated.any() else len(terminated)
     done = np.arange(length) == length - 1
     return {
-        REWARD: navigation.reward(start, end, goals, fallen).numpy()[:length],
+        REWARD: objective.reward(start, end, goals, fallen).numpy()[:length],
         TERMINATED: terminated[:length],
         TRUNCATED: done & ~terminated[:length],
         DONE: done,

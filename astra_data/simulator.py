@@ -23,6 +23,19 @@ class SteppedSimulator(Protocol):
         ...
 
 
+class PlacedSimulator(SteppedSimulator, Protocol):
+    """B abstract states that something else may put where the simulator itself would not have taken them."""
+
+    @property
+    def blocked(self) -> Tensor:
+        """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
+        ...
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
+        ...
+
+
 class AbstractSimulator(SteppedSimulator, Protocol):
     """A simulator that datasets can be paired with; bring your own by writing these four."""
 

@@ -45,10 +45,10 @@ def simulator_of(
     else:
         inner = task.varied_simulator(num_envs, variation, device)
     if isinstance(grounding, GroundingModel):
-        return GroundedSimulator(inner, grounding, inner.free, scatter=scatter)
+        return GroundedSimulator(inner, grounding, scatter=scatter)
     if isinstance(grounding, ResidualModel):
-        return AugmentedSimulator(inner, grounding, inner.free, scatter=scatter)
-    return inner if scatter is None else RandomizedSimulator(inner, inner.free, scatter)
+        return AugmentedSimulator(inner, grounding, scatter=scatter)
+    return inner if scatter is None else RandomizedSimulator(inner, scatter)
 
 
 @torch.no_grad()

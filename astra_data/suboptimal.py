@@ -22,7 +22,7 @@ def suboptimal_policy(
     world = TargetWorld(task, _ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
     config = PpoConfig(total_steps=steps)
-    ppo = Ppo(world, policy, config, horizon=task.navigation.horizon, seed=seed)
+    ppo = Ppo(world, policy, config, horizon=task.objective.horizon, seed=seed)
     while not ppo.done:
         metrics = ppo.iterate()
         note = f"training the behaviour: reward per step {metrics['reward']:.3f}"

@@ -34,7 +34,7 @@ TIMED = {
 """Stages that work for few points, and the file that tells how long they took."""
 
 COLUMNS = (
-    *("method", "percent", "seed", "success", "return", "topple", "simulated_success"),
+    *("method", "percent", "seed", "success", "return", "failed", "simulated_success"),
     *("dataset_version", "dataset_hash", "commit", "wall_seconds"),
 )
 
@@ -125,7 +125,7 @@ class Table:
             "seed": point.seed,
             "success": means["success"],
             "return": means["return"],
-            "topple": means["topple"],
+            "failed": means["failed"],
             "simulated_success": None if simulated is None else simulated.means()["success"],
             "dataset_version": evaluation.dataset_version,
             "dataset_hash": evaluation.dataset_hash,

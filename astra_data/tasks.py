@@ -8,11 +8,13 @@ from torch import Tensor
 
 from astra_data.abstraction import ant_beyond_point_mass, ant_to_point_mass
 from astra_data.ant import TIMESTEP_S, WALL_REACH_M
+from astra_data.batched import TargetEnv
 from astra_data.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.navigation import Navigation, RewardKind
+from astra_data.objective import Objective
 from astra_data.recipe import did_you_mean
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
@@ -25,7 +27,7 @@ class Task:
 
     Attributes:
         name: in recipes. instruction: what LeRobot calls the task.
-        navigation: maze, horizon, reward and success.
+        objective: maze, horizon, reward and success.
         abstraction: φ, target states (..., S) to abstract states (..., X).
         beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., S - X).
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
@@ -39,7 +41,7 @@ class Task:
 
     name: str
     instruction: str
-    navigation: Navigation
+    objective: Objective
     abstraction: Callable[[Any], Any]
     beyond: Callable[[Tensor], Tensor]
     state_columns: tuple[Column, ...]
@@ -53,16 +55,16 @@ class Task:
     @property
     def maze(self) -> Maze:
         """The maze."""
-        return self.navigation.maze
+        return self.objective.maze
 
     @property
     def fps(self) -> int:
         """Control steps per second."""
         return round(1.0 / self.timestep_s)
 
-    def target(self, num_envs: int, **options: Any) -> AntMazeEnv:  # noqa: ANN401 - handed on
+    def target(self, num_envs: int, **options: Any) -> TargetEnv:  # noqa: ANN401 - handed on
         """Build `num_envs` target environments; `options` as for `AntMazeEnv`."""
-        return AntMazeEnv(self.navigation, num_envs, **options)
+        return AntMazeEnv(self.objective, num_envs, **options)
 
     def simulator(self, num_envs: int, device: str = "cpu") -> PointMass:
         """Build `num_envs` abstract simulators."""
@@ -136,7 +138,7 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
     return Task(
         name=name if reward == "geodesic" else f"{name}-{reward}",
         instruction="walk through the maze to the goal",
-        navigation=Navigation(maze, horizon, reward),
+        objective=Navigation(maze, horizon, reward),
         abstraction=ant_to_point_mass,
         beyond=ant_beyond_point_mass,
         state_columns=_ANT_COLUMNS,

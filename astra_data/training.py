@@ -27,7 +27,7 @@ from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import Task
 from astra_data.training_world import WorldConfig, training_world, world_parts
 from astra_data.variation import Variation
-from astra_data.world import NavigationWorld, RewardSource
+from astra_data.world import RewardSource, SimulatorWorld
 
 _CHECKPOINT_EVERY = 20
 
@@ -139,7 +139,7 @@ class SimulatorPpo:
 
     def world(
         self, training: Training, *, tells_parameters: bool = False
-    ) -> tuple[NavigationWorld, Simulation]:
+    ) -> tuple[SimulatorWorld, Simulation]:
         """Return the world to train in, and what a policy file says of it."""
         config, settings = training.config, training.settings
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
@@ -171,7 +171,7 @@ def train_by_ppo(
             hidden_sizes=config.hidden_sizes,
         )
     ).to(training.device)
-    ppo = Ppo(env, policy, config, horizon=training.task.navigation.horizon, seed=training.seed)
+    ppo = Ppo(env, policy, config, horizon=training.task.objective.horizon, seed=training.seed)
     return policy, optimise(ppo, env, config.ramp, training)
 
 
@@ -198,7 +198,7 @@ def optimise(
         points, spent = told["points"], told["spent"]
     stopwatch, first = Stopwatch(spent), learner.steps
     while not learner.done:
-        if isinstance(env, NavigationWorld):
+        if isinstance(env, SimulatorWorld):
             env.caution = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
         metrics = learner.iterate()
         # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.

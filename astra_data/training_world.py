@@ -10,14 +10,13 @@ from torch import Tensor
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import scatter_factor
 from astra_data.grounding_file import Grounding
-from astra_data.mazes import FIELD_CELL_M
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.residual import ResidualModel
 from astra_data.recipe import Config, NotNegative, Positive, Share
 from astra_data.simulators import hidden_before, simulator_of
 from astra_data.tasks import Task
 from astra_data.variation import Variation
-from astra_data.world import DataStarts, NavigationWorld, RewardSource
+from astra_data.world import DataStarts, RewardSource, SimulatorWorld
 
 _KERNEL_M = 0.25
 """Standard deviation of the kernel that smooths the density of the data."""
@@ -106,7 +105,7 @@ def _thinness(task: Task, positions: Tensor, density: float) -> Tensor:
     height, width = free.blocked.shape
     rows, columns = free.cells(positions)
     counts = torch.bincount(rows * width + columns, minlength=height * width).reshape(height, width)
-    smooth = gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / FIELD_CELL_M)
+    smooth = gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / task.maze.fine_m)
     # Where most of the maze was never visited, the median is nothing, and any visit at all is enough.
     enough = max(density * float(np.median(smooth[~task.maze.fine_walls])), 1e-9)
     return torch.from_numpy(1.0 - smooth / enough).clamp_min(0.0).float().to(positions.device)
@@ -121,15 +120,15 @@ def training_world(
     num_envs: int,
     device: str,
     tells_parameters: bool = False,
-) -> NavigationWorld:
+) -> SimulatorWorld:
     """Build the world: the task in the raw, varied, scattered or grounded simulator.
 
     With `tells_parameters`, observations end with the normalised parameters of a simulator that varies.
     """
     scatter = parts.scatter if config.residual_noise else None
     simulator = simulator_of(task, grounding, num_envs, device, variation=parts.variation, scatter=scatter)
-    return NavigationWorld(
-        task.navigation,
+    return SimulatorWorld(
+        task.objective,
         simulator,
         reward=config.reward or "abstract",
         topple=config.topple,

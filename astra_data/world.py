@@ -1,4 +1,4 @@
-"""The navigation task in an abstract simulator, raw or grounded: the worlds that policies are trained in."""
+"""The task in an abstract simulator, raw or grounded: the worlds that policies are trained in."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,8 +10,7 @@ from torch import Tensor
 
 from astra_data.batched import Step
 from astra_data.free_space import FreeSpace
-from astra_data.mazes import Maze
-from astra_data.navigation import Navigation
+from astra_data.objective import Objective
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.simulators import Simulator, start_simulator, varied_within
@@ -34,15 +33,14 @@ class DataStarts:
     hidden: Tensor | None
 
 
-def policy_observation(maze: Maze, state: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
-    """Assemble what a policy sees: latent (..., Z) where there is one, position, velocity, goal; (..., O).
+def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
+    """Assemble what a policy sees (..., O): latent (..., Z) where there is one, then state and goal.
 
-    All parts have a length of about one. A latent left at its own length, the square root of Z, drowns the
-    rest: PPO then hardly learns to use the position.
+    A latent left at its own length, the square root of Z, drowns the rest: PPO then hardly learns to use the
+    position. It is shortened to about one.
     """
-    half = torch.tensor(maze.half_extent, dtype=state.dtype, device=state.device)
-    parts = [state[..., :2] / half, state[..., 2:], goal / half, (goal - state[..., :2]) / half]
-    return torch.cat(parts if latent is None else [latent / latent.shape[-1] ** 0.5, *parts], dim=-1)
+    seen = objective.observe(state, goal)
+    return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
 
 
 def limit_command(action: Tensor, limit: float) -> Tensor:
@@ -53,17 +51,19 @@ def limit_command(action: Tensor, limit: float) -> Tensor:
     return command * shorten
 
 
-class NavigationWorld:
+class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for the
     step that reaches the goal: this simulator decides that by itself, so the task's own reward is paid;
     "blend", the task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the
-    topple head and ends the episode. All randomness comes from torch's global generator.
+    topple head and ends the episode; so does touching a wall, where the task says so. All randomness comes
+    from torch's global generator.
 
     Attributes:
         latent_size: Z, of the latents in the observations; 0 where there are none.
         parameter_count: P, of the parameters in the observations; 0 where they are not told.
+        failed: which episodes ended badly in the last step, (B,) bool.
         caution: factor on the penalties for thin data and for risk; 1 unless the training ramps it up.
     """
 
@@ -71,7 +71,7 @@ class NavigationWorld:
 
     def __init__(
         self,
-        navigation: Navigation,
+        objective: Objective,
         simulator: Simulator,
         *,
         reward: RewardSource = "abstract",
@@ -86,7 +86,7 @@ class NavigationWorld:
         """Put the task into `simulator`.
 
         Args:
-            navigation: the task.
+            objective: of the task.
             simulator: raw or grounded.
             reward: where the reward comes from.
             topple: end episodes by the topple head.
@@ -97,7 +97,7 @@ class NavigationWorld:
             data_start_share: share of the episodes that start from `starts`.
             tells_parameters: end observations with the parameters of a simulator that varies, normalised.
         """
-        self.navigation = navigation
+        self.objective = objective
         self.simulator = simulator
         self.grounded = simulator if isinstance(simulator, GroundedSimulator) else None
         self.reward = reward
@@ -105,14 +105,14 @@ class NavigationWorld:
         self.caution = 1.0
         self.risk_weight = risk_weight
         self.command_limit_m_s = command_limit_m_s
-        self.free = FreeSpace.of_maze(navigation.maze, radius_m=0.0, device=str(simulator.state.device))
+        self.free = FreeSpace.of_maze(objective.maze, radius_m=0.0, device=str(simulator.state.device))
         self.thinness = thinness
         self.starts = starts
         self.data_start_share = data_start_share
         self.device = simulator.state.device
         self.num_envs = len(simulator.state)
         self.goal = torch.zeros(self.num_envs, 2, device=self.device)
-        self.toppled = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.failed = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._told = varied_within(simulator) if tells_parameters else None
         self.parameter_count = 0 if self._told is None else self._told.parameters.shape[1]
         self.observation_size = self._observe().shape[1]
@@ -130,9 +130,8 @@ class NavigationWorld:
 
     def _start_task(self, rows: Tensor) -> None:
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
-        position = self.navigation.draw_starts(rng, len(rows))
-        goal = self.navigation.draw_goals(rng, len(rows))
-        state = np.concatenate([position, np.zeros_like(position)], axis=1)
+        state = self.objective.draw_starts(rng, len(rows))
+        goal = self.objective.draw_goals(rng, len(rows))
         self._set(rows, self._tensor(state), self._tensor(goal))
 
     def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
@@ -160,8 +159,10 @@ class NavigationWorld:
         before = self.simulator.state
         latent = None if self.grounded is None else self.grounded.latent
         after = self.simulator.step(action)
-        success = self.navigation.reached(after[:, :2], self.goal)
-        self.toppled = torch.zeros_like(success)
+        success = self.objective.reached(after, self.goal)
+        self.failed = torch.zeros_like(success)
+        if self.objective.ends_at_walls:
+            self.failed = self.simulator.blocked & ~success
         penalty = torch.zeros(self.num_envs, device=self.device)
         if self.thinness is not None:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
@@ -169,10 +170,10 @@ class NavigationWorld:
             with torch.no_grad():
                 risk = self.grounded.model.topple_risk(latent, action, after)
             if self.topple:
-                self.toppled = (torch.rand_like(risk) < risk) & ~success
+                self.failed = self.failed | ((torch.rand_like(risk) < risk) & ~success)
             else:
-                penalty = penalty + self.risk_weight * self.navigation.topple_reward * risk
-        reward = self.navigation.reward(before[:, :2], after[:, :2], self.goal, self.toppled)
+                penalty = penalty + self.risk_weight * self.objective.failure_reward * risk
+        reward = self.objective.reward(before, after, self.goal, self.failed)
         if self.reward == "predicted" and self.grounded is not None and latent is not None:
             with torch.no_grad():
                 predicted = self.grounded.model.predict_reward(latent, action)
@@ -180,13 +181,13 @@ class NavigationWorld:
         return Step(
             observation=self._observe(),
             reward=reward + self.caution * penalty,
-            terminated=success | self.toppled,
+            terminated=success | self.failed,
             success=success,
         )
 
     def _observe(self) -> Tensor:
         latent = None if self.grounded is None else self.grounded.latent
-        observation = policy_observation(self.navigation.maze, self.simulator.state, self.goal, latent)
+        observation = policy_observation(self.objective, self.simulator.state, self.goal, latent)
         if self._told is None:
             return observation
         return torch.cat([observation, self._told.variation.normal(self._told.parameters)], dim=-1)

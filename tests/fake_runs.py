@@ -50,7 +50,7 @@ def outcomes(success: list[int], seed: int) -> dict[str, list[float]]:
     count = len(success)
     return {
         "success": [float(value) for value in success],
-        "topple": [1.0 - value for value in success],
+        "failed": [1.0 - value for value in success],
         "wall_contact": [0.1 * (seed + 1)] * count,
         "steps": [100.0 + 10 * episode for episode in range(count)],
         "return": [float(seed)] * count,

@@ -173,7 +173,7 @@ def evaluate(
         "seed": seed,
         "num_threads": num_threads,
     }
-    outcomes = {name: [0.0, 1.0] for name in ("success", "topple", "wall_contact", "steps", "return")}
+    outcomes = {name: [0.0, 1.0] for name in ("success", "failed", "wall_contact", "steps", "return")}
     evaluation = {
         "task": task,
         "method": method,

@@ -13,7 +13,7 @@ from astra_data.training import TrainConfig
 
 TASK = "antmaze-short"
 _LONG = TASKS["antmaze-umaze"]
-_SHORT = replace(_LONG, name=TASK, navigation=replace(_LONG.navigation, horizon=25))
+_SHORT = replace(_LONG, name=TASK, objective=replace(_LONG.objective, horizon=25))
 
 COLLECT = CollectConfig(episodes=8, max_steps=60)
 GROUND = GroundConfig(updates=30, batch_windows=4, window=20, latent_size=16, held_out_share=0.25)

@@ -45,7 +45,7 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
         latent, _ = target.encoder(target.encoder_input(STATE, GOALS, previous(actions)))
     else:
         latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
-    observation = policy_observation(TASK.maze, abstract, GOALS, latent)
+    observation = policy_observation(TASK.objective, abstract, GOALS, latent)
     torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
 
@@ -56,7 +56,7 @@ def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> N
     policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=8))
     deployed = DeployedPolicy(TASK, policy)
     actions = run(deployed)
-    observation = policy_observation(TASK.maze, STATE[..., [0, 1, 15, 16]], GOALS, None)
+    observation = policy_observation(TASK.objective, STATE[..., [0, 1, 15, 16]], GOALS, None)
     features = policy.remember_sequence(
         observation, previous(actions), policy.initial_hidden(3), torch.zeros(3, 6)
     )

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from astra_data.free_space import FreeSpace, GoalDistance
-from astra_data.mazes import FIELD_CELL_M, U_MAZE, Maze
+from astra_data.mazes import U_MAZE, Maze
 
 ROOM = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))
 """One room, free in [-2, 2]²; with a radius of 0.1 m, in [-1.9, 1.9]²."""
@@ -90,9 +90,9 @@ def test_goal_distance_is_bilinear() -> None:
     height, width = ROOM.fine_walls.shape
     half = torch.tensor(ROOM.half_extent, dtype=torch.float32)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    x, y = x * FIELD_CELL_M - half[0], y * FIELD_CELL_M - half[1]
+    x, y = x * ROOM.fine_m - half[0], y * ROOM.fine_m - half[1]
     fields = torch.stack([2 * x - 3 * y, x + y])
-    distance = GoalDistance(fields, torch.tensor([[0.0, 0.0], [1.0, 1.0]]), half)
+    distance = GoalDistance(fields, torch.tensor([[0.0, 0.0], [1.0, 1.0]]), half, ROOM.fine_m)
     position = torch.rand(200, 2, generator=torch.Generator().manual_seed(0)) * 4 - 2
     near = distance(position, torch.tensor([[0.2, 0.1]]).expand(200, 2))
     torch.testing.assert_close(near, 2 * position[:, 0] - 3 * position[:, 1], atol=1e-4, rtol=0)
@@ -101,7 +101,7 @@ def test_goal_distance_is_bilinear() -> None:
 
 
 def test_goal_distance_follows_the_goal() -> None:
-    distance = GoalDistance.of_maze(U_MAZE)
+    distance = GoalDistance.of_maze(U_MAZE, spacing_m=0.2)
     goal = torch.tensor([[-4.0, -4.0], [-3.6, -4.0]])
     position = torch.tensor([[0.0, -4.0], [0.0, -4.0]])
     assert distance(position, goal).tolist() == pytest.approx([4.0, 3.6], abs=0.1)

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import astra_data.envs
-from astra_data.gymnasium_faces import Array, SeededNavigationWorld, WorldEnv, WorldVectorEnv
+from astra_data.gymnasium_faces import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
 from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
@@ -58,7 +58,7 @@ def test_gymnasiums_own_checks_pass(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_time_limits_are_the_tasks_horizons(name: str) -> None:
     spec = gymnasium.spec(name)
-    assert spec.max_episode_steps == TASKS[spec.kwargs["task"]].navigation.horizon
+    assert spec.max_episode_steps == TASKS[spec.kwargs["task"]].objective.horizon
     assert spec.kwargs["task"].endswith("long" if "Long" in name else "umaze")
 
 
@@ -147,7 +147,7 @@ def test_a_grounded_simulator_shows_its_latents() -> None:
     task = TASKS["antmaze-umaze"]
     model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
     grounded = simulator_of(task, model.requires_grad_(False), 3, "cpu")
-    env = WorldVectorEnv(SeededNavigationWorld(task.navigation, grounded), max_episode_steps=5)
+    env = WorldVectorEnv(SeededSimulatorWorld(task.objective, grounded), max_episode_steps=5)
     raw = point_mazes(3, max_episode_steps=5)
     first, _ = env.reset(seed=1)
     expected, _ = raw.reset(seed=1)

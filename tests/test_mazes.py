@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from astra_data.mazes import FIELD_CELL_M, LONG_MAZE, U_MAZE, Maze
+from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
 
 CORRIDOR = Maze(rows=("1111111", "1000001", "1111111"), scale=4.0, start=(1, 1), goal=(1, 5))
 
@@ -35,7 +35,7 @@ def test_the_fine_grid_repeats_the_walls() -> None:
 
 def test_clearance_in_the_middle_and_beside_a_wall() -> None:
     points = np.array([[0.0, 4.0], [0.0, 5.5], [0.0, 4.0 + 1.75], [0.0, 0.0]])
-    assert U_MAZE.clearance(points) == pytest.approx([2.0, 0.5, 0.25, 0.0], abs=FIELD_CELL_M)
+    assert U_MAZE.clearance(points) == pytest.approx([2.0, 0.5, 0.25, 0.0], abs=U_MAZE.fine_m)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_success_and_toppling_are_paid_once_each() -> None:
 def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
     task = Navigation(maze, horizon=1)
     for draw, cell in ((task.draw_starts, task.maze.start), (task.draw_goals, task.maze.goal)):
-        points = draw(np.random.default_rng(0), 4000) - np.array(task.maze.cell_centre(*cell))
+        points = draw(np.random.default_rng(0), 4000)[:, :2] - np.array(task.maze.cell_centre(*cell))
         assert points.shape == (4000, 2)
         assert points.mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.02)
         assert points.std(axis=0) == pytest.approx([0.2, 0.2], abs=0.01)
@@ -48,7 +48,7 @@ def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
 
 
 def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -> None:
-    points = TASK.draw_anywhere(np.random.default_rng(0), 7000)
+    points = TASK.draw_anywhere(np.random.default_rng(0), 7000)[:, :2]
     assert U_MAZE.clearance(points).min() > 0.8
     # The two arms are mirror images.
     assert (points[:, 1] > 0).mean() == pytest.approx(0.5, abs=0.02)

@@ -11,17 +11,17 @@ def flags(*values: int) -> Tensor:
 def test_what_happens_after_the_end_does_not_count() -> None:
     record = EpisodeRecord(torch.zeros(3, 2))
     none = flags(0, 0, 0)
-    for step, (success, toppled, contact) in enumerate(
+    for step, (success, failed, contact) in enumerate(
         [(none, none, flags(1, 1, 0)), (flags(1, 0, 0), none, none), (none, flags(1, 1, 0), flags(1, 1, 1))]
     ):
         position = torch.full((3, 2), float(step + 1))
-        record.add(position, torch.tensor([1.0, 2.0, 4.0]), success, toppled, contact)
+        record.add(position, torch.tensor([1.0, 2.0, 4.0]), success, failed, contact)
     assert record.active.tolist() == [False, False, True]
     assert record.total_steps == 3 + 3 + 2
     outcome = record.outcome()
     assert outcome.to_json() == {
         "success": [1.0, 0.0, 0.0],
-        "topple": [0.0, 1.0, 0.0],
+        "failed": [0.0, 1.0, 0.0],
         "wall_contact": torch.tensor([1 / 2, 2 / 3, 1 / 3]).tolist(),
         "steps": [2.0, 3.0, 3.0],
         "return": [2.0, 6.0, 12.0],

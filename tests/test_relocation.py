@@ -111,7 +111,7 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
     path = straight((GOAL[0] + 2.0, GOAL[1]), (GOAL[0] - 1.0, GOAL[1]), 30)
     before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
     toppled = np.arange(30) == toppled_at
-    judged = outcomes(TASK.navigation, before, after, GOAL, toppled)
+    judged = outcomes(TASK.objective, before, after, GOAL, toppled)
     assert {len(values) for values in judged.values()} == {length}
     assert judged["next.success"].tolist() == [False] * (length - 1) + [success]
     assert judged["next.terminated"].tolist() == judged["next.done"].tolist()
@@ -124,6 +124,6 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
 def test_an_episode_that_just_stops_is_truncated() -> None:
     path = straight((4.0, 4.0), (3.0, 4.0), 10)
     before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
-    judged = outcomes(TASK.navigation, before, after, GOAL, np.zeros(10, dtype=bool))
+    judged = outcomes(TASK.objective, before, after, GOAL, np.zeros(10, dtype=bool))
     assert judged["next.truncated"].tolist() == judged["next.done"].tolist() == [False] * 9 + [True]
     assert not judged["next.terminated"].any()

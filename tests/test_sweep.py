@@ -44,7 +44,7 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
             "seed": "1",
             "success": "1.0",
             "return": "0.5",
-            "topple": "0.5",
+            "failed": "0.5",
             "simulated_success": "0.5",
             "dataset_version": "fake@data-1.0.0",
             "dataset_hash": "hash1",

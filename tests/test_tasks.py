@@ -29,7 +29,7 @@ def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
     start = maze.fine_index(np.array(maze.cell_centre(*maze.start)))
     metres = maze.distance_field(np.array(maze.cell_centre(*maze.goal)))[start]
     # Below the largest command along one axis, 1 m/s, with time to spare.
-    assert metres / (task.navigation.horizon * task.timestep_s) < 0.8
+    assert metres / (task.objective.horizon * task.timestep_s) < 0.8
 
 
 def test_an_unknown_task_answers_with_the_known_ones() -> None:
@@ -45,5 +45,5 @@ def test_names_tell_rewards_apart(name: str, metres: float) -> None:
     # Half a metre straight at the goal, which is behind a wall: the path round the wall's corner, 6 m to the
     # right of the start and 2 m down, is sqrt(6² + 2²) - sqrt(6² + 1.5²) metres shorter.
     after = start + torch.tensor([[0.0, -0.5]])
-    reward = task.navigation.reward(start, after, goal, torch.zeros(1))
+    reward = task.objective.reward(start, after, goal, torch.zeros(1))
     assert float(reward) == pytest.approx(metres, abs=0.04)

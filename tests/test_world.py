@@ -8,21 +8,21 @@ from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
 from astra_data.variation import Variation
-from astra_data.world import DataStarts, NavigationWorld, limit_command, policy_observation
+from astra_data.world import DataStarts, SimulatorWorld, limit_command, policy_observation
 
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def world(num_envs: int = 4, **options: float | torch.Tensor) -> NavigationWorld:
+def world(num_envs: int = 4, **options: float | torch.Tensor) -> SimulatorWorld:
     simulator = PointMass(U_MAZE, num_envs, timestep_s=0.05)
-    return NavigationWorld(TASK, simulator, **options)  # type: ignore[arg-type]
+    return SimulatorWorld(TASK, simulator, **options)  # type: ignore[arg-type]
 
 
 def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
     state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
-    seen = policy_observation(U_MAZE, state, goal, None)
+    seen = policy_observation(TASK, state, goal, None)
     assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
-    with_latent = policy_observation(U_MAZE, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
+    with_latent = policy_observation(TASK, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
     assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
 
 
@@ -96,7 +96,7 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
     rewards = []
     for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
         inner = PointMass(U_MAZE, 3, timestep_s=0.05)
-        one = NavigationWorld(TASK, GroundedSimulator(inner, model, inner.free), **options)
+        one = SimulatorWorld(TASK, GroundedSimulator(inner, model), **options)
         one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
         latent = one.simulator.latent  # type: ignore[union-attr]
         rewards.append(one.step(action).reward)
@@ -129,8 +129,8 @@ def test_caution_scales_the_penalties() -> None:
 def test_parameters_of_the_episode_are_told_where_asked_for() -> None:
     variation = Variation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPointMass(U_MAZE, 4, variation, timestep_s=0.05)
-    assert NavigationWorld(TASK, simulator).observation_size == 8
-    telling = NavigationWorld(TASK, simulator, tells_parameters=True)
+    assert SimulatorWorld(TASK, simulator).observation_size == 8
+    telling = SimulatorWorld(TASK, simulator, tells_parameters=True)
     assert (telling.observation_size, telling.parameter_count) == (8 + 7, 7)
     before = telling.reset()
     torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)

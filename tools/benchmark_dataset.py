@@ -37,7 +37,7 @@ from astra_data.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Arra
 from astra_data.cores import cores
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.frames import Frames
-from astra_data.gymnasium_faces import SeededNavigationWorld, WorldEnv
+from astra_data.gymnasium_faces import SeededSimulatorWorld, WorldEnv
 from astra_data.pairing import Pairing, pairing_named
 from astra_data.sims.mujoco_model import MujocoModel
 from astra_data.stages.pair import pair_steps
@@ -353,7 +353,7 @@ def point_mass_pairs() -> Candidates:
     action = rng.uniform(-1, 1, size=(PAIRED, 2)).astype(np.float32)
     pairing = pairing_named(TASK)
     batch, simulator = pairing.simulator(BATCH_OF_PAIRS), task.simulator(1)
-    env = WorldEnv(SeededNavigationWorld(task.navigation, simulator))
+    env = WorldEnv(SeededSimulatorWorld(task.objective, simulator))
     env.reset(seed=0)
     abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
 

@@ -46,7 +46,7 @@ from astra_data.recipe import load_recipe
 from astra_data.request import Recipe
 from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
-from astra_data.world import NavigationWorld
+from astra_data.world import SimulatorWorld
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
 TASK = TASKS[SETTINGS.task]
@@ -153,14 +153,14 @@ def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, 
 def ppo_stretch(model: GroundingModel | None, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
     config = SETTINGS.train
-    env = NavigationWorld(TASK.navigation, simulator_of(TASK, model, config.num_envs, "cpu"))
+    env = SimulatorWorld(TASK.objective, simulator_of(TASK, model, config.num_envs, "cpu"))
     shape = ActorCriticShape(
         observation_size=env.observation_size,
         action_size=env.action_size,
         memory_size=memory_size,
         hidden_sizes=config.hidden_sizes,
     )
-    ppo = Ppo(env, ActorCritic(shape), config, horizon=TASK.navigation.horizon, seed=0)
+    ppo = Ppo(env, ActorCritic(shape), config, horizon=TASK.objective.horizon, seed=0)
 
     def stretch() -> int:
         ppo.iterate()
@@ -374,7 +374,7 @@ def target(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidat
     rng = np.random.default_rng(0)
 
     def ours(steps: int = 25) -> int:
-        env.reset(env.toppled)
+        env.reset(env.failed)
         for _ in range(steps):
             env.step(torch.from_numpy(rng.uniform(-1, 1, (ANTS, 2))))
         return steps * ANTS

@@ -80,13 +80,13 @@ class RecordingController(VelocityController):
 def measure_target(num_envs: int, threads: int, rounds: int) -> dict[str, float]:
     """Return control steps per second of our target, of bare physics, and of Gymnasium's own maze."""
     controller = RecordingController(VelocityController.load())
-    env = AntMazeEnv(TASK.navigation, num_envs, seed=0, controller=controller, num_threads=threads)
+    env = AntMazeEnv(TASK.objective, num_envs, seed=0, controller=controller, num_threads=threads)
     env.reset()
     generator = torch.Generator().manual_seed(0)
     starts = [env.physics.qpos, env.physics.qvel]
 
     def target() -> int:
-        env.reset(env.toppled)
+        env.reset(env.failed)
         starts[:] = env.physics.qpos.copy(), env.physics.qvel.copy()
         controller.torques.clear()
         for _ in range(25):

@@ -17,7 +17,7 @@ from astra_data.ant import (
     wall_geoms,
 )
 from astra_data.batched import Step
-from astra_data.navigation import Navigation
+from astra_data.objective import Objective
 from astra_data.physics import BatchedPhysics, Floats
 
 
@@ -28,7 +28,7 @@ class AntMazeEnv:
     Reaching the goal and toppling end an episode; touching a wall is recorded, not punished.
 
     Attributes:
-        state: (B, 29) float32. goal: (B, 2) float32. toppled: (B,) bool, of the last step.
+        state: (B, 29) float32. goal: (B, 2) float32. failed: (B,) bool, toppled in the last step.
     """
 
     observation_size = STATE_SIZE + 2
@@ -36,7 +36,7 @@ class AntMazeEnv:
 
     def __init__(
         self,
-        navigation: Navigation,
+        objective: Objective,
         num_envs: int,
         *,
         seed: int,
@@ -48,7 +48,7 @@ class AntMazeEnv:
         """Build B ants.
 
         Args:
-            navigation: maze, goal and reward.
+            objective: maze, goal and reward.
             num_envs: B.
             seed: of starts, goals and headings.
             leg_scale: factor on the legs' length.
@@ -56,12 +56,12 @@ class AntMazeEnv:
             controller: the low-level controller, by default the one shipped.
             num_threads: physics threads, by default one per core.
         """
-        self.navigation = navigation
+        self.objective = objective
         self.num_envs = num_envs
         self.leg_scale = leg_scale
         self.start_anywhere = start_anywhere
         self.controller = controller or VelocityController.load()
-        model = ant_model(navigation.maze, leg_scale=leg_scale)
+        model = ant_model(objective.maze, leg_scale=leg_scale)
         self.physics = BatchedPhysics(
             model,
             num_envs,
@@ -70,13 +70,18 @@ class AntMazeEnv:
             num_threads=num_threads,
         )
         self.goal = torch.zeros(num_envs, 2)
-        self.toppled = torch.zeros(num_envs, dtype=torch.bool)
+        self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self.reseed(seed)
 
     @property
     def state(self) -> Tensor:
         """The full target states, (B, 29) float32."""
         return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
+
+    @property
+    def position(self) -> Tensor:
+        """Where the ants are, (B, 2) float32 in m."""
+        return torch.from_numpy(self.physics.qpos[:, :2]).float()
 
     @property
     def wall_contact(self) -> Tensor:
@@ -91,20 +96,20 @@ class AntMazeEnv:
         """Stand the ants in `mask` (B,) up at new starts with random headings, by default all."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         count = len(rows)
-        navigation = self.navigation
-        draw = navigation.draw_anywhere if self.start_anywhere else navigation.draw_starts
+        objective = self.objective
+        draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
         qpos = standing_pose(count)
-        qpos[:, :2] = draw(self._rng, count)
+        qpos[:, :2] = draw(self._rng, count)[:, :2]
         yaw = self._rng.uniform(-np.pi, np.pi, count)
         qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
-        self.goal[rows] = torch.from_numpy(navigation.draw_goals(self._rng, count)).float()
+        self.goal[rows] = torch.from_numpy(objective.draw_goals(self._rng, count)).float()
         self.reset_to(rows, np.concatenate([qpos, np.zeros((count, STATE_SIZE - POSITIONS))], axis=1))
         return self._observe()
 
     def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
         """Set the ants `rows` (n,) to `state` (n, 29)."""
         self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
-        self.toppled[rows] = False
+        self.failed[rows] = False
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
@@ -118,16 +123,16 @@ class AntMazeEnv:
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stand frozen."""
         command = action.clamp(-1.0, 1.0).numpy().astype(np.float64)
-        before = torch.from_numpy(self.physics.qpos[:, :2]).float()
+        before = self.position
         torques = self.controller(self.physics.qpos, self.physics.qvel, command)
         self.physics.step(torques, None if active is None else active.numpy())
-        after = torch.from_numpy(self.physics.qpos[:, :2]).float()
-        self.toppled = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
-        success = self.navigation.reached(after, self.goal)
+        after = self.position
+        self.failed = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
+        success = self.objective.reached(after, self.goal)
         return Step(
             observation=self._observe(),
-            reward=self.navigation.reward(before, after, self.goal, self.toppled),
-            terminated=success | self.toppled,
+            reward=self.objective.reward(before, after, self.goal, self.failed),
+            terminated=success | self.failed,
             success=success,
         )
 

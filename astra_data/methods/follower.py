@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from astra_data.mazes import FIELD_CELL_M, Maze
+from astra_data.mazes import Maze
 from astra_data.method import Method
 
 FOLLOWER = Method(name="follower", title="Careful follower", learn=None)
@@ -40,7 +40,7 @@ class CarefulFollower:
         directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
         ahead = position[:, None] + 0.8 * directions
         half = torch.tensor(self.maze.half_extent, dtype=torch.float32)
-        cells = ((ahead + half) / FIELD_CELL_M).long()
+        cells = ((ahead + half) / self.maze.fine_m).long()
         rows = cells[..., 1].clamp(0, fields.shape[1] - 1)
         columns = cells[..., 0].clamp(0, fields.shape[2] - 1)
         costs = fields[torch.arange(len(position))[:, None], rows, columns]

@@ -63,7 +63,7 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     features = PositionFeatures(_POSITION_OCTAVES).to(windows.state.device)
 
     def observation(state: Tensor) -> Tensor:
-        seen = policy_observation(task.maze, state, windows.goal, None)
+        seen = policy_observation(task.objective, state, windows.goal, None)
         return torch.cat([seen, features(state[..., :2])], dim=-1)
 
     return Experience(

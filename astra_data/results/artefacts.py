@@ -38,7 +38,7 @@ class Outcomes(BaseModel):
 
     success: list[float]
     """1 where the goal was reached, else 0."""
-    topple: list[float]
+    failed: list[float]
     """1 where the robot fell over, else 0."""
     wall_contact: list[float]
     """Share of the episode's steps in contact with a wall."""

@@ -173,7 +173,7 @@ def _row(
         role=ROLES.get(method),
         seeds=list(of_seeds),
         success=measures["success"],
-        topple=measures["topple"],
+        failed=measures["failed"],
         wall_contact=measures["wall_contact"],
         steps=measures["steps"],
         returns=measures["return"],

@@ -111,7 +111,7 @@ class MethodResults(Part):
     seeds: list[int]
     """Those that are finished."""
     success: list[float]
-    topple: list[float]
+    failed: list[float]
     wall_contact: list[float]
     """Share of steps in contact with a wall."""
     steps: list[float]

@@ -49,7 +49,7 @@ COLUMNS = (
     "seeds",
     "success",
     "IQM [95 %]",
-    "topple",
+    "failed",
     "wall contact",
     "steps",
     "return",
@@ -110,7 +110,7 @@ def _table(results: Results) -> str:
                 str(len(row.seeds)),
                 f"**{success}**" if not row.role and summary["success"].mean == best else success,
                 interval(summary["success"].iqm, summary["success"].low, summary["success"].high),
-                spread(summary["topple"], 2),
+                spread(summary["failed"], 2),
                 spread(summary["wall_contact"], 2),
                 spread(summary["steps"], 0),
                 spread(summary["return"], 1),
@@ -119,7 +119,7 @@ def _table(results: Results) -> str:
         )
     note = (
         "Mean ± standard deviation over seeds, in the target. IQM: interquartile mean over seeds with its "
-        "95 % stratified bootstrap interval. Topple: share of episodes in which the robot fell. Wall "
+        "95 % stratified bootstrap interval. Failed: share of episodes that ended badly, as in a fall. Wall "
         "contact: share of steps. Floor and ceiling bound the other rows; the best of those is bold."
     )
     if any(map(is_plus, rows)):

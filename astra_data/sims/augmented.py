@@ -3,15 +3,12 @@
 import torch
 from torch import Tensor
 
-from astra_data.free_space import FreeSpace
 from astra_data.models.residual import ResidualModel
-from astra_data.simulator import SteppedSimulator
+from astra_data.simulator import PlacedSimulator
 
 
 class AugmentedSimulator:
     """Step the simulator, add what the model says that it lacks, and set it there (Golemo et al. 2018).
-
-    The corrected position is kept out of blocked cells by sliding along them from the previous position.
 
     Attributes:
         state: corrected abstract states, (B, X). hidden: memory of the model, (B, M).
@@ -20,9 +17,8 @@ class AugmentedSimulator:
 
     def __init__(
         self,
-        simulator: SteppedSimulator,
+        simulator: PlacedSimulator,
         model: ResidualModel,
-        free: FreeSpace,
         *,
         scatter: Tensor | None = None,
     ) -> None:
@@ -31,26 +27,27 @@ class AugmentedSimulator:
         Args:
             simulator: the abstract simulator.
             model: trained; only read.
-            free: where corrected positions may be.
             scatter: factor (X, X) of the noise that stands for the target's scatter around the correction.
         """
         self.simulator = simulator
         self.model = model
-        self.free = free
         self.scatter = scatter
         self.hidden = model.initial_memory(len(simulator.state))
-        self.blocked = torch.zeros(len(simulator.state), dtype=torch.bool, device=simulator.state.device)
 
     @property
     def state(self) -> Tensor:
         """The corrected abstract states, (B, X)."""
         return self.simulator.state
 
+    @property
+    def blocked(self) -> Tensor:
+        """Which were stopped at a wall, (B,) bool."""
+        return self.simulator.blocked
+
     def reset_to(self, state: Tensor, rows: Tensor, hidden: Tensor | None = None) -> None:
         """Set `rows` (n,) to `state` (n, X), with the memory `hidden` (n, M), by default an empty one."""
         self.simulator.reset_to(state, rows)
         self.hidden[rows] = self.model.initial_memory(len(state)) if hidden is None else hidden
-        self.blocked[rows] = False
 
     @torch.no_grad()
     def step(self, action: Tensor) -> Tensor:
@@ -63,7 +60,4 @@ class AugmentedSimulator:
         corrected = sequence.squeeze(1)
         if self.scatter is not None:
             corrected = corrected + torch.randn_like(corrected) @ self.scatter.T
-        position, self.blocked = self.free.slide(before[:, :2], corrected[:, :2])
-        state = torch.cat([position, corrected[:, 2:]], dim=-1)
-        self.simulator.reset_to(state)
-        return state
+        return self.simulator.settle(before, corrected)

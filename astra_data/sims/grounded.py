@@ -3,15 +3,12 @@
 import torch
 from torch import Tensor
 
-from astra_data.free_space import FreeSpace
 from astra_data.models.grounding import GroundingModel
-from astra_data.simulator import SteppedSimulator
+from astra_data.simulator import PlacedSimulator
 
 
 class GroundedSimulator:
     """Step the simulator, correct where it landed, set it back there, and encode the history anew.
-
-    The corrected position is kept out of blocked cells by sliding along them from the previous position.
 
     Attributes:
         state: corrected abstract states, (B, X). latent: z, (B, Z).
@@ -20,9 +17,8 @@ class GroundedSimulator:
 
     def __init__(
         self,
-        simulator: SteppedSimulator,
+        simulator: PlacedSimulator,
         model: GroundingModel,
-        free: FreeSpace,
         *,
         scatter: Tensor | None = None,
     ) -> None:
@@ -31,23 +27,25 @@ class GroundedSimulator:
         Args:
             simulator: the abstract simulator.
             model: a trained grounding model; only read.
-            free: where corrected positions may be.
             scatter: factor (X, X) of the noise that stands for the target's scatter around the correction.
         """
         self.simulator = simulator
         self.model = model
-        self.free = free
         self.scatter = scatter
         count, device = len(simulator.state), simulator.state.device
         shape = model.shape
         self.hidden = torch.zeros(count, shape.latent_size, device=device)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
-        self.blocked = torch.zeros(count, dtype=torch.bool, device=device)
 
     @property
     def state(self) -> Tensor:
         """The corrected abstract states, (B, X)."""
         return self.simulator.state
+
+    @property
+    def blocked(self) -> Tensor:
+        """Which were stopped at a wall, (B,) bool."""
+        return self.simulator.blocked
 
     @property
     def latent(self) -> Tensor:
@@ -82,7 +80,6 @@ class GroundedSimulator:
         self.hidden[rows] = self.model.encoder.step(
             self.model.encoder_input(state, goal, previous_action), hidden
         )
-        self.blocked[rows] = False
 
     @torch.no_grad()
     def step(self, action: Tensor) -> Tensor:
@@ -91,8 +88,6 @@ class GroundedSimulator:
         corrected = self.model.correct(self.latent, action, self.simulator.step(action))
         if self.scatter is not None:
             corrected = corrected + torch.randn_like(corrected) @ self.scatter.T
-        position, self.blocked = self.free.slide(before[:, :2], corrected[:, :2])
-        state = torch.cat([position, corrected[:, 2:]], dim=-1)
-        self.simulator.reset_to(state)
+        state = self.simulator.settle(before, corrected)
         self.hidden = self.model.encoder.step(self.model.encoder_input(state, self.goal, action), self.hidden)
         return state

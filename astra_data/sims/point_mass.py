@@ -42,12 +42,19 @@ class PointMass:
         if rows is None:
             self.state = state.clone()
         else:
-            # A new tensor, so that states handed out earlier stay as they were.
+            # New tensors, so that those handed out earlier stay as they were.
             self.state = self.state.index_copy(0, rows, state)
+            self.blocked = self.blocked.index_fill(0, rows, False)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2), clipped to ±1 m/s per axis; return the new state (B, 4)."""
         position = self.state[:, :2]
         moved, self.blocked = self.free.slide(position, position + action.clamp(-1.0, 1.0) * self.timestep_s)
         self.state = torch.cat([moved, (moved - position) / self.timestep_s], dim=-1)
+        return self.state
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Slide from `before` towards `landed`, both (B, 4); velocities are those of `landed`."""
+        position, self.blocked = self.free.slide(before[:, :2], landed[:, :2])
+        self.state = torch.cat([position, landed[:, 2:]], dim=-1)
         return self.state

@@ -3,28 +3,30 @@
 import torch
 from torch import Tensor
 
-from astra_data.free_space import FreeSpace
-from astra_data.simulator import SteppedSimulator
+from astra_data.simulator import PlacedSimulator
 
 
 class RandomizedSimulator:
-    """Step the simulator, add noise, keep the position in free space, set the simulator there.
+    """Step the simulator, add noise, and settle it there.
 
     Attributes:
         state: (B, X). blocked: (B,) bool, the last step was stopped at the edge of the free space.
     """
 
-    def __init__(self, simulator: SteppedSimulator, free: FreeSpace, noise_factor: Tensor) -> None:
+    def __init__(self, simulator: PlacedSimulator, noise_factor: Tensor) -> None:
         """Wrap `simulator`; the noise is `noise_factor` (X, X) times standard normal numbers."""
         self.simulator = simulator
-        self.free = free
         self.noise_factor = noise_factor
-        self.blocked = torch.zeros(len(simulator.state), dtype=torch.bool, device=simulator.state.device)
 
     @property
     def state(self) -> Tensor:
         """The scattered states, (B, X)."""
         return self.simulator.state
+
+    @property
+    def blocked(self) -> Tensor:
+        """Which were stopped at the edge of the free space, (B,) bool."""
+        return self.simulator.blocked
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set `rows` (n,), by default all, to `state` (n, X)."""
@@ -34,7 +36,4 @@ class RandomizedSimulator:
         """Apply `action` (B, A); return the new state (B, X)."""
         before = self.simulator.state
         landed = self.simulator.step(action)
-        landed = landed + torch.randn_like(landed) @ self.noise_factor.T
-        position, self.blocked = self.free.slide(before[:, :2], landed[:, :2])
-        self.simulator.reset_to(torch.cat([position, landed[:, 2:]], dim=-1))
-        return self.simulator.state
+        return self.simulator.settle(before, landed + torch.randn_like(landed) @ self.noise_factor.T)

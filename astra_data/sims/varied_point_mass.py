@@ -53,6 +53,8 @@ class VariedPointMass:
         """Set the rows in `rows` (n,), by default all, to `state` (n, 4)."""
         self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
         self.true_state = state.clone() if rows is None else self.true_state.index_copy(0, rows, state)
+        if rows is not None:
+            self.blocked = self.blocked.index_fill(0, rows, False)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2); return what is shown of the new state (B, 4)."""
@@ -71,4 +73,10 @@ class VariedPointMass:
         widths = torch.stack([of["position_noise_m"], of["velocity_noise_m_s"]], dim=-1)
         shown = torch.rand_like(self.true_state) * 2.0 - 1.0
         self.state = self.true_state + shown * widths.repeat_interleave(2, dim=-1)
+        return self.state
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Slide from `before` towards `landed`, both (B, 4); velocities are those of `landed`."""
+        position, self.blocked = self.free.slide(before[:, :2], landed[:, :2])
+        self.reset_to(torch.cat([position, landed[:, 2:]], dim=-1))
         return self.state

@@ -247,10 +247,10 @@ def _copied(
     """Return the steps `steps` of `episode` after `change`, with a goal of its own, judged by the task."""
     cut = {name: values[steps] for name, values in episode.columns.items()}
     moved = {column.name: change.of_column(column, cut[column.name]) for column in _moving(source)}
-    goal = world.navigation.draw_goals(rng, 1)[0].astype(np.float32)
+    goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
     columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
     before, after = (positions(world, columns[name]) for name in (STATE, NEXT_STATE))
-    judged = outcomes(world.navigation, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
+    judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
     length = len(judged[DONE])
     return Episode(
         uid,

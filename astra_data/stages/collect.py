@@ -9,6 +9,7 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
+from astra_data.batched import TargetEnv
 from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands
 from astra_data.columns import (
     ACTION,
@@ -27,7 +28,6 @@ from astra_data.columns import (
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
 from astra_data.digest import file_digest
-from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding
 from astra_data.policy_file import PolicyFile, deploy
@@ -241,7 +241,7 @@ def _record(
     return steps
 
 
-def _step(env: AntMazeEnv, behavior: Behavior, active: Tensor, *, last: bool) -> dict[str, Tensor]:
+def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> dict[str, Tensor]:
     state, goal = env.state, env.goal.clone()
     action = behavior.act(state, goal)
     outcome = env.step(action, active)

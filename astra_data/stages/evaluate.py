@@ -33,7 +33,7 @@ from astra_data.stopwatch import Stopwatch
 from astra_data.target_encoder_file import load_target_encoder
 from astra_data.tasks import Task, task_named
 from astra_data.training_world import WorldParts, training_world
-from astra_data.world import NavigationWorld
+from astra_data.world import SimulatorWorld
 
 Act = Callable[[Tensor, Tensor], Tensor]
 Begin = Callable[[Tensor], Act]
@@ -93,7 +93,7 @@ def evaluate(
     stopwatch = Stopwatch()
     told: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
     told |= origin()
-    simulators: dict[str, NavigationWorld] = {}
+    simulators: dict[str, SimulatorWorld] = {}
     headline: EncoderKind = "source"
     if policy is None:
         begin: Begin = partial(_follow, world)
@@ -130,7 +130,7 @@ def evaluate(
     told |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
     tensors = {"target.position": outcomes[headline].position}
     for name, simulated in simulators.items():
-        outcome = _in_simulator(simulated, begin, world.navigation.horizon, seed)
+        outcome = _in_simulator(simulated, begin, world.objective.horizon, seed)
         told[name] = outcome.to_json()
         if name == "simulated":
             tensors["simulated.position"] = outcome.position
@@ -172,13 +172,13 @@ def _in_target(
     )
     env.reset()
     act = begin(env.goal)
-    record = EpisodeRecord(env.state[:, :2])
+    record = EpisodeRecord(env.position)
     began = time.perf_counter()
-    for step in range(task.navigation.horizon):
+    for step in range(task.objective.horizon):
         outcome = env.step(act(env.state, env.goal), record.active)
-        record.add(env.state[:, :2], outcome.reward, outcome.success, env.toppled, env.wall_contact)
+        record.add(env.position, outcome.reward, outcome.success, env.failed, env.wall_contact)
         rate = record.total_steps / (time.perf_counter() - began)
-        progress((step + 1) / task.navigation.horizon * 0.99, f"{rate:,.0f} target steps/s")
+        progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
             break
     return record.outcome(), rate
@@ -187,28 +187,28 @@ def _in_target(
 def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str, Tensor]:
     env = task.target(config.episodes, seed=derive(seed, "evaluation"), num_threads=1)
     env.reset()
-    return {"start": env.state[:, :2], "goal": env.goal}
+    return {"start": env.position, "goal": env.goal}
 
 
 def _own_world(
     task: Task, simulation: Simulation, grounding: Grounding | None, config: EvaluateConfig
-) -> NavigationWorld:
+) -> SimulatorWorld:
     parts = WorldParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
     return training_world(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
 
 
-def _shared_worlds(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, NavigationWorld]:
+def _shared_worlds(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorWorld]:
     groundings: dict[str, Grounding | None] = {"raw": None}
     if reference is not None:
         groundings["grounded"] = load_grounding(reference / "grounding.safetensors")
     return {
-        name: NavigationWorld(task.navigation, simulator_of(task, grounding, config.episodes, "cpu"))
+        name: SimulatorWorld(task.objective, simulator_of(task, grounding, config.episodes, "cpu"))
         for name, grounding in groundings.items()
     }
 
 
 @torch.no_grad()
-def _in_simulator(world: NavigationWorld, begin: Begin, horizon: int, seed: int) -> Outcome:
+def _in_simulator(world: SimulatorWorld, begin: Begin, horizon: int, seed: int) -> Outcome:
     """Return what happened in `world`, from the task's starts, which are the same in all worlds."""
     torch.manual_seed(derive(seed, "simulated evaluation"))
     world.reset()
@@ -217,7 +217,7 @@ def _in_simulator(world: NavigationWorld, begin: Begin, horizon: int, seed: int)
     for _ in range(horizon):
         step = world.step(act(world.simulator.state, world.goal))
         blocked = world.simulator.blocked
-        record.add(world.simulator.state[:, :2], step.reward, step.success, world.toppled, blocked)
+        record.add(world.simulator.state[:, :2], step.reward, step.success, world.failed, blocked)
         if not record.active.any():
             break
     return record.outcome()

@@ -72,7 +72,7 @@ def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> N
     env = placed([[-4, 4], [-4, 4]])
     rolled(env, [0], np.radians(degrees))
     step = env.step(torch.zeros(2, 2))
-    assert env.toppled.tolist() == [toppled, False]
+    assert env.failed.tolist() == [toppled, False]
     assert step.terminated.tolist() == [toppled, False]
     assert float(step.reward[0]) == pytest.approx(-10.0 * toppled, abs=0.1)
 
@@ -151,7 +151,7 @@ def test_zero_command_stands_still() -> None:
     for _ in range(60):
         env.step(torch.zeros(2, 2))
     assert float((env.state[:, :2] - start).norm(dim=1).max()) < 0.5
-    assert not env.toppled.any()
+    assert not env.failed.any()
     speeds = []
     for _ in range(20):
         env.step(torch.zeros(2, 2))

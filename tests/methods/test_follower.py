@@ -7,7 +7,7 @@ from astra_data.tasks import TASKS
 
 def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
     task = TASKS["antmaze-umaze"]
-    navigation, maze = task.navigation, task.maze
+    navigation, maze = task.objective, task.maze
     rng = np.random.default_rng(0)
     goal = torch.from_numpy(navigation.draw_goals(rng, 3)).float()
     simulator = task.simulator(3)

@@ -28,7 +28,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
 def test_results_are_the_ones_worked_out_by_hand(results: Results) -> None:
     astra = results.methods["astra"]
     assert astra.success == [0.5, 0.25, 0.75]
-    assert astra.topple == [0.5, 0.75, 0.25]
+    assert astra.failed == [0.5, 0.75, 0.25]
     assert astra.wall_contact == pytest.approx([0.1, 0.2, 0.3])
     assert astra.steps == [115.0, 115.0, 115.0]
     assert astra.returns == [0.0, 1.0, 2.0]

@@ -8,7 +8,7 @@ from astra_data.sims.randomized import RandomizedSimulator
 
 def simulators(num_envs: int, factor: torch.Tensor) -> tuple[PointMass, RandomizedSimulator]:
     inner = PointMass(U_MAZE, num_envs, timestep_s=0.05)
-    return inner, RandomizedSimulator(inner, inner.free, factor)
+    return inner, RandomizedSimulator(inner, factor)
 
 
 def test_no_noise_is_the_simulator_itself() -> None:

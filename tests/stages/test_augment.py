@@ -24,6 +24,7 @@ from astra_data.columns import (
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
+from astra_data.navigation import Navigation
 from astra_data.progress import silent
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.pair import PairConfig, pair
@@ -171,7 +172,8 @@ def test_copies_and_what_they_copy_keep_out_of_the_walls_reach(collected: Path, 
 
 
 def test_copies_are_judged_with_a_goal_of_their_own(collected: Path, augmented: Path) -> None:
-    navigation = TASKS[TASK].navigation
+    navigation = TASKS[TASK].objective
+    assert isinstance(navigation, Navigation)
     goals = set()
     for copy, cut in copies(Dataset.open(collected), Dataset.open(augmented)):
         columns = copy.columns

@@ -13,6 +13,7 @@ from astra_data.checkpoint import load_tensors
 from astra_data.errors import BadInputError
 from astra_data.learners.rma import RmaConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.navigation import Navigation
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
@@ -40,14 +41,14 @@ def make(
 
 def check_outcome(outcome: dict[str, list[float]], position: Tensor) -> None:
     """Check the lists of one world against each other and against the paths."""
-    assert outcome.keys() == {"success", "topple", "wall_contact", "steps", "return"}
+    assert outcome.keys() == {"success", "failed", "wall_contact", "steps", "return"}
     assert all(len(values) == CONFIG.episodes for values in outcome.values())
     assert position.shape[0] == CONFIG.episodes
     assert position.shape[2] == 2
     for episode in range(CONFIG.episodes):
         steps = int(outcome["steps"][episode])
         assert 1 <= steps <= HORIZON
-        ended = outcome["success"][episode] + outcome["topple"][episode]
+        ended = outcome["success"][episode] + outcome["failed"][episode]
         assert ended in ((0, 1) if steps == HORIZON else (1,))
         assert 0 <= outcome["wall_contact"][episode] <= 1
         assert math.isfinite(outcome["return"][episode])
@@ -142,8 +143,10 @@ def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
 def test_an_episode_ends_with_its_success(
     task: str, trained: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    navigation = replace(TASKS[task].navigation, success_radius_m=100.0)
-    monkeypatch.setitem(TASKS, "antmaze-near", replace(TASKS[task], navigation=navigation))
+    usual = TASKS[task].objective
+    assert isinstance(usual, Navigation)
+    objective = replace(usual, success_radius_m=100.0)
+    monkeypatch.setitem(TASKS, "antmaze-near", replace(TASKS[task], objective=objective))
     told, paths = make("antmaze-near", "astra", tmp_path / "out", {"policy": trained, "grounding": grounded})
     for world in ("target", "simulated"):
         check_outcome(told[world], paths[f"{world}.position"])

@@ -85,7 +85,7 @@ def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN
     assert row["return"] == [0.0, 1.0, 2.0]
     assert set(row["summary"]) == {
         "success",
-        "topple",
+        "failed",
         "wall_contact",
         "steps",
         "return",

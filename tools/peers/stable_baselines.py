@@ -18,7 +18,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from astra_data.gymnasium_faces import Array, SeededNavigationWorld, WorldEnv, WorldVectorEnv
+from astra_data.gymnasium_faces import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
 from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.recipe import load_recipe
 from astra_data.request import Recipe
@@ -50,10 +50,10 @@ def main(algorithm: Algorithm, face: Face) -> None:
     task, config = TASKS[settings.task], settings.train
     shape = GroundingShape(state_size=4, action_size=2, goal_size=2)
     model = GroundingModel(shape).requires_grad_(False) if algorithm is Algorithm.ppo else None
-    horizon = task.navigation.horizon
+    horizon = task.objective.horizon
 
-    def world(num_envs: int) -> SeededNavigationWorld:
-        return SeededNavigationWorld(task.navigation, simulator_of(task, model, num_envs, "cpu"))
+    def world(num_envs: int) -> SeededSimulatorWorld:
+        return SeededSimulatorWorld(task.objective, simulator_of(task, model, num_envs, "cpu"))
 
     def single() -> gymnasium.Env[Array, Array]:
         return gymnasium.wrappers.TimeLimit(WorldEnv(world(1)), horizon)

@@ -1,0 +1,51 @@
+"""What a task asks for, on abstract states: the same in every world, so that rewards compare."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.mazes import Maze
+
+
+@dataclass(frozen=True)
+class Objective(ABC):
+    """Starts, goals, what a policy is shown, and how steps are judged; states are abstract ones, (..., X).
+
+    Attributes:
+        maze: where it happens. horizon: steps until an episode is cut off.
+        ends_at_walls: whether touching a wall is a failure, which ends an episode.
+        success_reward: for reaching the goal. failure_reward: for ending badly.
+    """
+
+    maze: Maze
+    horizon: int
+    ends_at_walls: bool = field(default=False, kw_only=True)
+    success_reward: float = field(default=10.0, kw_only=True)
+    failure_reward: float = field(default=-10.0, kw_only=True)
+
+    @abstractmethod
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X), at rest, where the task starts."""
+
+    @abstractmethod
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X), at rest, anywhere in the free space."""
+
+    @abstractmethod
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw goals (count, G)."""
+
+    @abstractmethod
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Assemble what a policy sees of states (..., X) and goals (..., G), each part about one long."""
+
+    @abstractmethod
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
+
+    @abstractmethod
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states (B, X), which perhaps ended badly (B,)."""
