@@ -9,7 +9,7 @@ from torch import Tensor
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.world import limit_command, policy_observation
 
 EncoderKind = Literal["target", "source"]

@@ -17,7 +17,7 @@ from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Positive, Share
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import Task
+from astra_data.task import Task
 
 _CHECKPOINT_EVERY = 250
 

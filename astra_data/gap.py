@@ -11,11 +11,13 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.seeding import derive, generator
 from astra_data.simulators import hidden_before, simulator_of, start_simulator
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.variation import Variation
 
 HORIZONS = (1, 10, 50, 200)
 _START_EVERY = 25
+QUANTITIES = ("position_m", "velocity_m_s", "ball_position_m", "ball_velocity_m_s")
+"""What abstract states are made of, two entries each; those without a ball end before it."""
 
 
 @torch.no_grad()
@@ -60,14 +62,14 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         if step + 1 in horizons:
             for name, state in states.items():
                 wrong = state - windows.next_state[episode, now]
-                both = torch.stack([wrong[:, :2].norm(dim=-1), wrong[:, 2:].norm(dim=-1)], dim=-1)
-                both[start + step >= lengths[episode]] = torch.nan
-                errors[name][step + 1] = both
+                apart = wrong.unflatten(-1, (-1, 2)).norm(dim=-1)
+                apart[start + step >= lengths[episode]] = torch.nan
+                errors[name][step + 1] = apart
     rng = generator(seed, "gap bootstrap")
     report: dict[str, Any] = {"horizons": horizons, "replays": len(pairs)}
     for name, by_horizon in errors.items():
         report[name] = {}
-        for index, quantity in enumerate(("position_m", "velocity_m_s")):
+        for index, quantity in enumerate(QUANTITIES[: windows.state.shape[-1] // 2]):
             rows = [_interval(by_horizon[h][:, index], episode, rng) for h in horizons]
             report[name][quantity] = dict(zip(("mean", "low", "high"), zip(*rows, strict=True), strict=True))
     return report

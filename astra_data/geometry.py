@@ -7,7 +7,9 @@ its right; a robot that is its own mirror image does not feel that either.
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from astra_data.columns import Array, Column
 from astra_data.errors import BadInputError
@@ -106,3 +108,10 @@ class PlanarMap:
         if self.reflected and column.mirror is None:
             return [f"{column.name}: the mirror image of its invariant values is not told"]
         return []
+
+
+def turned(vector: Tensor, angle_rad: Tensor) -> Tensor:
+    """Turn planar vectors (..., 2) to the left by angles (...)."""
+    cos, sin = angle_rad.cos(), angle_rad.sin()
+    x, y = vector.unbind(-1)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from astra_data.tasks import Task
+from astra_data.task import Task
 
 _ROBOTS = 60
 _COMMANDS = (((0.8, 0.0), 2.0), ((0.0, 0.8), 1.0), ((-0.8, 0.0), 2.0), ((0.0, -0.8), 1.0), ((0.0, 0.0), 2.0))

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -45,6 +46,10 @@ class Objective(ABC):
     @abstractmethod
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
+        return torch.zeros(len(state), dtype=torch.bool, device=state.device)
 
     @abstractmethod
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.adaptation import AdaptiveShape, Student
 from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.training_world import WorldConfig
 from astra_data.variation import Variation
 

@@ -20,7 +20,7 @@ from astra_data.columns import (
 )
 from astra_data.geometry import PlanarMap
 from astra_data.objective import Objective
-from astra_data.tasks import Task
+from astra_data.task import Task
 
 Rotations = Literal["quarter", "any", "none"]
 

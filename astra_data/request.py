@@ -104,7 +104,7 @@ class Recipe(Config):
     @property
     def compass_uniform(self) -> Variation:
         """What `compass_uniform` varies."""
-        return self.compass.variation
+        return self.compass.ranges_for(TASKS[self.task])
 
     @model_validator(mode="before")
     @classmethod

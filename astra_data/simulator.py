@@ -43,3 +43,7 @@ class AbstractSimulator(SteppedSimulator, Protocol):
     def parameters(self) -> Mapping[str, float]:
         """What a dataset paired with this simulator records about it."""
         ...
+
+
+class PairedSimulator(PlacedSimulator, AbstractSimulator, Protocol):
+    """The abstract simulator of a task."""

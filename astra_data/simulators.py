@@ -9,13 +9,15 @@ from astra_data.models.grounding import GroundingModel, Windows
 from astra_data.models.residual import ResidualModel
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
-from astra_data.sims.point_mass import PointMass
 from astra_data.sims.randomized import RandomizedSimulator
+from astra_data.sims.varied_ball_agent import VariedBallAgent
 from astra_data.sims.varied_point_mass import VariedPointMass
-from astra_data.tasks import Task
-from astra_data.variation import Variation
+from astra_data.simulator import PlacedSimulator
+from astra_data.task import Task
+from astra_data.variation import Variation, VariedSimulator
 
-Simulator = PointMass | VariedPointMass | RandomizedSimulator | GroundedSimulator | AugmentedSimulator
+Simulator = PlacedSimulator | RandomizedSimulator | GroundedSimulator | AugmentedSimulator
+"""As it is, or in one of the wrappers."""
 
 
 def simulator_of(
@@ -39,7 +41,7 @@ def simulator_of(
     """
     if isinstance(grounding, Variation):
         variation = grounding
-    inner: PointMass | VariedPointMass
+    inner: PlacedSimulator
     if variation is None:
         inner = task.simulator(num_envs, device)
     else:
@@ -102,7 +104,7 @@ def start_simulator(
         varied.redraw(rows)
 
 
-def varied_within(simulator: Simulator) -> VariedPointMass | None:
+def varied_within(simulator: Simulator) -> VariedSimulator | None:
     """Return the simulator with varying parameters inside `simulator`, if there is one."""
     inner = simulator.simulator if isinstance(simulator, RandomizedSimulator) else simulator
-    return inner if isinstance(inner, VariedPointMass) else None
+    return inner if isinstance(inner, VariedPointMass | VariedBallAgent) else None

@@ -8,7 +8,7 @@ from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.progress import Progress
 from astra_data.seeding import derive
 from astra_data.target_world import TargetWorld
-from astra_data.tasks import Task
+from astra_data.task import Task
 
 _ENVS = 128
 """Targets that it is trained in."""

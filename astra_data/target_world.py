@@ -9,7 +9,7 @@ from torch import Tensor
 from astra_data.batched import Step
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.deployment import Observed, target_observation
-from astra_data.tasks import Task
+from astra_data.task import Task
 
 
 @dataclass(frozen=True)

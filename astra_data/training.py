@@ -24,7 +24,7 @@ from astra_data.progress import Progress
 from astra_data.recipe import Config, Count
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.training_world import WorldConfig, training_world, world_parts
 from astra_data.variation import Variation
 from astra_data.world import RewardSource, SimulatorWorld

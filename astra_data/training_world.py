@@ -9,12 +9,13 @@ from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import scatter_factor
+from astra_data.free_space import FreeSpace
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.residual import ResidualModel
 from astra_data.recipe import Config, NotNegative, Positive, Share
 from astra_data.simulators import hidden_before, simulator_of
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.variation import Variation
 from astra_data.world import DataStarts, RewardSource, SimulatorWorld
 
@@ -101,7 +102,7 @@ def world_parts(
 
 
 def _thinness(task: Task, positions: Tensor, density: float) -> Tensor:
-    free = task.simulator(1, str(positions.device)).free
+    free = FreeSpace.of_maze(task.maze, radius_m=0.0, device=str(positions.device))
     height, width = free.blocked.shape
     rows, columns = free.cells(positions)
     counts = torch.bincount(rows * width + columns, minlength=height * width).reshape(height, width)

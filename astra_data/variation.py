@@ -1,13 +1,15 @@
-"""Variation: how the parameters of the planar point mass differ from episode to episode."""
+"""Variation: how the parameters of planar simulators differ from episode to episode."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import torch
 from pydantic import AfterValidator
 from torch import Tensor
 
+from astra_data.geometry import turned
 from astra_data.recipe import Config
+from astra_data.simulator import PlacedSimulator
 
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
@@ -55,19 +57,29 @@ class Variation(Config):
     timestep_scale: FactorRange = (1.0, 1.0)
     """Factor on the control period."""
 
-    @classmethod
-    def of_json(cls, ranges: Mapping[str, Sequence[float]]) -> "Variation":
+    @staticmethod
+    def of_json(ranges: Mapping[str, Sequence[float]]) -> "Variation":
         """Return what `model_dump` gave, after a way through JSON."""
-        return cls(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
+        kind = BallVariation if "ball_friction" in ranges else Variation
+        return kind(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters, in the order of their columns."""
+        return tuple(type(self).model_fields)
 
     def noiseless(self) -> "Variation":
         """Return the same ranges without any noise."""
-        names = (name for name in PARAMETERS if "noise" in name)
+        names = (name for name in self.names if "noise" in name)
         return self.model_copy(update=dict.fromkeys(names, (0.0, 0.0)))
 
     def ranges(self) -> Tensor:
-        """Return lower and upper end of every parameter, (P, 2), in the order of `PARAMETERS`."""
-        return torch.tensor([getattr(self, name) for name in PARAMETERS])
+        """Return lower and upper end of every parameter, (P, 2), in the order of `names`."""
+        return torch.tensor([getattr(self, name) for name in self.names])
+
+    def by_name(self, parameters: Tensor) -> dict[str, Tensor]:
+        """Return the columns (B,) of `parameters` (B, P) by their names."""
+        return dict(zip(self.names, parameters.unbind(-1), strict=True))
 
     def draw(self, count: int, device: torch.device | str = "cpu") -> Tensor:
         """Draw the parameters (count, P) of as many episodes, from torch's global generator."""
@@ -82,8 +94,18 @@ class Variation(Config):
         return torch.where(half > 0, (parameters - middle) / half.clamp_min(1e-9), 0.0)
 
 
-PARAMETERS = tuple(Variation.model_fields)
-"""The names of the parameters, in the order of their columns."""
+class BallVariation(Variation):
+    """Ranges of the parameters of an episode with a ball."""
+
+    ball_friction: FactorRange = (1.0, 1.0)
+    """Factor on the deceleration of the rolling ball."""
+    ball_position_noise_m: NoiseRange = (0.0, 0.0)
+    """Half width of the uniform noise on shown positions of the ball."""
+    ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)
+    """Half width of the uniform noise on shown velocities of the ball."""
+    contact_direction_deg: Range = (0.0, 0.0)
+    """The ball leaves a contact turned by this angle."""
+
 
 RANDOMIZED_ACTIONS = Variation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
 """Of domain randomization in navigation, as printed (Section V-A)."""
@@ -99,3 +121,35 @@ WIDE_RANGES = Variation(
 )
 """Of COMPASS in navigation, as printed (Section V-A): a control period of 0.015 to 0.025 s is read as shares
 of one of 0.02 s."""
+
+
+def varied_command(of: Mapping[str, Tensor], action: Tensor) -> Tensor:
+    """Return what becomes of commands (B, 2): noisy, cut, turned, scaled, by the parameters `of` (B,) each.
+
+    Noise is drawn from torch's global generator.
+    """
+    noise = of["action_noise"].unsqueeze(-1) * torch.randn_like(action)
+    command = (action + noise).clamp(-1.0, 1.0)
+    steered = turned(command, torch.deg2rad(of["heading_bias_deg"]))
+    return (of["friction"] * (1.0 + of["action_scale"])).unsqueeze(-1) * steered
+
+
+class VariedSimulator(PlacedSimulator, Protocol):
+    """A simulator whose parameters vary from row to row.
+
+    Attributes:
+        parameters: (B, P), in the order of the variation's `names`.
+        true_state: the states behind the noise of the sensors, (B, X).
+    """
+
+    parameters: Tensor
+    true_state: Tensor
+
+    @property
+    def variation(self) -> Variation:
+        """The ranges of the parameters."""
+        ...
+
+    def redraw(self, rows: Tensor) -> None:
+        """Draw new parameters for the rows `rows` (n,)."""
+        ...

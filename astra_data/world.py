@@ -160,9 +160,9 @@ class SimulatorWorld:
         latent = None if self.grounded is None else self.grounded.latent
         after = self.simulator.step(action)
         success = self.objective.reached(after, self.goal)
-        self.failed = torch.zeros_like(success)
+        self.failed = self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:
-            self.failed = self.simulator.blocked & ~success
+            self.failed = self.failed | (self.simulator.blocked & ~success)
         penalty = torch.zeros(self.num_envs, device=self.device)
         if self.thinness is not None:
             penalty = -self.thinness[self.free.cells(after[:, :2])]

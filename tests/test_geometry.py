@@ -18,7 +18,8 @@ from astra_data.mazes import Maze
 from astra_data.navigation import Navigation
 from astra_data.physics import BatchedPhysics
 from astra_data.sims.point_mass import PointMass
-from astra_data.tasks import TASKS, Task
+from astra_data.task import Task
+from astra_data.tasks import TASKS
 
 angles = st.floats(-10, 10)
 metres = st.floats(-20, 20)

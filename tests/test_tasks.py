@@ -3,7 +3,9 @@ import pytest
 import torch
 
 from astra_data.errors import BadInputError
-from astra_data.tasks import TASKS, Task, task_named
+from astra_data.free_space import FreeSpace
+from astra_data.task import Task
+from astra_data.tasks import TASKS, task_named
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -19,8 +21,9 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     abstract = task.abstraction(env.state)
     simulator = task.simulator(2)
     assert abstract.shape == simulator.state.shape == (2, task.abstract_state.size)
-    assert simulator.timestep_s == task.timestep_s
-    assert not simulator.free.blocked[simulator.free.cells(abstract[:, :2])].any()
+    assert simulator.parameters["timestep_s"] == task.timestep_s
+    free = FreeSpace.of_maze(task.maze, radius_m=0.1)
+    assert not free.blocked[free.cells(abstract[:, :2])].any()
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)

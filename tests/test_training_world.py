@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.free_space import FreeSpace
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
@@ -72,7 +73,7 @@ def test_scatter_is_what_the_simulator_does_not_explain(
     config = WorldConfig(residual_noise=2.0)
     parts = world_parts(TASK, config, episodes, None)
     world = training_world(TASK, config, parts, None, num_envs=1, device="cpu")
-    assert type(world.simulator) is RandomizedSimulator
+    assert isinstance(world.simulator, RandomizedSimulator)
     deviations = (parts.scatter @ parts.scatter.T).diagonal().sqrt()
     torch.testing.assert_close(deviations, 2 * torch.tensor([0.01, 0.02, 0.1, 0.2]), rtol=0.1, atol=0)
     model.residual_factor.copy_(torch.eye(4))
@@ -81,7 +82,7 @@ def test_scatter_is_what_the_simulator_does_not_explain(
 
 def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
     thinness = world_parts(TASK, WorldConfig(), episodes, None).thinness
-    cells = TASK.simulator(1).free.cells
+    cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     far = HERE + torch.tensor([[1.5, 0.0], [0.0, -1.5]])
     assert (thinness[cells(far)] == 1.0).all()
     visited = episodes.steps(episodes.windows.state)[:, :2]

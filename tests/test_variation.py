@@ -5,13 +5,13 @@ from pydantic import ValidationError, create_model
 from astra_data.errors import RecipeError
 from astra_data.methods.compass import CompassConfig
 from astra_data.recipe import Config, validated
-from astra_data.variation import PARAMETERS, Variation
+from astra_data.variation import Variation
 
 
 def test_parameters_are_drawn_uniformly_from_their_ranges() -> None:
     torch.manual_seed(0)
     variation = Variation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
-    drawn = dict(zip(PARAMETERS, variation.draw(20_000).unbind(-1), strict=True))
+    drawn = dict(zip(variation.names, variation.draw(20_000).unbind(-1), strict=True))
     assert (drawn["timestep_scale"] == 1.0).all() and (drawn["action_noise"] == 0.0).all()
     for name, (low, high) in {"friction": (0.8, 1.2), "heading_bias_deg": (-5.0, 5.0)}.items():
         assert low <= float(drawn[name].min()) and float(drawn[name].max()) <= high

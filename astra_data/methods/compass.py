@@ -16,30 +16,32 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.checkpoint import load_tensors, save_tensors
-from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.fitting import Fitting
+from astra_data.gap import QUANTITIES
 from astra_data.method import Method
 from astra_data.models.causal import CausalConfig, descend, fit_causes
 from astra_data.recipe import Count
+from astra_data.replays import Recorded, beginnings, trajectory_gaps
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.training import SimulatorPpo
-from astra_data.variation import PARAMETERS, WIDE_RANGES, FactorRange, NoiseRange, Range, Variation
+from astra_data.variation import WIDE_RANGES, BallVariation, FactorRange, NoiseRange, Range, Variation
 
-STEERING = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
+STEERING = (
+    *("friction", "action_scale", "heading_bias_deg", "timestep_scale"),
+    *("ball_friction", "contact_direction_deg"),
+)
 """What is identified. The others are noise, with which no replay comes closer to a recording, however noisy
 the target is: noise keeps its ranges, and is drawn from them while the policy is trained."""
 
-GAPS = ("position_m", "velocity_m_s")
-"""The effects: means over a window of the distance between the simulator's and the target's."""
-
 Mask = dict[str, dict[str, float]]
-"""How probably each parameter reaches each gap, by their names."""
+"""How probably each parameter reaches each gap, by their names. Gaps, the effects, are means over a window of
+the distance between the simulator's and the target's `QUANTITIES`."""
 
 
-class CompassConfig(Variation, CausalConfig):
+class CompassConfig(BallVariation, CausalConfig):
     """Ranges of the parameters, as the paper prints them (Section V-A), and how they are identified.
 
     The paper prints a control period of 0.015 to 0.025 s, which is read as shares of one of 0.02 s. It prints
@@ -78,75 +80,15 @@ class CompassConfig(Variation, CausalConfig):
     the plain simulator; or around it, with parameters from the last ranges, which are still the whole ranges
     of what was not identified."""
 
-    @property
-    def variation(self) -> Variation:
-        """The ranges by themselves."""
-        return Variation(**{name: getattr(self, name) for name in PARAMETERS})
+    def ranges_for(self, task: Task) -> Variation:
+        """Return the ranges of the parameters that the simulator of `task` has."""
+        kind = type(task.ranges)
+        return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """W windows of H steps of the target: `state` (W, X), `action` (W, H, A) and `next_state` (W, H, X)."""
-
-    state: Tensor
-    action: Tensor
-    next_state: Tensor
-
-    @classmethod
-    def at(cls, episodes: PairedEpisodes, episode: Tensor, first: Tensor, length: int) -> "Recorded":
-        """Cut windows of `length` steps out of `episode` (W,) from step `first` (W,) on."""
-        windows, steps = episodes.windows, first[:, None] + torch.arange(length, device=first.device)
-        rows = episode[:, None], steps
-        return cls(windows.state[episode, first], windows.action[rows], windows.next_state[rows])
-
-    @classmethod
-    def side_by_side(cls, episodes: PairedEpisodes, length: int) -> "Recorded":
-        """Cut all episodes into windows of `length` steps that do not overlap."""
-        episode, first = beginnings(episodes, length)
-        chosen = first % length == 0
-        return cls.at(episodes, episode[chosen], first[chosen], length)
-
-    @property
-    def summary(self) -> Tensor:
-        """What the causal model knows of a window: first velocity and mean command, (W, 4)."""
-        return torch.cat([self.state[:, 2:], self.action.mean(1)], dim=-1)
-
-
-def beginnings(episodes: PairedEpisodes, length: int) -> tuple[Tensor, Tensor]:
-    """Return episode and first step, (N,) each, of every window of `length` steps.
-
-    Raises:
-        BadInputError: no episode is that long.
-    """
-    steps = torch.arange(episodes.windows.mask.shape[1], device=episodes.lengths.device)
-    begins = (steps <= (episodes.lengths - length)[:, None]).nonzero()
-    if not len(begins):
-        raise BadInputError(
-            f"{episodes.reference}: expected episodes of at least {length} steps, the longest has "
-            f"{int(episodes.lengths.max())}: shorten `window` in [compass]"
-        )
-    return begins[:, 0], begins[:, 1]
-
-
-@torch.no_grad()
-def trajectory_gaps(task: Task, recorded: Recorded, parameters: Tensor, seed: int) -> Tensor:
-    """Replay W windows with each of `parameters` (C, P) and the same noise; return their `GAPS` (C, W, 2)."""
-    count, length = recorded.action.shape[:2]
-    simulator = task.varied_simulator(count, Variation(), str(recorded.state.device))
-    gaps = []
-    for context in parameters:
-        torch.manual_seed(seed)
-        simulator.parameters = context.expand(count, -1)
-        simulator.reset_to(recorded.state)
-        wrong = [simulator.step(recorded.action[:, i]) - recorded.next_state[:, i] for i in range(length)]
-        errors = torch.stack(wrong).unflatten(-1, (2, 2))  # (H, W, position or velocity, x or y)
-        gaps.append(errors.norm(dim=-1).mean(0))
-    return torch.stack(gaps)
-
-
-def parameters_at(point: Mapping[str, float]) -> Tensor:
+def parameters_at(point: Mapping[str, float], kind: type[Variation] = Variation) -> Tensor:
     """Return the parameters (P,) of a simulator without noise that is plain but for `point`."""
-    return Variation(**{name: (value, value) for name, value in point.items()}).ranges()[:, 0]
+    return kind(**{name: (value, value) for name, value in point.items()}).ranges()[:, 0]
 
 
 @dataclass
@@ -169,8 +111,9 @@ class Search:
         if checkpoint.exists():
             _, told = load_tensors(checkpoint)
             return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
-        plain = Variation()
-        point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in STEERING}
+        plain = type(ranges)()
+        steering = [name for name in ranges.names if name in STEERING]
+        point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in steering}
         return cls(ranges, point, [], None)
 
     def save(self, checkpoint: Path) -> None:
@@ -184,7 +127,7 @@ class Search:
             reach = shrink * (box[name][1] - box[name][0]) / 2
             ends = self.point[name] - reach, self.point[name] + reach
             box[name] = tuple(_within(end, box[name]) for end in ends)
-        self.box = Variation(**box)
+        self.box = type(self.box)(**box)
 
 
 def _within(value: float, ends: tuple[float, float]) -> float:
@@ -206,16 +149,17 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
     """
     config = fitting.settings if isinstance(fitting.settings, CompassConfig) else CompassConfig()
     checkpoint = fitting.folder / "checkpoint.safetensors"
-    if not set(STEERING).intersection(_varied(config.variation)):
+    ranges = config.ranges_for(fitting.task)
+    if not set(STEERING).intersection(_varied(ranges)):
         raise BadInputError(f"[compass]: expected a range for at least one of {', '.join(STEERING)}")
     held_out = Recorded.side_by_side(fitting.held_out, config.window)
 
     def held_out_gap(point: Mapping[str, float]) -> dict[str, float]:
-        at = parameters_at(point).unsqueeze(0).to(fitting.device)
+        at = parameters_at(point, type(ranges)).unsqueeze(0).to(fitting.device)
         gaps = trajectory_gaps(fitting.task, held_out, at, fitting.seed)
-        return dict(zip(GAPS, gaps.mean((0, 1)).tolist(), strict=True))
+        return dict(zip(QUANTITIES, gaps.mean((0, 1)).tolist(), strict=False))
 
-    search, plain = Search.begin(config.variation, checkpoint), held_out_gap({})
+    search, plain = Search.begin(ranges, checkpoint), held_out_gap({})
     stopwatch, replays = Stopwatch(search.spent), config.contexts * config.windows
     for iteration in range(len(search.found), config.iterations):
         mask = _iterate(search, config, fitting, f"compass {iteration}")
@@ -230,7 +174,7 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
     grounding = search.box
     if config.policy_at == "point":
         ends = {name: (value, value) for name, value in search.point.items()}
-        grounding = Variation(**(search.box.model_dump() | ends))
+        grounding = type(ranges)(**(search.box.model_dump() | ends))
     return grounding, {
         "replays_per_second": config.iterations * replays / stopwatch.seconds,
         **stopwatch.spent(),
@@ -260,7 +204,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     difference = (gaps - of_window)[:, usual]
     scale = difference.std((0, 1)).clamp_min(1e-9)
     varied = _varied(box)
-    columns = [PARAMETERS.index(parameter) for parameter in varied]
+    columns = [box.names.index(parameter) for parameter in varied]
     summary = recorded.summary[usual]
     parameters = box.normal(contexts)[:, None, columns].expand(-1, len(summary), -1)
     cause = torch.cat([parameters, summary.expand(len(contexts), -1, -1)], dim=-1)
@@ -270,7 +214,8 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     mask = (model.probability > config.mask_threshold).float()
     steers = torch.tensor([parameter in STEERING for parameter in varied], device=device)
     moves = mask[: len(varied)].any(-1) & steers
-    here = box.normal(parameters_at(search.point))[columns].to(device)
+    kind = type(box)
+    here = box.normal(parameters_at(search.point, kind))[columns].to(device)
     there = descend(model, mask, here, moves, summary).cpu()
     low, high = box.ranges()[columns].unbind(-1)
     values = low + (there + 1.0) / 2.0 * (high - low)
@@ -279,13 +224,14 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
         for parameter, value, moving in zip(varied, values.tolist(), moves.tolist(), strict=True)
         if moving
     }
-    both = torch.stack([parameters_at(search.point), parameters_at(search.point | moved)]).to(device)
+    points = (search.point, search.point | moved)
+    both = torch.stack([parameters_at(point, kind) for point in points]).to(device)
     before, after = (trajectory_gaps(fitting.task, recorded, both, noise)[:, usual] / scale).mean((1, 2))
     # The model is smooth where the gap has its edge: the simulator has the last word.
     if after < before:
         search.point |= moved
     search.narrow(moved, config.shrink)
-    rows = (dict(zip(GAPS, row, strict=True)) for row in model.probability.tolist())
+    rows = (dict(zip(QUANTITIES, row, strict=False)) for row in model.probability.tolist())
     return dict(zip(varied, rows, strict=False))
 
 

@@ -21,7 +21,7 @@ from astra_data.models.history import PositionFeatures
 from astra_data.policy_file import PolicyFile
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import Task
+from astra_data.task import Task
 from astra_data.training import Training
 from astra_data.world import policy_observation
 

@@ -20,7 +20,6 @@ from astra_data.policy_file import PolicyFile
 from astra_data.progress import part
 from astra_data.seeding import derive
 from astra_data.training import SimulatorPpo, Training, optimise
-from astra_data.variation import WIDE_RANGES
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,8 @@ class TeacherThenStudent(SimulatorPpo):
         """Return the student, and the teacher's learning curve with the student's as "adaptation"."""
         config, seed = training.config, training.seed
         settings = training.settings if isinstance(training.settings, RmaConfig) else RmaConfig()
-        env, simulation = self.world(training, tells_parameters=True)
+        told = replace(self, variation=training.task.ranges)
+        env, simulation = told.world(training, tells_parameters=True)
         torch.manual_seed(derive(seed, "policy"))
         shape = AdaptiveShape(
             observation_size=env.observation_size - env.parameter_count,
@@ -61,5 +61,5 @@ class TeacherThenStudent(SimulatorPpo):
 RMA = Method(
     name="rma",
     title="RMA",
-    learn=TeacherThenStudent(variation=WIDE_RANGES),
+    learn=TeacherThenStudent(),
 )

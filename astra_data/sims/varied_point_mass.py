@@ -5,18 +5,18 @@ from torch import Tensor
 
 from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
-from astra_data.variation import PARAMETERS, Variation
+from astra_data.variation import Variation, varied_command
 
 
 class VariedPointMass:
     """B point masses like those of `PointMass`, each with its own parameters (see `Variation`).
 
-    A command gets noise, is clipped to ±1 m/s per axis, scaled and turned; the mass follows it for one
+    A command gets noise, is clipped to ±1 per axis, scaled and turned; the mass follows it for one
     control period of its own length. What `state` shows is where it is plus the noise of the sensors; noise
     is drawn from torch's global generator. With the plain parameters it is the plain point mass.
 
     Attributes:
-        parameters: (B, P), in the order of `PARAMETERS`.
+        parameters: (B, P), in the order of the variation's `names`.
         state: what is shown, (B, 4) float32. true_state: where the masses are, likewise.
         free: where the point's centre may be.
         blocked: (B,) bool, the last step was stopped by a wall.
@@ -33,12 +33,14 @@ class VariedPointMass:
         *,
         timestep_s: float,
         radius_m: float = 0.1,
+        speed_m_s: float = 1.0,
         device: str = "cpu",
     ) -> None:
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
         self.variation = variation
         self.num_envs = num_envs
         self.timestep_s = timestep_s
+        self.speed_m_s = speed_m_s
         self.state = torch.zeros(num_envs, self.state_size, device=device)
         self.true_state = self.state
         self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -58,14 +60,8 @@ class VariedPointMass:
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2); return what is shown of the new state (B, 4)."""
-        of = dict(zip(PARAMETERS, self.parameters.unbind(-1), strict=True))
-        noise = of["action_noise"].unsqueeze(-1) * torch.randn_like(action)
-        command = (action + noise).clamp(-1.0, 1.0)
-        angle = torch.deg2rad(of["heading_bias_deg"])
-        cos, sin = angle.cos(), angle.sin()
-        x, y = command.unbind(-1)
-        turned = torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
-        velocity = (of["friction"] * (1.0 + of["action_scale"])).unsqueeze(-1) * turned
+        of = self.variation.by_name(self.parameters)
+        velocity = varied_command(of, action) * self.speed_m_s
         period = (self.timestep_s * of["timestep_scale"]).unsqueeze(-1)
         position = self.true_state[:, :2]
         moved, self.blocked = self.free.slide(position, position + velocity * period)

@@ -42,7 +42,8 @@ from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative
 from astra_data.relocation import Relocation, Rotations, outcomes, positions
 from astra_data.seeding import derive, generator
-from astra_data.tasks import TASKS, Task, task_named
+from astra_data.task import Task
+from astra_data.tasks import TASKS, task_named
 
 DEFAULT_COPIES = 3
 _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)

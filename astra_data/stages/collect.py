@@ -37,7 +37,8 @@ from astra_data.results.provenance import machine
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.target_encoder_file import load_target_encoder
-from astra_data.tasks import Task, task_named
+from astra_data.task import Task
+from astra_data.tasks import task_named
 
 _TRAINING_SHARE = 0.8
 """Part of the progress that training the suboptimal policy takes."""

@@ -31,7 +31,8 @@ from astra_data.seeding import derive
 from astra_data.simulators import simulator_of
 from astra_data.stopwatch import Stopwatch
 from astra_data.target_encoder_file import load_target_encoder
-from astra_data.tasks import Task, task_named
+from astra_data.task import Task
+from astra_data.tasks import task_named
 from astra_data.training_world import WorldParts, training_world
 from astra_data.world import SimulatorWorld
 

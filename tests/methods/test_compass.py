@@ -15,7 +15,7 @@ from astra_data.progress import Progress, silent
 from astra_data.recipe import Config, load_recipe
 from astra_data.request import Recipe
 from astra_data.tasks import TASKS
-from astra_data.variation import PARAMETERS, Variation
+from astra_data.variation import WIDE_RANGES, Variation
 
 TASK = TASKS["antmaze-umaze"]
 PLANTED = {"friction": 0.92, "action_scale": 0.05, "timestep_scale": 1.1, "heading_bias_deg": 3.0}
@@ -82,7 +82,7 @@ def test_planted_parameters_are_found(found: tuple[Variation, dict[str, Any]]) -
     for name, value in point.items():
         assert getattr(variation, name) == (value, value)
     # Noise cannot be identified: it keeps its ranges.
-    for name in PARAMETERS:
+    for name in Variation().names:
         if name not in point:
             assert getattr(variation, name) == getattr(QUICK, name)
 
@@ -157,6 +157,6 @@ def test_both_rows_read_the_same_table(tmp_path: Path) -> None:
     assert items["ground/compass/seed_0"]["settings"].window == 10
     assert items["ground/compass/seed_0"]["settings"].friction == (0.5, 0.9)
     uniform = items["train/compass_uniform/seed_0"]["settings"]
-    assert uniform == Variation(**{**CompassConfig().variation.model_dump(), "friction": (0.5, 0.9)})
+    assert uniform == Variation(**{**WIDE_RANGES.model_dump(), "friction": (0.5, 0.9)})
     assert items["train/compass/seed_0"]["settings"] is None
     assert items["train/compass_plus/seed_0"]["grounding"] == tmp_path / "ground/compass/seed_0"

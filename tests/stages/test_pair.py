@@ -48,6 +48,7 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
         "task": "antmaze-short",
         "timestep_s": 0.05,
         "radius_m": 0.1,
+        "speed_m_s": 1.0,
     }
     steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
     assert steps == pytest.approx(after.lengths.sum())

@@ -1,0 +1,59 @@
+"""A ball on a carpet: how it rolls, and how it leaves a planar body that walks into it. Batched torch."""
+
+import torch
+from torch import Tensor
+
+from astra_data.geometry import turned
+
+ROLLING_M_S2 = 0.30
+"""Deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)."""
+BALL_RADIUS_M = 0.05
+"""Likewise."""
+
+
+def roll(
+    position: Tensor, velocity: Tensor, period_s: Tensor | float, deceleration_m_s2: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """Return position and velocity (B, 2) after rolling for `period_s` with even friction, until it lies."""
+    speed = velocity.norm(dim=-1)
+    slower = (speed - deceleration_m_s2 * period_s).clamp_min(0.0)
+    rolling_s = (speed - slower) / deceleration_m_s2
+    direction = velocity / speed.clamp_min(1e-9).unsqueeze(-1)
+    way = 0.5 * (speed + slower) * rolling_s
+    return position + direction * way.unsqueeze(-1), direction * slower.unsqueeze(-1)
+
+
+def knock(
+    before: Tensor,
+    after: Tensor,
+    ball: Tensor,
+    velocity: Tensor,
+    *,
+    reach_m: float,
+    speed_m_s: float,
+    turn_rad: Tensor | float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Knock away the balls that bodies walk into.
+
+    Args:
+        before: where the bodies were, (B, 2).
+        after: where they are, (B, 2).
+        ball: where the balls are, (B, 2).
+        velocity: of the balls, (B, 2).
+        reach_m: between the centres of a body and a ball that it touches.
+        speed_m_s: at which a ball leaves along the line between the centres.
+        turn_rad: the ball leaves turned by this, (B,) or one for all.
+
+    Returns:
+        positions and velocities (B, 2) of the balls.
+    """
+    apart = ball - after
+    distance = apart.norm(dim=-1, keepdim=True)
+    direction = apart / distance.clamp_min(1e-9)
+    approaches = ((after - before) * direction).sum(-1, keepdim=True) > 0
+    touched = (distance < reach_m) & approaches
+    leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
+    return (
+        torch.where(touched, after + direction * reach_m, ball),
+        torch.where(touched, leaving * speed_m_s, velocity),
+    )
