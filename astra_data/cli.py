@@ -20,6 +20,7 @@ from astra_data.commands import (
     exporting,
     importing,
     inspecting,
+    predicting,
     recipes,
     sharing,
     sweeping,
@@ -60,6 +61,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "align": recipes.align,
         "evaluate": recipes.evaluate,
         "report": recipes.report,
+        "gap": predicting.gap,
     },
     "Recipes or datasets": {
         "collect": building.collect,

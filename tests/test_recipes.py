@@ -4,11 +4,26 @@ import pytest
 
 from astra_data.experiment import load_experiment
 from astra_data.plan import plan
+from astra_data.prediction.study import GapRecipe
+from astra_data.recipe import load_recipe
 
 HOUSE = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("path", sorted((HOUSE / "recipes").glob("*.toml")), ids=lambda path: path.stem)
+WALKS = [HOUSE / "recipes/nao_real.toml"]
+"""Recipes of `astra-data gap`, which have no stages."""
+
+
+@pytest.mark.parametrize("path", WALKS, ids=lambda path: path.stem)
+def test_a_recipe_of_walks_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
+    first = path.read_text().splitlines()[0]
+    assert first == f"# uv run astra-data gap recipes/{path.name} --data FOLDER"
+    assert (path.parent / load_recipe(path, GapRecipe).mapping).is_file()
+
+
+@pytest.mark.parametrize(
+    "path", sorted({*(HOUSE / "recipes").glob("*.toml")} - {*WALKS}), ids=lambda path: path.stem
+)
 def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
     first, experiment = path.read_text().splitlines()[0], load_experiment(path, Path("runs"))
     command = "sweep" if experiment.recipe.sweep.percent else "run"

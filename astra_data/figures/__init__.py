@@ -7,6 +7,7 @@ coverage      coverage: which positions or velocities a dataset holds
 validity      predictive_validity: returns in the simulators against those in the target
 sizes         data_efficiency: success over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
+walks         walk_prediction: how well models predict a recorded walk, by horizon and size of the data
 """
 
 from astra_data.figures.coverage import coverage
@@ -16,6 +17,7 @@ from astra_data.figures.scores import Curve, learning_curves, success_bars
 from astra_data.figures.sizes import Visits, data_efficiency
 from astra_data.figures.style import ROLES, method_colour, method_title, png
 from astra_data.figures.validity import Foretold, predictive_validity
+from astra_data.figures.walks import walk_prediction
 
 __all__ = [
     "ROLES",
@@ -35,4 +37,5 @@ __all__ = [
     "predictive_validity",
     "success_bars",
     "trajectories",
+    "walk_prediction",
 ]

@@ -28,6 +28,10 @@ TITLES = {
     "target": "Target",
     "full_obs": "Full Obs",
     "follower": "Careful follower",
+    "raw": "Raw simulator",
+    "gains": "One gain per axis",
+    "ridge": "Ridge regression",
+    "mlp": "Feed-forward network",
 }
 
 COLOURS = {
@@ -47,6 +51,10 @@ COLOURS = {
     "target": "#4D4D4D",
     "full_obs": "#1A1A1A",
     "follower": "#9A9A9A",
+    "raw": "#2B2B2B",
+    "gains": "#B58900",
+    "ridge": "#D33682",
+    "mlp": "#6C71C4",
 }
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
