@@ -29,3 +29,33 @@ def ant_beyond_point_mass(state: Tensor) -> Tensor:
     rest = state[..., _ANT_REST]
     rest[..., _JOINT_RATES] *= 0.2
     return rest
+
+
+_NAO_PLANAR = [0, 1, 4, 5]
+_NAO_SIZE = 29
+_BALL = [_NAO_SIZE + entry for entry in range(4)]
+
+
+def nao_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+    """Keep where a NAO believes it is, and how it walks: (..., S) to [x, y, vx, vy] (..., 4).
+
+    Position in m and planned velocity in m/s, in the world frame. Dropped: the heading, the legs' joints, how
+    the torso sways, the feet's load, where in its step the robot is; and how far its beliefs are from the
+    truth, which it does not know.
+    """
+    return state[..., _NAO_PLANAR]
+
+
+def nao_to_ball_agent[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+    """Keep what `nao_to_point_mass` does, and where it believes the ball is: (..., 34) to (..., 8).
+
+    The ball's position in m and velocity in m/s in the world frame. Dropped besides: since when the ball has
+    not been seen.
+    """
+    return state[..., _NAO_PLANAR + _BALL]
+
+
+def nao_beyond(state: Tensor) -> Tensor:
+    """Return what φ drops of a NAO's state, without or with a ball: (..., 29) to (..., 25), 34 to 26."""
+    rest = [entry for entry in range(state.shape[-1]) if entry not in _NAO_PLANAR + _BALL]
+    return state[..., rest]

@@ -80,6 +80,7 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         is_mirrorable=False,
         ranges=WIDE_RANGES,
         simulator_id="point_mass",
+        facts={"integrator": "RK4", "leg_scale": 1.0},
     )
 
 

@@ -30,7 +30,7 @@ def knock(
     velocity: Tensor,
     *,
     reach_m: float,
-    speed_m_s: float,
+    speed_m_s: Tensor | float,
     turn_rad: Tensor | float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Knock away the balls that bodies walk into.
@@ -41,7 +41,7 @@ def knock(
         ball: where the balls are, (B, 2).
         velocity: of the balls, (B, 2).
         reach_m: between the centres of a body and a ball that it touches.
-        speed_m_s: at which a ball leaves along the line between the centres.
+        speed_m_s: at which a ball leaves along the line between the centres, (B, 1) or one for all.
         turn_rad: the ball leaves turned by this, (B,) or one for all.
 
     Returns:

@@ -65,7 +65,7 @@ class TargetEnv(BatchedEnv, Protocol):
 
     @property
     def position(self) -> Tensor:
-        """Where the robots really are, (B, 2) float32 in m."""
+        """Where the robots really are, and their balls if they have any, (B, 2) or (B, 4) float32 in m."""
         ...
 
     @property

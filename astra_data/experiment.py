@@ -46,6 +46,7 @@ class Experiment:
             return set()
         changed = _differences(_recorded(self.base.recipe), self.recipe)
         absent = set() if self.recipe.sweep.percent else {"subset"}
+        absent |= set() if self.recipe.augment else {"augment"}
         return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed)
 
     def maker(self, stage: str) -> "Experiment":

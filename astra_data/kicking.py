@@ -31,14 +31,14 @@ class Kicking(Objective):
         behind_m: distance from the ball of the place behind it, which the shaping reward leads to.
     """
 
-    goal_line_m: float = 2.0
+    goal_line_m: float = 1.5
     goal_half_width_m: float = 0.75
     side_line_m: float = 2.0
     back_line_m: float = -2.0
-    ball_x_m: tuple[float, float] = (-1.0, 0.0)
-    ball_y_m: tuple[float, float] = (-0.75, 0.75)
-    distance_m: tuple[float, float] = (0.5, 1.2)
-    bearing_rad: float = np.pi / 2
+    ball_x_m: tuple[float, float] = (-0.5, 0.0)
+    ball_y_m: tuple[float, float] = (-0.6, 0.6)
+    distance_m: tuple[float, float] = (0.4, 1.0)
+    bearing_rad: float = np.pi / 3
     behind_m: float = 0.25
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -73,6 +73,10 @@ class Kicking(Objective):
         to_goal = goal - ball
         back: Tensor = self.behind_m * to_goal / to_goal.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         return ball - back
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return where robot and ball are in states (..., 8), (..., 4)."""
+        return state[..., [0, 1, 4, 5]]
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell which balls (B,) of states (B, 8) are in the goal."""

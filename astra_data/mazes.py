@@ -132,3 +132,15 @@ LONG_MAZE = Maze(
     goal=(5, 3),
 )
 """Two U's in a row, four right-angle turns, 40 m along the centre line: ours, the paper prints no layout."""
+
+S_MAZE = Maze(rows=LONG_MAZE.rows, scale=1.0, start=(1, 1), goal=(5, 3), fine_m=0.05)
+"""An S with corridors of 1 m on half a field of RoboCup's Standard Platform League: ours, likewise."""
+
+FIELD = Maze(
+    rows=("1" * 12, *("1" + "0" * 10 + "1",) * 10, "1" * 12),
+    scale=0.5,
+    start=(5, 2),
+    goal=(5, 9),
+    fine_m=0.05,
+)
+"""A room of 5 m by 5 m for playing with a ball."""

@@ -29,12 +29,14 @@ class Navigation(Objective):
         success_radius_m: closer to the goal than this is success and ends the episode.
         spread_m: standard deviation of start and goal around their cells' centres, per axis.
         start_clearance_m: distance from the walls kept by starts drawn anywhere.
+        start_offsets_m: of the usual starts from the centre of the start's cell; each is as likely.
     """
 
     reward_kind: RewardKind = "geodesic"
     success_radius_m: float = 0.45
     spread_m: float = 0.2
     start_clearance_m: float = 0.8
+    start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
 
     @cached_property
     def goal_distance(self) -> GoalDistance:
@@ -52,8 +54,11 @@ class Navigation(Objective):
         return self._goal_distances[device]
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states [x, y, vx, vy] (count, 4) at rest around the maze's start cell."""
-        return _at_rest(self._around(self.maze.start, rng, count))
+        """Draw states [x, y, vx, vy] (count, 4) at rest around the usual starts."""
+        position = self._around(self.maze.start, rng, count)
+        if len(self.start_offsets_m) > 1:
+            position += np.array(self.start_offsets_m)[rng.integers(len(self.start_offsets_m), size=count)]
+        return _at_rest(position)
 
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw goals (count, 2) in m around the maze's goal cell."""

@@ -47,6 +47,10 @@ class Objective(ABC):
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
 
+    def places(self, state: Tensor) -> Tensor:
+        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""
+        return state[..., :2]
+
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
         return torch.zeros(len(state), dtype=torch.bool, device=state.device)

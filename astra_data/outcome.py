@@ -16,7 +16,7 @@ class Outcome:
         wall_contact: share of the steps.
         steps: until the end.
         returns: sum of rewards.
-        position: (N, T + 1, 2) in m, from the start on, NaN after the end.
+        position: of what moves, (N, T + 1, 2 K) in m, from the start on, NaN after the end.
     """
 
     success: list[float]
@@ -45,7 +45,7 @@ class EpisodeRecord:
     """
 
     def __init__(self, position: Tensor) -> None:
-        """Begin at `position` (N, 2)."""
+        """Begin at `position` (N, 2 K)."""
         count = len(position)
         self.active = torch.ones(count, dtype=torch.bool)
         self.total_steps = 0

@@ -1,8 +1,8 @@
 """The artefacts that a recipe's rows, seeds and sizes need, each once.
 
-    collect ── pair ──┬── ground ──┬── train ──┬── evaluate ── report
-                      │            └── align ──┘
-                      └── (rows without grounding train on the pairs alone)
+    collect ── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ── report
+                                   │            └── align ──┘
+                                   └── (rows without grounding train on the pairs alone)
 
 A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` settings; it shares the
 grounding and the alignment of `<method>`. Where a recipe sweeps over sizes, collect and pair make the largest
@@ -21,6 +21,7 @@ from astra_data.request import METHOD_TABLES, WHOLE, Part, Recipe
 from astra_data.rows import base_method, is_plus, place, reference_of
 from astra_data.schedule import Item
 from astra_data.stages.align import align
+from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import collect
 from astra_data.stages.evaluate import evaluate
 from astra_data.stages.ground import ground
@@ -73,6 +74,8 @@ def plan(
     items: list[Item] = []
     for seed in part.seeds:
         items.append(_collect(recipe, folder, seed))
+        if recipe.augment is not None:
+            items.append(_augment(recipe, recipe.augment, folder, seed))
         items.append(_pair(recipe, folder, seed))
         items += (_subset(recipe, folder, seed, percent) for percent in part.percents)
         for percent in part.percents or (None,):
@@ -124,8 +127,15 @@ def _collect(recipe: Recipe, folder: Path, seed: int) -> Item:
     return Item(key, (), call, is_threaded=True)
 
 
+def _augment(recipe: Recipe, config: AugmentConfig, folder: Path, seed: int) -> Item:
+    key, dataset = f"augment/{place(seed)}", f"collect/{place(seed)}"
+    call = partial(augment, recipe.task, config, dataset=folder / dataset, seed=seed, out=folder / key)
+    return Item(key, (dataset,), call)
+
+
 def _pair(recipe: Recipe, folder: Path, seed: int) -> Item:
-    key, dataset = f"pair/{place(seed)}", f"collect/{place(seed)}"
+    made = "collect" if recipe.augment is None else "augment"
+    key, dataset = f"pair/{place(seed)}", f"{made}/{place(seed)}"
     call = partial(pair, recipe.task, recipe.pair, dataset=folder / dataset, out=folder / key)
     return Item(key, (dataset,), call)
 

@@ -17,6 +17,7 @@ from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.recipe import Config, Count, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus, place
 from astra_data.stages.align import AlignConfig
+from astra_data.stages.augment import AugmentConfig
 from astra_data.stages.collect import CollectConfig
 from astra_data.stages.evaluate import EvaluateConfig
 from astra_data.stages.pair import PairConfig
@@ -28,7 +29,8 @@ from astra_data.variation import RANDOMIZED_ACTIONS, Variation
 
 STAGES: dict[str, tuple[str, ...]] = {
     "collect": (),
-    "pair": ("collect",),
+    "augment": ("collect",),
+    "pair": ("collect", "augment"),
     "subset": ("pair",),
     "ground": ("pair", "subset"),
     "train": ("pair", "subset", "ground"),
@@ -36,7 +38,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "evaluate": ("train", "ground", "align"),
     "report": ("evaluate",),
 }
-"""Each stage, in order, and the stages whose artefacts it reads."""
+"""Each stage, in order, and the stages whose artefacts it reads. Not every recipe augments."""
 
 METHOD_TABLES = {
     "domain_randomization": "train",
@@ -75,6 +77,8 @@ class Recipe(Config):
     seeds: tuple[int, ...] = Field(min_length=1)
     """Each seed repeats everything, from the collected dataset on."""
     collect: CollectConfig
+    augment: AugmentConfig | None = None
+    """How each collected dataset is augmented before it is paired; by default not at all."""
     pair: PairConfig
     ground: GroundConfig
     train: TrainConfig
@@ -109,7 +113,8 @@ class Recipe(Config):
     @model_validator(mode="before")
     @classmethod
     def _add_empty_sections(cls, tables: dict[str, Any]) -> dict[str, Any]:
-        return {table: {} for table in (*STAGES, "plus") if table in cls.model_fields} | tables
+        needed = [table for table in (*STAGES, "plus") if table in cls.model_fields and table != "augment"]
+        return {table: {} for table in needed} | tables
 
     @field_validator("plus", mode="before")
     @classmethod

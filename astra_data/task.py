@@ -1,6 +1,6 @@
 """What a task is: a target environment, an abstract simulator, the map between them, and what to achieve."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -49,6 +49,7 @@ class Task:
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
         is_mirrorable: whether the robot, its controller included, is its own mirror image.
         ranges: of the simulator's parameters, as the paper prints them for COMPASS.
+        facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
     """
 
@@ -68,6 +69,7 @@ class Task:
     is_mirrorable: bool
     ranges: Variation
     simulator_id: str
+    facts: Mapping[str, str | float]
 
     @property
     def maze(self) -> Maze:

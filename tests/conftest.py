@@ -1,5 +1,5 @@
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import fake_stages
 import pytest
@@ -16,8 +16,9 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     plan = importlib.import_module("astra_data.plan")
     request = importlib.import_module("astra_data.request")
     tables = [name for name in (*request.STAGES, "plus") if name in request.Recipe.model_fields]
-    sections = {name: (fake_stages.FakeConfig, ...) for name in tables}
+    sections: dict[str, tuple[Any, Any]] = {name: (fake_stages.FakeConfig, ...) for name in tables}
     sections["collect"] = (fake_stages.FakeCollectConfig, ...)
+    sections["augment"] = (fake_stages.FakeConfig | None, None)
     model: type[Recipe] = create_model("FakeRecipe", __base__=request.Recipe, **sections)  # type: ignore[call-overload]
     for stage in request.STAGES:
         monkeypatch.setattr(plan, stage, getattr(fake_stages, stage))

@@ -92,6 +92,12 @@ def collect(
     _write(config, out, progress, task=task, seed=seed, episodes=config.episodes, num_threads=num_threads)
 
 
+def augment(
+    task: str, config: FakeConfig, *, dataset: Path, seed: int, out: Path, progress: Progress
+) -> None:
+    _write(config, out, progress, task=task, dataset=dataset, seed=seed)
+
+
 def pair(task: str, config: FakeConfig, *, dataset: Path, out: Path, progress: Progress) -> None:
     _write(config, out, progress, task=task, dataset=dataset)
 

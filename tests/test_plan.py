@@ -1,3 +1,4 @@
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,19 @@ def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
         "ground/astra/seed_0",
         "align/astra/seed_0",
     )
+
+
+def test_a_recipe_may_augment_what_it_collects(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[collect]\nepisodes = 50\n[augment]\nsteps = 4\n")
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    assert items["augment/seed_7"].inputs == ("collect/seed_7",)
+    assert items["pair/seed_7"].inputs == ("augment/seed_7",)
+    call = items["augment/seed_7"].call
+    assert isinstance(call, partial)
+    assert call.keywords["seed"] == 7
+    assert call.keywords["dataset"] == tmp_path / "collect/seed_7"
+    plain = plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path)
+    assert not [item for item in plain if item.key.startswith("augment")]
 
 
 def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) -> None:

@@ -29,14 +29,14 @@ RIM = 0.35
 
 @dataclass(frozen=True)
 class Panel:
-    """One row's episodes; positions in m, NaN after an episode's end.
+    """One row's episodes; positions in m of the robot, and of its ball if it has one; NaN after the end.
 
     Attributes:
         method: name of the row.
         success: the row's success rate in the target, over all its episodes.
-        target: positions in the target, (N, T, 2).
+        target: positions in the target, (N, T, 2) or (N, T, 4).
         target_success: which of them reached the goal, (N,).
-        simulated: positions in the simulator that the policy was trained in, (M, T, 2); M may be 0.
+        simulated: positions in the simulator that the policy was trained in, likewise (M, ...); M may be 0.
         simulated_success: which of them reached the goal, (M,).
         goal: goals of the episodes in the target, (N, 2).
     """
@@ -162,8 +162,11 @@ def _paths(axes: Axes, positions: Floats, success: Bools, colour: str, dashes: s
         if not len(points):
             continue
         axes.plot(points[:, 0], points[:, 1], dashes, color=colour, lw=1.0, alpha=0.7, zorder=3)
+        if points.shape[1] > 2:
+            axes.plot(points[:, 2], points[:, 3], ":", color=colour, lw=1.4, alpha=0.9, zorder=3)
+            axes.plot(*points[-1, 2:], "o", color="white", mec=colour, ms=4, mew=1.0, zorder=5)
         if not reached:
-            axes.plot(*points[-1], "x", color="white", ms=7, mew=3.4, zorder=5)
-            axes.plot(*points[-1], "x", color=colour, ms=6, mew=1.8, zorder=5)
+            axes.plot(*points[-1, :2], "x", color="white", ms=7, mew=3.4, zorder=5)
+            axes.plot(*points[-1, :2], "x", color=colour, ms=6, mew=1.8, zorder=5)
     starts = positions[:, 0] if len(positions) else np.empty((0, 2))
     axes.plot(starts[:, 0], starts[:, 1], "o", color=FAINT, ms=2.5, mew=0, zorder=4)

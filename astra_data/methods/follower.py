@@ -1,15 +1,29 @@
-"""A careful hand-written follower of the corridors: how well the task can be done (the ceiling)."""
+"""Careful hand-written controllers: how well a task can be done (the ceiling)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from astra_data.kicking import Kicking
 from astra_data.mazes import Maze
 from astra_data.method import Method
+from astra_data.task import Task
 
 FOLLOWER = Method(name="follower", title="Careful follower", learn=None)
+
+Act = Callable[[Tensor, Tensor], Tensor]
+
+
+def careful(task: Task, goal: Tensor) -> Act:
+    """Return how to act on abstract states (B, X) for goals (B, G), in episodes that begin with `goal`."""
+    if isinstance(task.objective, Kicking):
+        return CarefulKicker(task.objective).command
+    follower = CarefulFollower(task.maze)
+    fields = follower.fields(goal)
+    return lambda state, goal: follower.command(state[:, :2], goal, fields)
 
 
 @dataclass(frozen=True)
@@ -17,28 +31,29 @@ class CarefulFollower:
     """Steer down the distance to the goal, along paths away from the walls, a little below full speed.
 
     Attributes:
-        maze: where. margin_m: distance from the walls that paths keep where they can.
-        speed_m_s: of the faster axis.
+        maze: where. margin: distance from the walls that paths keep where they can, in cells of the maze.
+        speed: of the faster axis, in units of commands.
     """
 
     maze: Maze
-    margin_m: float = 1.6
-    speed_m_s: float = 0.85
+    margin: float = 0.4
+    speed: float = 0.85
 
     def fields(self, goals: Tensor) -> Tensor:
         """Return the cost of going from each fine cell to each of `goals` (B, 2), (B, height, width)."""
-        fields = [self.maze.distance_field(goal, self.margin_m) for goal in goals.numpy()]
+        margin_m = self.margin * self.maze.scale
+        fields = [self.maze.distance_field(goal, margin_m) for goal in goals.numpy()]
         return torch.from_numpy(np.stack(fields)).float()
 
     def command(self, position: Tensor, goal: Tensor, fields: Tensor) -> Tensor:
         """Return velocity commands (B, 2), at `position` (B, 2) for `goal` (B, 2).
 
-        Looks 0.8 m around in `fields` (B, height, width) for the cheapest direction out of 32; near the
-        goal it heads straight there.
+        Looks a fifth of a cell around in `fields` (B, height, width) for the cheapest direction out of 32;
+        near the goal it heads straight there.
         """
         angles = torch.arange(32) * (2 * torch.pi / 32)
         directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
-        ahead = position[:, None] + 0.8 * directions
+        ahead = position[:, None] + 0.2 * self.maze.scale * directions
         half = torch.tensor(self.maze.half_extent, dtype=torch.float32)
         cells = ((ahead + half) / self.maze.fine_m).long()
         rows = cells[..., 1].clamp(0, fields.shape[1] - 1)
@@ -46,6 +61,44 @@ class CarefulFollower:
         costs = fields[torch.arange(len(position))[:, None], rows, columns]
         best = directions[costs.argmin(dim=1)]
         straight = goal - position
-        near = straight.norm(dim=-1, keepdim=True) < 1.0
-        heading = torch.where(near, straight, best)
-        return self.speed_m_s * heading / heading.abs().amax(dim=-1, keepdim=True).clamp_min(1e-6)
+        near = straight.norm(dim=-1, keepdim=True) < 0.25 * self.maze.scale
+        return _at_speed(torch.where(near, straight, best), self.speed)
+
+
+@dataclass(frozen=True)
+class CarefulKicker:
+    """Walk around the ball to the place behind it, then straight through it.
+
+    Attributes:
+        kicking: the task. clear_m: distance from the ball on the way around it.
+        width_m: how far beside the line through ball and goal a run-up may be.
+        speed: of the faster axis, in units of commands.
+    """
+
+    kicking: Kicking
+    clear_m: float = 0.4
+    width_m: float = 0.08
+    speed: float = 0.85
+
+    def command(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return velocity commands (B, 2) at abstract states (B, 8) for goals (B, 2)."""
+        robot, _, ball, rolling = state.split(2, dim=-1)
+        ball = ball + rolling  # Where it will be in a second.
+        to_goal = torch.nn.functional.normalize(goal - ball, dim=-1)
+        apart = robot - ball
+        along = (apart * to_goal).sum(-1, keepdim=True)
+        beside = apart - along * to_goal
+        runs_up = (along < -0.1) & (beside.norm(dim=-1, keepdim=True) < self.width_m)
+        behind = ball - self.clear_m * to_goal
+        # In the way: the ball is nearer than the place behind it, so go along a circle around it.
+        outward = torch.nn.functional.normalize(apart, dim=-1)
+        side = torch.nn.functional.normalize(beside, dim=-1)
+        around = -to_goal + side * (self.clear_m - apart.norm(dim=-1, keepdim=True)) / self.clear_m * 3.0
+        in_the_way = (along > -0.5 * self.clear_m) & (apart.norm(dim=-1, keepdim=True) < 1.5 * self.clear_m)
+        away = torch.where(apart.norm(dim=-1, keepdim=True) < 0.6 * self.clear_m, outward, around)
+        heading = torch.where(in_the_way, away, behind - robot)
+        return _at_speed(torch.where(runs_up, ball + 0.5 * to_goal - robot, heading), self.speed)
+
+
+def _at_speed(heading: Tensor, speed: float) -> Tensor:
+    return speed * heading / heading.abs().amax(dim=-1, keepdim=True).clamp_min(1e-6)

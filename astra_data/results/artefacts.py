@@ -39,7 +39,7 @@ class Outcomes(BaseModel):
     success: list[float]
     """1 where the goal was reached, else 0."""
     failed: list[float]
-    """1 where the robot fell over, else 0."""
+    """1 where it ended badly, else 0."""
     wall_contact: list[float]
     """Share of the episode's steps in contact with a wall."""
     steps: list[float]
@@ -60,6 +60,7 @@ class Evaluation(Artefact):
     method: str
     seed: int
     episodes: int = Field(ge=1)
+    leg_scale: float = 1.0
     dataset_version: str | None = None
     dataset_hash: str | None = None
     target_steps_per_second: float | None = None

@@ -116,6 +116,7 @@ def assemble(
         evaluated_with=_evaluated_with(evaluations),
         seeds=[seed for seed in asked if seed in reported],
         episodes=episodes,
+        leg_scale=next(file.leg_scale for of_seeds in evaluations.values() for file in of_seeds.values()),
         methods=rows,
         unfinished=[method_title(method) for method in methods if method not in rows],
         probability_of_improvement=_improvement(rows, replicates),
@@ -137,6 +138,12 @@ def _check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str)
         f"{file.method} seed {file.seed} with {file.episodes} episodes"
         for file in files
         if file.episodes != episodes
+    ]
+    legs = files[0].leg_scale
+    wrong += [
+        f"{file.method} seed {file.seed} with legs {file.leg_scale:g} times as long"
+        for file in files
+        if file.leg_scale != legs
     ]
     if wrong:
         raise BadInputError(

@@ -156,6 +156,8 @@ class Results(Part):
     """Of which rows may have finished only some."""
     episodes: int
     """Per row and seed."""
+    leg_scale: float = 1.0
+    """Of the target's robot, which the data was not collected with if it is not 1."""
     methods: dict[str, MethodResults]
     unfinished: list[str] = Field(default_factory=list)
     """Titles of the recipe's rows that no seed of is finished yet."""

@@ -88,9 +88,11 @@ def _head(results: Results) -> str:
     if any(row.seeds != results.seeds for row in results.methods.values()):
         seeds += " (rows have as many of them as the table says)"
     to_come = f" Not finished yet: {', '.join(results.unfinished)}." if results.unfinished else ""
+    legs = f" The target's legs are {results.leg_scale:g} times as long." if results.leg_scale != 1 else ""
     return (
         f"# {results.recipe}\n\n"
-        f"Task `{results.task}`, seeds {seeds}, {results.episodes} episodes per row and seed. Produced by\n\n"
+        f"Task `{results.task}`, seeds {seeds}, {results.episodes} episodes per row and seed.{legs} "
+        f"Produced by\n\n"
         f"```\n{results.command}\n```\n\n"
         f"on {machines or 'a machine that was not recorded'}. "
         f"Wall time of the stages, summed: {duration(results.wall_seconds['total'])}.{to_come}"

@@ -120,7 +120,7 @@ def collect(
         "stage": "collect",
         "config": config.model_dump(mode="json") | saved,
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
-        "environment": {"id": task, "integrator": "RK4", "timestep_s": world.timestep_s, "leg_scale": 1.0},
+        "environment": {"id": task, "timestep_s": world.timestep_s, **world.facts},
     }
     folder = out or place(description)
     with StagedWriter(

@@ -21,7 +21,7 @@ from astra_data.deployment import DeployedPolicy, EncoderKind
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import Grounding, load_grounding
 from astra_data.methods import method_named
-from astra_data.methods.follower import CarefulFollower
+from astra_data.methods.follower import careful
 from astra_data.outcome import EpisodeRecord, Outcome
 from astra_data.policy_file import PolicyFile, Simulation, deploy
 from astra_data.progress import Progress
@@ -93,12 +93,13 @@ def evaluate(
         raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     stopwatch = Stopwatch()
     told: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
+    told["leg_scale"] = config.leg_scale
     told |= origin()
     simulators: dict[str, SimulatorWorld] = {}
     headline: EncoderKind = "source"
     if policy is None:
-        begin: Begin = partial(_follow, world)
-        robots = {headline: begin}
+        begin: Begin = partial(careful, world)
+        robots: dict[EncoderKind, Begin] = {headline: partial(_careful_in_target, world)}
         shown_abstract = True
     else:
         trained = PolicyFile.load(policy / "policy.safetensors")
@@ -145,15 +146,14 @@ def evaluate(
     progress(1.0, f"success in the target {success:.2f}")
 
 
+def _careful_in_target(task: Task, goal: Tensor) -> Act:
+    act = careful(task, goal)
+    return lambda state, goal: act(task.abstraction(state), goal)
+
+
 def _start(deployed: DeployedPolicy, act: Act, goal: Tensor) -> Act:
     deployed.start(len(goal))
     return act
-
-
-def _follow(task: Task, goal: Tensor) -> Act:
-    follower = CarefulFollower(task.maze)
-    fields = follower.fields(goal)
-    return lambda state, goal: follower.command(state[:, :2], goal, fields)
 
 
 def _in_target(
@@ -214,11 +214,12 @@ def _in_simulator(world: SimulatorWorld, begin: Begin, horizon: int, seed: int) 
     torch.manual_seed(derive(seed, "simulated evaluation"))
     world.reset()
     act = begin(world.goal)
-    record = EpisodeRecord(world.simulator.state[:, :2])
+    record = EpisodeRecord(world.objective.places(world.simulator.state))
     for _ in range(horizon):
         step = world.step(act(world.simulator.state, world.goal))
         blocked = world.simulator.blocked
-        record.add(world.simulator.state[:, :2], step.reward, step.success, world.failed, blocked)
+        places = world.objective.places(world.simulator.state)
+        record.add(places, step.reward, step.success, world.failed, blocked)
         if not record.active.any():
             break
     return record.outcome()

@@ -1,8 +1,9 @@
 import numpy as np
 import torch
 
-from astra_data.methods.follower import CarefulFollower
+from astra_data.methods.follower import CarefulFollower, careful
 from astra_data.tasks import TASKS
+from astra_data.world import SimulatorWorld
 
 
 def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
@@ -27,3 +28,17 @@ def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
             break
     assert reached.all()
     assert closest > 1.0
+
+
+def test_the_careful_kicker_scores_from_every_start_of_its_simulator() -> None:
+    task = TASKS["nao-kick"]
+    torch.manual_seed(0)
+    world = SimulatorWorld(task.objective, task.simulator(100))
+    world.reset()
+    act = careful(task, world.goal)
+    scored, ended = torch.zeros(2, 100, dtype=torch.bool)
+    for _ in range(task.objective.horizon):
+        step = world.step(act(world.simulator.state, world.goal))
+        scored |= step.success & ~ended
+        ended |= step.terminated
+    assert scored.float().mean() >= 0.98

@@ -63,7 +63,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     told, paths = make(task, "astra", tmp_path / "astra", inputs)
     keys = {"task", "method", "seed", "episodes", "dataset_version", "dataset_hash", "wall_seconds"}
     keys |= {"cpu_seconds", "target_steps_per_second", "encoder", "target", "simulated", "encoders", "raw"}
-    keys |= {"git_commit", "packages", "machine"}
+    keys |= {"git_commit", "packages", "machine", "leg_scale"}
     assert told.keys() == keys
     assert (told["method"], told["seed"], told["episodes"], told["encoder"]) == ("astra", 0, 3, "target")
     assert told["encoders"].keys() == {"source", "target"}

@@ -184,6 +184,17 @@ def test_the_table_says_how_many_seeds_each_row_has(root: Path) -> None:
     assert "| ASTRA | 3 | 0.50 ± 0.25 |" in page
 
 
+def test_the_page_tells_of_longer_legs(root: Path) -> None:
+    for file in (root / "evaluate").glob("*/*/evaluation.json"):
+        edit_json(file, leg_scale=1.25)
+    make(root)
+    page = (root / "report/results.md").read_text()
+    assert "4 episodes per row and seed. The target's legs are 1.25 times as long." in page
+    edit_json(file, leg_scale=1.0)
+    with pytest.raises(BadInputError, match=r"with legs 1"):
+        make(root)
+
+
 def test_the_page_says_which_rows_are_not_finished(root: Path) -> None:
     for seed in (0, 1, 2):
         (root / f"evaluate/astra/seed_{seed}/evaluation.json").unlink()

@@ -1,0 +1,167 @@
+"""The NAO's tasks, on simulated stand-ins: through an S-shaped maze, and a ball into a goal (Section V-C).
+
+Where the paper is silent: a control step is 16 ticks of the robot's 12 ms, 0.192 s, for at 0.25 m/s a robot
+that is to go 9 to 13 m in 500 steps cannot be controlled faster than at 10 Hz; the maze, its starts, the
+field and the rewards are ours. `-surrogate` follows the name of the same task without physics.
+"""
+
+from functools import partial
+from typing import Any, Literal, get_args
+
+from astra_data.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
+from astra_data.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
+from astra_data.envs.nao import BALL_SIZE, SPEED_M_S, STATE_SIZE, NaoEnv
+from astra_data.kicking import Kicking
+from astra_data.mazes import FIELD, S_MAZE
+from astra_data.nao.body import TICK_S
+from astra_data.nao.kinematics import JOINTS
+from astra_data.nao.robot import CONTROL_STEP_S
+from astra_data.navigation import Navigation
+from astra_data.sims.ball_agent import BallAgent
+from astra_data.sims.point_mass import PointMass
+from astra_data.sims.varied_ball_agent import VariedBallAgent
+from astra_data.sims.varied_point_mass import VariedPointMass
+from astra_data.task import Task, roles
+from astra_data.variation import WIDE_RANGES, BallVariation
+
+Level = Literal["mujoco", "surrogate"]
+
+_RADIUS_M = 0.2
+"""Of the disc that the robot is at walls in its abstract simulators (HULKs' obstacle radius)."""
+_BODY: dict[str, Any] = {"radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
+_CONTACT: dict[str, Any] = {"reach_m": 0.19, "knock_m_s": 1.0}
+
+KICK_RANGES = BallVariation(
+    **WIDE_RANGES.model_dump(),
+    ball_friction=(0.8, 1.2),
+    ball_position_noise_m=(0.03, 0.03),
+    ball_velocity_noise_m_s=(0.0, 0.02),
+    contact_direction_deg=(-5.0, 5.0),
+)
+"""Of COMPASS in kicking: the paper names the ball's friction, position, velocity and direction after contact,
+and prints no ranges for them; those of the robot are taken."""
+
+Roles = tuple[tuple[str, ...], list[str], list[str], list[str], list[str]]
+
+
+def _mirrored(joint: str) -> str:
+    """Tell which joint's angle a joint's becomes in the mirror: the sides swap, and rolling turns around."""
+    other = {"L": "R", "R": "L"}.get(joint[0], joint[0]) + joint[1:]
+    return f"-{other}" if joint.endswith("Roll") else other
+
+
+_STATE_ROLES: Roles = (
+    (
+        *("x", "y", "cos_heading", "sin_heading", "vx", "vy", *JOINTS),
+        *("gyro_x", "gyro_y", "gyro_z", "roll", "pitch", "load_left", "load_right"),
+        *("step_sine", "step_cosine", "planned_forward", "planned_left", "planned_turn"),
+    ),
+    [
+        *(["m"] * 2 + ["1"] * 2 + ["m/s"] * 2 + ["rad"] * len(JOINTS)),
+        *(["rad/s"] * 3 + ["rad"] * 2 + ["50 N"] * 2 + ["1"] * 2 + ["m/s"] * 2 + ["rad/s"]),
+    ],
+    ["world"] * 6 + ["joint"] * len(JOINTS) + ["body"] * 12,
+    ["position"] * 2 + ["vector"] * 4 + ["invariant"] * (len(JOINTS) + 12),
+    [
+        *([""] * 6 + [_mirrored(joint) for joint in JOINTS]),
+        *("-gyro_x", "gyro_y", "-gyro_z", "-roll", "pitch", "load_right", "load_left"),
+        *("-step_sine", "-step_cosine", "planned_forward", "-planned_left", "-planned_turn"),
+    ],
+)
+_BALL_ROLES: Roles = (
+    ("ball_x", "ball_y", "ball_vx", "ball_vy", "ball_unseen"),
+    ["m"] * 2 + ["m/s"] * 2 + ["s"],
+    ["world"] * 4 + ["body"],
+    ["position"] * 2 + ["vector"] * 2 + ["invariant"],
+    [""] * 4 + ["ball_unseen"],
+)
+_PLANAR_ROLES: Roles = (
+    ("x", "y", "vx", "vy"),
+    ["m"] * 2 + ["m/s"] * 2,
+    ["world"] * 4,
+    ["position"] * 2 + ["vector"] * 2,
+    [""] * 4,
+)
+
+
+def _columns(*, ball: bool) -> tuple[Column, ...]:
+    size = STATE_SIZE + BALL_SIZE * ball
+    told = roles(*(_with_ball(_STATE_ROLES) if ball else _STATE_ROLES))
+    goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
+    command = roles(("command_vx", "command_vy"), ["0.25 m/s"] * 2, ["world"] * 2, ["vector"] * 2)
+    meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
+    return (
+        Column(STATE, size=size, meaning=meaning, **told),
+        Column(GOAL, size=2, meaning="the middle of the goal line" if ball else "where to go", **goal),
+        Column(ACTION, size=2, meaning="commanded planar velocity, ±1 per axis", **command),
+        Column(NEXT_STATE, size=size, meaning=f"{meaning}, one control step later", **told),
+    )
+
+
+def _with_ball(known: Roles, count: int = BALL_SIZE) -> Roles:
+    (names, *told), (ball_names, *ball_told) = known, _BALL_ROLES
+    units, frames, entries, mirror = (mine + its[:count] for mine, its in zip(told, ball_told, strict=True))
+    return (*names, *ball_names[:count]), units, frames, entries, mirror
+
+
+def _abstract(*, ball: bool) -> Column:
+    names, units, frames, entries, _ = _with_ball(_PLANAR_ROLES, 4) if ball else _PLANAR_ROLES
+    told = roles(names, units, frames, entries)
+    meaning = "abstract state of the target before the action"
+    return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **told)
+
+
+def _navigation(level: Level) -> Task:
+    return Task(
+        name="nao-navigation" if level == "mujoco" else f"nao-navigation-{level}",
+        instruction="walk through the maze to the goal",
+        objective=Navigation(
+            S_MAZE,
+            horizon=500,
+            success_radius_m=0.3,
+            spread_m=0.05,
+            start_clearance_m=0.3,
+            start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
+            ends_at_walls=True,
+        ),
+        make_target=partial(NaoEnv, level=level),
+        make_simulator=partial(PointMass, **_BODY),
+        make_varied_simulator=partial(VariedPointMass, **_BODY),
+        abstraction=nao_to_point_mass,
+        beyond=nao_beyond,
+        state_columns=_columns(ball=False),
+        abstract_state=_abstract(ball=False),
+        timestep_s=CONTROL_STEP_S,
+        action_limit=1.0,
+        wall_reach_m=0.3,
+        # A robot's joints are off by what is its own.
+        is_mirrorable=False,
+        ranges=WIDE_RANGES,
+        simulator_id="point_mass",
+        facts={"stand_in": level, "tick_s": TICK_S},
+    )
+
+
+def _kicking(level: Level) -> Task:
+    return Task(
+        name="nao-kick" if level == "mujoco" else f"nao-kick-{level}",
+        instruction="kick the ball into the goal",
+        objective=Kicking(FIELD, horizon=156),
+        make_target=partial(NaoEnv, level=level, ball=True),
+        make_simulator=partial(BallAgent, **_BODY, **_CONTACT),
+        make_varied_simulator=partial(VariedBallAgent, **_BODY, **_CONTACT),
+        abstraction=nao_to_ball_agent,
+        beyond=nao_beyond,
+        state_columns=_columns(ball=True),
+        abstract_state=_abstract(ball=True),
+        timestep_s=CONTROL_STEP_S,
+        action_limit=1.0,
+        wall_reach_m=0.3,
+        is_mirrorable=False,
+        ranges=KICK_RANGES,
+        simulator_id="ball_agent",
+        facts={"stand_in": level, "tick_s": TICK_S},
+    )
+
+
+NAO_TASKS = tuple(make(level) for make in (_navigation, _kicking) for level in get_args(Level))

@@ -1,0 +1,116 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.envs.nao import NaoEnv
+from astra_data.errors import BadInputError
+from astra_data.nao.perception import NO_ERRORS
+from astra_data.tasks import TASKS
+
+LEVELS = ("surrogate", "mujoco")
+
+
+def env(task: str = "nao-navigation", count: int = 3, level: str = "surrogate", **options: Any) -> NaoEnv:  # noqa: ANN401 - handed on
+    name = task if level == "mujoco" else f"{task}-{level}"
+    made = TASKS[name].target(count, seed=0, num_threads=1, **options)
+    assert isinstance(made, NaoEnv)
+    made.reset()
+    return made
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("task", ["nao-navigation", "nao-kick"])
+def test_states_have_their_columns_and_abstractions(task: str, level: str) -> None:
+    name = task if level == "mujoco" else f"{task}-{level}"
+    one = env(task, level=level)
+    columns = TASKS[name].state_columns
+    assert one.state.shape == (3, columns[0].size)
+    assert columns[0].names is not None
+    assert len(columns[0].names) == columns[0].size
+    assert one.reset().shape == (3, one.observation_size)
+    abstract = TASKS[name].abstraction(one.state)
+    assert abstract.shape == one.truth.shape == (3, TASKS[name].abstract_state.size)
+    assert TASKS[name].beyond(one.state).shape[1] == columns[0].size - abstract.shape[1]
+    # Beliefs are near the truth.
+    assert (abstract - one.truth).abs().max() < 0.5
+
+
+def test_robots_turn_to_where_they_are_to_go_and_go_there() -> None:
+    one = env(count=8, errors=NO_ERRORS)
+    start = one.position
+    for _ in range(25):
+        one.step(torch.tensor([[0.8, 0.0]]).expand(8, 2))
+    way = one.position - start
+    assert way[:, 0].min() > 0.3
+    assert (way[:, 1].abs() < 0.5 * way[:, 0]).all()
+    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), 1.0, atol=0.1)
+
+
+def test_robots_with_a_ball_keep_facing_it() -> None:
+    one = env("nao-kick", 8, errors=NO_ERRORS)
+    away = torch.nn.functional.normalize(one.truth[:, :2] - one.truth[:, 4:6])
+    for _ in range(25):
+        one.step(0.5 * away)
+    apart = one.robots.ball - one.robots.pose[:, :2]
+    assert np.linalg.norm(apart, axis=1).min() > 0.5
+    bearing = np.arctan2(apart[:, 1], apart[:, 0]) - one.robots.pose[:, 2]
+    np.testing.assert_allclose(np.cos(bearing), 1.0, atol=0.1)
+
+
+def test_touching_a_wall_fails() -> None:
+    one = env(count=2)
+    for _ in range(60):
+        step = one.step(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
+        if step.terminated[0]:
+            break
+    assert one.failed.tolist() == [True, False]
+    assert one.wall_contact.tolist() == [True, False]
+    assert step.terminated.tolist() == [True, False]
+    assert step.reward[0] < -9
+
+
+def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
+    one = env("nao-kick", 2)
+    balls = np.array([[1.4, 0.0], [1.4, 1.2]])
+    one.robots.reset(
+        np.arange(2), np.column_stack([balls - [0.3, 0.0], [0.0, 0.0]]), np.random.default_rng(0), balls
+    )
+    one.localisation.reset(np.arange(2), one.robots.pose, np.random.default_rng(0))
+    ended = torch.zeros(2, dtype=torch.bool)
+    success = ended.clone()
+    for _ in range(40):
+        step = one.step(torch.tensor([[1.0, 0.0]]).expand(2, 2), ~ended)
+        success |= step.success & ~ended
+        ended |= step.terminated
+    assert ended.all()
+    assert success.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed(level: str) -> None:
+    one, other = (env("nao-kick", 2, level) for _ in range(2))
+    action = torch.tensor([[0.7, 0.2], [-0.5, 0.9]])
+    for _ in range(3):
+        assert torch.equal(one.step(action).observation, other.step(action).observation)
+    fresh = env("nao-kick", 2, level)
+    fresh.load_state_dict(one.state_dict())
+    for _ in range(3):
+        assert torch.equal(one.step(action).observation, fresh.step(action).observation)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_robots_can_be_stood_where_a_state_believes_them(level: str) -> None:
+    one = env("nao-kick", 2, level)
+    state = one.state.double().numpy()
+    one.step(torch.ones(2, 2))
+    one.reset_to(np.arange(2), state)
+    np.testing.assert_allclose(one.robots.pose[:, :2], state[:, :2], atol=1e-6)
+    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), state[:, 2], atol=1e-6)
+    np.testing.assert_allclose(one.robots.ball, state[:, 29:31], atol=1e-6)
+
+
+def test_its_legs_are_as_they_are() -> None:
+    with pytest.raises(BadInputError, match="leg_scale: expected 1"):
+        env(leg_scale=1.25)

@@ -1,0 +1,48 @@
+import pytest
+import torch
+
+from astra_data.ball import ROLLING_M_S2, knock, roll
+
+
+def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
+    position, velocity = torch.zeros(1, 2), torch.tensor([[0.6, 0.8]])
+    for _ in range(10):
+        position, velocity = roll(position, velocity, 0.1, ROLLING_M_S2)
+    # v0 t - a t² / 2 after 1 s, along (0.6, 0.8).
+    assert position[0].tolist() == pytest.approx([0.6 * 0.85, 0.8 * 0.85], abs=1e-5)
+    assert velocity[0].tolist() == pytest.approx([0.6 * 0.7, 0.8 * 0.7], abs=1e-5)
+
+
+def test_a_ball_comes_to_rest_where_its_energy_ends() -> None:
+    position, velocity = roll(torch.zeros(1, 2), torch.tensor([[1.0, 0.0]]), 60.0, ROLLING_M_S2)
+    assert position[0].tolist() == pytest.approx([1.0 / (2 * 0.3), 0.0], abs=1e-5)
+    assert velocity.abs().max() == 0
+    again, _ = roll(position, velocity, 1.0, ROLLING_M_S2)
+    assert torch.equal(again, position)
+
+
+def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
+    before, after = torch.tensor([[0.0, 0.0]]), torch.tensor([[0.1, 0.0]])
+    ball = torch.tensor([[0.2, 0.1]])
+    place, velocity = knock(before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7)
+    diagonal = 0.5**0.5
+    assert velocity[0].tolist() == pytest.approx([0.7 * diagonal, 0.7 * diagonal], abs=1e-6)
+    assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
+    _, turned = knock(
+        before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7, turn_rad=torch.pi / 4
+    )
+    assert turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("after", "ball"),
+    [([0.1, 0.0], [0.4, 0.0]), ([0.1, 0.0], [-0.05, 0.0]), ([0.0, 0.0], [0.1, 0.0])],
+    ids=["out of reach", "behind", "standing"],
+)
+def test_other_balls_are_left_alone(after: list[float], ball: list[float]) -> None:
+    rolling = torch.tensor([[0.1, 0.2]])
+    place, velocity = knock(
+        torch.zeros(1, 2), torch.tensor([after]), torch.tensor([ball]), rolling, reach_m=0.19, speed_m_s=0.7
+    )
+    assert torch.equal(place, torch.tensor([ball]))
+    assert torch.equal(velocity, rolling)
