@@ -7,14 +7,13 @@ from torch.nn import functional
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, Windows
 from astra_data.models.residual import ResidualModel
+from astra_data.planar import VariedStates
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.randomized import RandomizedSimulator
-from astra_data.sims.varied_ball_agent import VariedBallAgent
-from astra_data.sims.varied_point_mass import VariedPointMass
 from astra_data.simulator import PlacedSimulator
 from astra_data.task import Task
-from astra_data.variation import Variation, VariedSimulator
+from astra_data.variation import Variation
 
 Simulator = PlacedSimulator | RandomizedSimulator | GroundedSimulator | AugmentedSimulator
 """As it is, or in one of the wrappers."""
@@ -104,7 +103,7 @@ def start_simulator(
         varied.redraw(rows)
 
 
-def varied_within(simulator: Simulator) -> VariedSimulator | None:
+def varied_within(simulator: Simulator) -> VariedStates | None:
     """Return the simulator with varying parameters inside `simulator`, if there is one."""
     inner = simulator.simulator if isinstance(simulator, RandomizedSimulator) else simulator
-    return inner if isinstance(inner, VariedPointMass | VariedBallAgent) else None
+    return inner if isinstance(inner, VariedStates) else None

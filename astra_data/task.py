@@ -10,8 +10,9 @@ from astra_data.batched import TargetEnv
 from astra_data.columns import Column
 from astra_data.mazes import Maze
 from astra_data.objective import Objective
+from astra_data.planar import VariedStates
 from astra_data.simulator import PairedSimulator
-from astra_data.variation import Variation, VariedSimulator
+from astra_data.variation import Variation
 
 
 class MakeSimulator(Protocol):
@@ -27,7 +28,7 @@ class MakeVariedSimulator(Protocol):
 
     def __call__(
         self, maze: Maze, num_envs: int, variation: Variation, *, timestep_s: float, device: str
-    ) -> VariedSimulator:
+    ) -> VariedStates:
         """Build `num_envs` simulators in `maze`."""
         ...
 
@@ -89,7 +90,7 @@ class Task:
         """Build `num_envs` abstract simulators."""
         return self.make_simulator(self.maze, num_envs, timestep_s=self.timestep_s, device=device)
 
-    def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedSimulator:
+    def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedStates:
         """Build `num_envs` abstract simulators whose parameters vary."""
         return self.make_varied_simulator(
             self.maze, num_envs, variation, timestep_s=self.timestep_s, device=device

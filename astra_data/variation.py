@@ -1,7 +1,7 @@
 """Variation: how the parameters of planar simulators differ from episode to episode."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import torch
 from pydantic import AfterValidator
@@ -9,7 +9,6 @@ from torch import Tensor
 
 from astra_data.geometry import turned
 from astra_data.recipe import Config
-from astra_data.simulator import PlacedSimulator
 
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
@@ -132,24 +131,3 @@ def varied_command(of: Mapping[str, Tensor], action: Tensor) -> Tensor:
     command = (action + noise).clamp(-1.0, 1.0)
     steered = turned(command, torch.deg2rad(of["heading_bias_deg"]))
     return (of["friction"] * (1.0 + of["action_scale"])).unsqueeze(-1) * steered
-
-
-class VariedSimulator(PlacedSimulator, Protocol):
-    """A simulator whose parameters vary from row to row.
-
-    Attributes:
-        parameters: (B, P), in the order of the variation's `names`.
-        true_state: the states behind the noise of the sensors, (B, X).
-    """
-
-    parameters: Tensor
-    true_state: Tensor
-
-    @property
-    def variation(self) -> Variation:
-        """The ranges of the parameters."""
-        ...
-
-    def redraw(self, rows: Tensor) -> None:
-        """Draw new parameters for the rows `rows` (n,)."""
-        ...

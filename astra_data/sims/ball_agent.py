@@ -4,11 +4,11 @@ import torch
 from torch import Tensor
 
 from astra_data.ball import ROLLING_M_S2, knock, roll
-from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
+from astra_data.planar import PlanarStates
 
 
-class BallAgent:
+class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
 
     A command is the velocity of the next step, in units of the top speed along each axis. Walls stop the
@@ -16,8 +16,7 @@ class BallAgent:
     their centres. Left out: legs, feet and where they are, and which way the robot looks.
 
     Attributes:
-        state: (B, 8) float32.
-        free: where the mass may be. blocked: (B,) bool, a wall stopped the mass in the last step.
+        parameters: what a dataset paired with this simulator records about it.
     """
 
     state_size = 8
@@ -47,8 +46,7 @@ class BallAgent:
             knock_m_s: speed of a ball that is knocked away.
             device: torch device.
         """
-        self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
-        self.num_envs = num_envs
+        super().__init__(maze, num_envs, self.state_size, radius_m=radius_m, device=device)
         self.parameters = {
             "timestep_s": timestep_s,
             "radius_m": radius_m,
@@ -56,16 +54,6 @@ class BallAgent:
             "reach_m": reach_m,
             "knock_m_s": knock_m_s,
         }
-        self.state = torch.zeros(num_envs, self.state_size, device=device)
-        self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
-
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the rows in `rows` (n,), by default all, to `state` (n, 8)."""
-        if rows is None:
-            self.state = state.clone()
-        else:
-            self.state = self.state.index_copy(0, rows, state)
-            self.blocked = self.blocked.index_fill(0, rows, False)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2), clipped to ±1 per axis; return the new state (B, 8)."""
@@ -78,10 +66,4 @@ class BallAgent:
         )
         ball, velocity = roll(ball, velocity, of["timestep_s"], ROLLING_M_S2)
         self.state = torch.cat([moved, (moved - position) / of["timestep_s"], ball, velocity], dim=-1)
-        return self.state
-
-    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the masses from `before` towards `landed`, both (B, 8); all else is that of `landed`."""
-        position, self.blocked = self.free.slide(before[:, :2], landed[:, :2])
-        self.state = torch.cat([position, landed[:, 2:]], dim=-1)
         return self.state
