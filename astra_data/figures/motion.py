@@ -23,6 +23,11 @@ COLUMNS = 4
 PANEL_INCHES = 2.0
 """Width of a panel."""
 
+TITLE_POINTS = 10.0
+"""Size of a panel's title, of which `TITLE_LETTERS` fit; longer ones are smaller."""
+
+TITLE_LETTERS = 17
+
 RIM = 0.35
 """How much of the outer walls is shown, in cells."""
 
@@ -65,7 +70,10 @@ def trajectories(maze: Maze, panels: Sequence[Panel]) -> Figure:
             _paths(axes, panel.simulated, panel.simulated_success, SIMULATED, "--")
             for x, y in _goals(maze, panel.goal):
                 axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
-            axes.set_title(method_title(panel.method), loc="left")
+            title = method_title(panel.method)
+            # The number has to find room beside it.
+            size = TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title))
+            axes.set_title(title, loc="left", fontsize=size)
             axes.set_title(f"{panel.success:.2f}", loc="right", fontweight="normal")
         handles = [
             Line2D([], [], color=SIMULATED, ls="--", label="in its simulator"),
