@@ -32,8 +32,9 @@ def ant_beyond_point_mass(state: Tensor) -> Tensor:
 
 
 _NAO_PLANAR = [0, 1, 4, 5]
-_NAO_SIZE = 29
-_BALL = [_NAO_SIZE + entry for entry in range(4)]
+NAO_STATE_SIZE = 29
+"""Of a NAO's state; what it believes of its ball follows."""
+_BALL = [NAO_STATE_SIZE + entry for entry in range(4)]
 
 
 def nao_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:

@@ -49,7 +49,7 @@ class Kicking(Objective):
         angle += rng.uniform(-self.bearing_rad, self.bearing_rad, count)
         distance = rng.uniform(*self.distance_m, count)
         robot = ball + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        edge = np.array([self.side_line_m, self.side_line_m]) - 0.1
+        edge = self.side_line_m - 0.1
         robot = robot.clip(-edge, edge)
         rest = np.zeros_like(robot)
         return np.concatenate([robot, rest, ball, rest], axis=1)

@@ -113,8 +113,8 @@ class Recipe(Config):
     @model_validator(mode="before")
     @classmethod
     def _add_empty_sections(cls, tables: dict[str, Any]) -> dict[str, Any]:
-        needed = [table for table in (*STAGES, "plus") if table in cls.model_fields and table != "augment"]
-        return {table: {} for table in needed} | tables
+        needed = {name for name, field in cls.model_fields.items() if field.is_required()}
+        return {table: {} for table in (*STAGES, "plus") if table in needed} | tables
 
     @field_validator("plus", mode="before")
     @classmethod

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.abstraction import NAO_STATE_SIZE
 from astra_data.batched import Step
 from astra_data.errors import BadInputError
 from astra_data.geometry import wrapped
@@ -27,7 +28,7 @@ _STANDING = 0.05
 """Shorter commands turn nobody."""
 _FOOT_LOAD_N = 50.0
 """Scale of the pressures on the soles."""
-STATE_SIZE = 29
+STATE_SIZE = NAO_STATE_SIZE
 """Believed x, y, cos and sin of the heading, planned velocity x, y in the world, angles (11) of the legs'
 joints, gyroscope (3), tilt (2), load (2) of the feet, phase (2) of the step, planned velocity (3) in the
 body."""

@@ -20,7 +20,7 @@ Act = Callable[[Tensor, Tensor], Tensor]
 def careful(task: Task, goal: Tensor) -> Act:
     """Return how to act on abstract states (B, X) for goals (B, G), in episodes that begin with `goal`."""
     if isinstance(task.objective, Kicking):
-        return CarefulKicker(task.objective).command
+        return CarefulKicker().command
     follower = CarefulFollower(task.maze)
     fields = follower.fields(goal)
     return lambda state, goal: follower.command(state[:, :2], goal, fields)
@@ -70,12 +70,11 @@ class CarefulKicker:
     """Walk around the ball to the place behind it, then straight through it.
 
     Attributes:
-        kicking: the task. clear_m: distance from the ball on the way around it.
+        clear_m: distance from the ball on the way around it.
         width_m: how far beside the line through ball and goal a run-up may be.
         speed: of the faster axis, in units of commands.
     """
 
-    kicking: Kicking
     clear_m: float = 0.4
     width_m: float = 0.08
     speed: float = 0.85
@@ -86,16 +85,17 @@ class CarefulKicker:
         ball = ball + rolling  # Where it will be in a second.
         to_goal = torch.nn.functional.normalize(goal - ball, dim=-1)
         apart = robot - ball
+        distance = apart.norm(dim=-1, keepdim=True)
         along = (apart * to_goal).sum(-1, keepdim=True)
         beside = apart - along * to_goal
         runs_up = (along < -0.1) & (beside.norm(dim=-1, keepdim=True) < self.width_m)
         behind = ball - self.clear_m * to_goal
         # In the way: the ball is nearer than the place behind it, so go along a circle around it.
-        outward = torch.nn.functional.normalize(apart, dim=-1)
+        outward = apart / distance.clamp_min(1e-12)
         side = torch.nn.functional.normalize(beside, dim=-1)
-        around = -to_goal + side * (self.clear_m - apart.norm(dim=-1, keepdim=True)) / self.clear_m * 3.0
-        in_the_way = (along > -0.5 * self.clear_m) & (apart.norm(dim=-1, keepdim=True) < 1.5 * self.clear_m)
-        away = torch.where(apart.norm(dim=-1, keepdim=True) < 0.6 * self.clear_m, outward, around)
+        around = -to_goal + side * (self.clear_m - distance) / self.clear_m * 3.0
+        in_the_way = (along > -0.5 * self.clear_m) & (distance < 1.5 * self.clear_m)
+        away = torch.where(distance < 0.6 * self.clear_m, outward, around)
         heading = torch.where(in_the_way, away, behind - robot)
         return _at_speed(torch.where(runs_up, ball + 0.5 * to_goal - robot, heading), self.speed)
 

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.ball import BALL_RADIUS_M, ROLLING_M_S2
 from astra_data.mazes import Maze
 from astra_data.nao.links import (
     ARM,
@@ -41,14 +42,11 @@ ROLL_TORQUE_NM = 8.0
 PITCH_TORQUE_NM = 5.5
 """Likewise between 1.6 and 7.8."""
 WALL_HEIGHT_M = 0.5
-BALL_RADIUS_M = 0.050
 BALL_MASS_KG = 0.045
-"""Radius and mass of SimRobot's model of the league's ball."""
-BALL_DECELERATION = 0.30
-"""In m/s², of a rolling ball, from B-Human's ball specification."""
+"""Of SimRobot's model of the league's ball."""
 GRAVITY = 9.81
 # A rolling solid sphere is slowed by c g / (1.4 R), c being the coefficient of rolling friction.
-_ROLLING_M = BALL_DECELERATION * 1.4 * BALL_RADIUS_M / GRAVITY
+_ROLLING_M = ROLLING_M_S2 * 1.4 * BALL_RADIUS_M / GRAVITY
 _SOLE_POINT_RADIUS_M = 0.005
 # Bits of what collides with what.
 _FLOOR, _WALL, _LEG = 1, 2, 4

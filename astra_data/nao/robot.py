@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.ant import rotation_matrix
+from astra_data.ball import BALL_RADIUS_M
 from astra_data.cores import cores
 from astra_data.errors import BadInputError
 from astra_data.mazes import Maze
 from astra_data.nao.bodies import MOTORS, TICKS, BatchedBodies
-from astra_data.nao.body import BALL_RADIUS_M, TICK_S, nao_model
+from astra_data.nao.body import TICK_S, nao_model
 from astra_data.nao.kinematics import TO_MOTORS, leg_angles
 from astra_data.nao.links import HIP_OFFSET_Z_M
 from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits

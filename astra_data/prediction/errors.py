@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.prediction.motion import chained, turned, wrapped
+from astra_data.geometry import turned
+from astra_data.prediction.motion import chained, wrapped
 from astra_data.prediction.predictors import Predictor
 from astra_data.prediction.rollouts import predict
 from astra_data.prediction.walks import Stretch, Walks

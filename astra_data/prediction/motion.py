@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from astra_data.geometry import turned
+
 MIRROR = (1.0, -1.0, -1.0)
 """What a mirror image does to forward, left and turn."""
 
@@ -10,13 +12,6 @@ MIRROR = (1.0, -1.0, -1.0)
 def wrapped(angle_rad: Tensor) -> Tensor:
     """Return angles (...) in [-π, π)."""
     return (angle_rad + torch.pi) % (2 * torch.pi) - torch.pi
-
-
-def turned(vector: Tensor, angle_rad: Tensor) -> Tensor:
-    """Turn vectors (..., 2) by angles (...), counterclockwise."""
-    x, y = vector.unbind(-1)
-    cos, sin = angle_rad.cos(), angle_rad.sin()
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
 
 
 def between(before: Tensor, after: Tensor) -> Tensor:

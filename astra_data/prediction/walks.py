@@ -8,7 +8,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from astra_data.errors import BadInputError
-from astra_data.prediction.motion import MIRROR, between, turned
+from astra_data.geometry import turned
+from astra_data.prediction.motion import MIRROR, between
 from astra_data.prediction.recordings import Piece
 from astra_data.recipe import Config, Count
 from astra_data.sims.planar_walker import PlanarWalker

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from astra_data.columns import Column
+from astra_data.geometry import turned
 
 FORWARD_M_S = 0.25
 BACKWARD_M_S = 0.15
@@ -68,10 +69,7 @@ class PlanarWalker:
         # The exact chord of an arc: (1 - cos t) / t = sin(t/2)² / (t/2), and sinc is defined at 0.
         along, across = torch.sinc(turn / torch.pi), torch.sinc(turn / 2 / torch.pi) * torch.sin(turn / 2)
         ahead, aside = along * forward - across * left, across * forward + along * left
-        cos, sin = heading.cos(), heading.sin()
-        position = self.state[:, :2] + torch.stack(
-            [cos * ahead - sin * aside, sin * ahead + cos * aside], dim=-1
-        )
+        position = self.state[:, :2] + turned(torch.stack([ahead, aside], dim=-1), heading)
         pose = torch.cat([position, (heading + turn)[:, None]], dim=-1)
         self.state = torch.cat([pose, velocity, self.state[:, 6:]], dim=-1)
         return self.state

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 
 from astra_data.ant import ant_model, wall_geoms
+from astra_data.ball import BALL_RADIUS_M
 from astra_data.mazes import U_MAZE
-from astra_data.nao.body import BALL_MASS_KG, BALL_RADIUS_M, SUBSTEPS, TICK_S, nao_model
+from astra_data.nao.body import BALL_MASS_KG, SUBSTEPS, TICK_S, nao_model
 from astra_data.nao.links import LEG_JOINTS
 
 
