@@ -99,12 +99,12 @@ class GoalDistance:
     cell_m: float
 
     @classmethod
-    def of_maze(cls, maze: Maze, *, spacing_m: float) -> "GoalDistance":
-        """Compute the fields for 7 x 7 goals, `spacing_m` apart, around the middle of the goal's cell."""
+    def of_maze(cls, maze: Maze, *, spacing_m: float, radius_m: float = 0.0) -> "GoalDistance":
+        """Compute a disc's fields for 7 x 7 goals, `spacing_m` apart, around the goal cell's middle."""
         steps = np.arange(-3, 4) * spacing_m
         centre = np.array(maze.cell_centre(*maze.goal))
         lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + centre
-        fields = np.stack([maze.distance_field(goal) for goal in lattice])
+        fields = np.stack([maze.distance_field(goal, radius=radius_m) for goal in lattice])
         return cls(
             torch.from_numpy(fields).float(),
             torch.from_numpy(lattice).float(),

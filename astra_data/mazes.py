@@ -83,13 +83,14 @@ class Maze:
         """Return the distance in m from `points` (..., 2) to the nearest wall."""
         return np.asarray(self.clearance_field[self.fine_index(points)])
 
-    def distance_field(self, goal: Floats, margin: float = 0.0) -> Floats:
+    def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
-        Paths keep `margin` m from the walls where they can: closer cells cost more the closer they are.
-        Wall cells take the value of the nearest free cell plus the way out of the wall.
+        Cells within `radius` m of a wall are not free, and the goal's must be. Paths keep `margin` m from the
+        walls where they can: closer cells cost more the closer they are. Cells that are not free take the
+        value of the nearest one that is, plus the way to it.
         """
-        free = ~self.fine_walls
+        free = self.clearance_field > radius
         numbers = np.full(free.shape, -1)
         numbers[free] = np.arange(free.sum())
         cost = np.ones(free.shape)
@@ -108,7 +109,7 @@ class Maze:
         graph = coo_array(entries, shape=(count, count)).tocsr()
         source = int(numbers[self.fine_index(goal)])
         lengths = np.asarray(dijkstra(graph, directed=False, indices=source)) * self.fine_m
-        into_wall, nearest = distance_transform_edt(self.fine_walls, return_indices=True)
+        into_wall, nearest = distance_transform_edt(~free, return_indices=True)
         field = np.zeros(free.shape)
         field[free] = lengths
         return np.asarray(field[tuple(nearest)] + into_wall * self.fine_m)
@@ -133,7 +134,13 @@ LONG_MAZE = Maze(
 )
 """Two U's in a row, four right-angle turns, 40 m along the centre line: ours, the paper prints no layout."""
 
-S_MAZE = Maze(rows=LONG_MAZE.rows, scale=1.0, start=(1, 1), goal=(5, 3), fine_m=0.05)
+S_MAZE = Maze(
+    rows=("111111", "100001", "111101", "100001", "101111", "100001", "111111"),
+    scale=1.0,
+    start=(1, 1),
+    goal=(5, 4),
+    fine_m=0.05,
+)
 """An S with corridors of 1 m on half a field of RoboCup's Standard Platform League: ours, likewise."""
 
 FIELD = Maze(

@@ -1,7 +1,7 @@
 """The navigation task: reach a goal in a maze. The same in every world, so that rewards compare.
 
-The paper prints no reward. Ours: metres of progress along the shortest free path to the goal, +10 for
-reaching it, -10 for ending badly; sparse and Euclidean-dense forms are options.
+The paper prints no reward. Ours: progress along the shortest free path to the goal, +10 for reaching it, and
+less for ending badly; sparse and Euclidean-dense forms are options.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,10 @@ class Navigation(Objective):
     """Reach the goal of `maze` within `horizon` steps.
 
     Attributes:
-        reward_kind: "geodesic" (metres of progress along the corridors), "euclidean" (of the straight
-            distance) or "sparse" (none), each plus the bonuses below.
+        reward_kind: "geodesic" (progress along the corridors), "euclidean" (along the straight line) or
+            "sparse" (none), each plus the bonuses of success and failure.
+        metre_reward: for a metre of progress.
+        path_clearance_m: distance from the walls kept by the shortest free path.
         success_radius_m: closer to the goal than this is success and ends the episode.
         spread_m: standard deviation of start and goal around their cells' centres, per axis.
         start_clearance_m: distance from the walls kept by starts drawn anywhere.
@@ -33,6 +35,8 @@ class Navigation(Objective):
     """
 
     reward_kind: RewardKind = "geodesic"
+    metre_reward: float = 1.0
+    path_clearance_m: float = 0.0
     success_radius_m: float = 0.45
     spread_m: float = 0.2
     start_clearance_m: float = 0.8
@@ -41,7 +45,7 @@ class Navigation(Objective):
     @cached_property
     def goal_distance(self) -> GoalDistance:
         """Path lengths to goals near the maze's goal cell."""
-        return GoalDistance.of_maze(self.maze, spacing_m=self.spread_m)
+        return GoalDistance.of_maze(self.maze, spacing_m=self.spread_m, radius_m=self.path_clearance_m)
 
     @cached_property
     def _goal_distances(self) -> dict[torch.device, GoalDistance]:
@@ -100,7 +104,7 @@ class Navigation(Objective):
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states that begin with the position, (B, 2 or more)."""
         bonus = self.success_reward * self.reached(after, goal) + self.failure_reward * failed
-        return self.progress(before, after, goal) + bonus
+        return self.metre_reward * self.progress(before, after, goal) + bonus
 
 
 def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:

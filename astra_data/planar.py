@@ -16,7 +16,7 @@ class PlanarStates:
     Attributes:
         state: (B, X) float32.
         free: where the disc's centre may be.
-        blocked: (B,) bool, a wall stopped the disc in the last step.
+        blocked: (B,) bool, a wall stopped the disc in the last step, or in its correction.
     """
 
     def __init__(self, maze: Maze, num_envs: int, state_size: int, *, radius_m: float, device: str) -> None:
@@ -33,8 +33,13 @@ class PlanarStates:
             self.blocked = self.blocked.index_fill(0, rows, False)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the discs from `before` towards `landed`, both (B, X); all else is that of `landed`."""
-        position, self.blocked = self.free.slide(before[:, :2], landed[:, :2])
+        """Slide the discs from `before` towards `landed`, both (B, X); all else is that of `landed`.
+
+        What the step did itself still counts as a touch: otherwise policies lean on walls that the correction
+        draws them away from.
+        """
+        position, stopped = self.free.slide(before[:, :2], landed[:, :2])
+        self.blocked = self.blocked | stopped
         self.reset_to(torch.cat([position, landed[:, 2:]], dim=-1))
         return self.state
 

@@ -64,6 +64,20 @@ def test_distance_in_a_wall_grows_inward() -> None:
     assert depths == pytest.approx([2.05, 2.55, 3.05], rel=0.05)
 
 
+def test_a_disc_goes_around_corners_at_its_radius() -> None:
+    # A tight string: a tangent to the circle about each corner, an arc, and the wall's end between them.
+    apart = np.hypot(6.0, 2.0)
+    arc = np.arctan2(2.0, -6.0) - np.arccos(1.0 / apart)
+    length = 2 * (np.sqrt(apart**2 - 1.0) + arc) + 4.0
+    goal, start = np.array([-4.0, -4.0]), U_MAZE.fine_index(np.array([-4.0, 4.0]))
+    assert U_MAZE.distance_field(goal, radius=1.0)[start] == pytest.approx(length, rel=0.03)
+    # 0.5 m from a wall it is 0.5 m from where it may be: in the aisle's middle, 1 m on.
+    field = U_MAZE.distance_field(goal, radius=1.0)
+    assert field[U_MAZE.fine_index(np.array([0.0, -5.45]))] == pytest.approx(
+        field[U_MAZE.fine_index(np.array([0.0, -4.95]))] + 0.5, abs=0.15
+    )
+
+
 def test_a_margin_keeps_paths_away_from_corners() -> None:
     goal, start = np.array([-4.0, -4.0]), U_MAZE.fine_index(np.array([-4.0, 4.0]))
     wide = U_MAZE.distance_field(goal, margin=1.0)

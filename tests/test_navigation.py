@@ -36,6 +36,17 @@ def test_success_and_toppling_are_paid_once_each() -> None:
     assert reward.tolist() == pytest.approx([10.0, 0.0, -10.0, 0.0], abs=1e-5)
 
 
+def test_a_metre_is_paid_as_the_task_says() -> None:
+    goal = torch.tensor([[-4.0, -4.0]])
+    before, after, failed = (
+        goal + torch.tensor([[2.0, 0.0]]),
+        goal + torch.tensor([[1.0, 0.0]]),
+        goal[:, 0] > 0,
+    )
+    task = Navigation(U_MAZE, horizon=700, metre_reward=4.0)
+    assert float(task.reward(before, after, goal, failed)) == pytest.approx(4.0, abs=0.1)
+
+
 @pytest.mark.parametrize("maze", [U_MAZE, LONG_MAZE])
 def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
     task = Navigation(maze, horizon=1)

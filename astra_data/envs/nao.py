@@ -24,6 +24,8 @@ SPEED_M_S = 0.25
 TURN_GAIN_PER_S = 2.0
 """Rate per rad at which a robot turns to where it goes."""
 TURN_LIMIT_RAD_S = 1.0
+SEARCH_AFTER_S = 1.5
+"""A robot that has not seen its ball for longer looks around for it."""
 _STANDING = 0.05
 """Shorter commands turn nobody."""
 _FOOT_LOAD_N = 50.0
@@ -184,7 +186,7 @@ class NaoEnv:
     def _body_command(self, action: Tensor) -> Floats:
         """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3), as believed.
 
-        Robots turn to where they go, or to their ball.
+        Robots turn to where they go, or to their ball, or look around for it.
         """
         command = action.clamp(-1.0, 1.0).double().numpy()
         x, y = (SPEED_M_S * command).T
@@ -197,6 +199,8 @@ class NaoEnv:
         astray = wrapped(ahead - heading)
         turn = (TURN_GAIN_PER_S * astray).clip(-TURN_LIMIT_RAD_S, TURN_LIMIT_RAD_S)
         turn *= np.linalg.norm(command, axis=1) > _STANDING
+        if self.has_ball:
+            turn = np.where(self.sight.unseen_s > SEARCH_AFTER_S, TURN_LIMIT_RAD_S, turn)
         return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
 
     def state_dict(self) -> dict[str, Tensor]:

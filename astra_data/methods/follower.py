@@ -42,7 +42,7 @@ class CarefulFollower:
     def fields(self, goals: Tensor) -> Tensor:
         """Return the cost of going from each fine cell to each of `goals` (B, 2), (B, height, width)."""
         margin_m = self.margin * self.maze.scale
-        fields = [self.maze.distance_field(goal, margin_m) for goal in goals.numpy()]
+        fields = [self.maze.distance_field(goal, margin=margin_m) for goal in goals.numpy()]
         return torch.from_numpy(np.stack(fields)).float()
 
     def command(self, position: Tensor, goal: Tensor, fields: Tensor) -> Tensor:
@@ -67,37 +67,36 @@ class CarefulFollower:
 
 @dataclass(frozen=True)
 class CarefulKicker:
-    """Walk around the ball to the place behind it, then straight through it.
+    """Walk to the place behind the ball, around the ball where it is near, and from there through it.
 
     Attributes:
         clear_m: distance from the ball on the way around it.
-        width_m: how far beside the line through ball and goal a run-up may be.
+        cone_rad: it walks through the ball where the way to it and on to the goal bends by less than this.
+        rolls_m_s: balls that seem slower than this are taken to lie still.
         speed: of the faster axis, in units of commands.
     """
 
-    clear_m: float = 0.4
-    width_m: float = 0.08
+    clear_m: float = 0.35
+    cone_rad: float = np.pi / 7
+    rolls_m_s: float = 0.3
     speed: float = 0.85
 
     def command(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return velocity commands (B, 2) at abstract states (B, 8) for goals (B, 2)."""
         robot, _, ball, rolling = state.split(2, dim=-1)
-        ball = ball + rolling  # Where it will be in a second.
+        rolls = rolling.norm(dim=-1, keepdim=True) > self.rolls_m_s
+        ball = ball + rolls * rolling  # Where it will be in a second.
         to_goal = torch.nn.functional.normalize(goal - ball, dim=-1)
-        apart = robot - ball
-        distance = apart.norm(dim=-1, keepdim=True)
-        along = (apart * to_goal).sum(-1, keepdim=True)
-        beside = apart - along * to_goal
-        runs_up = (along < -0.1) & (beside.norm(dim=-1, keepdim=True) < self.width_m)
+        distance = (robot - ball).norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        outward = (robot - ball) / distance
+        kicks = -(outward * to_goal).sum(-1, keepdim=True) > np.cos(self.cone_rad)
+        # Along a circle about the ball, the shorter way.
+        left = torch.stack([-outward[:, 1], outward[:, 0]], dim=-1)
+        shorter = -(left * to_goal).sum(-1, keepdim=True).sign()
+        around = shorter * left + 2 * (1 - distance / self.clear_m) * outward
         behind = ball - self.clear_m * to_goal
-        # In the way: the ball is nearer than the place behind it, so go along a circle around it.
-        outward = apart / distance.clamp_min(1e-12)
-        side = torch.nn.functional.normalize(beside, dim=-1)
-        around = -to_goal + side * (self.clear_m - distance) / self.clear_m * 3.0
-        in_the_way = (along > -0.5 * self.clear_m) & (distance < 1.5 * self.clear_m)
-        away = torch.where(distance < 0.6 * self.clear_m, outward, around)
-        heading = torch.where(in_the_way, away, behind - robot)
-        return _at_speed(torch.where(runs_up, ball + 0.5 * to_goal - robot, heading), self.speed)
+        way = torch.where(distance < 1.5 * self.clear_m, around, behind - robot)
+        return _at_speed(torch.where(kicks, -outward, way), self.speed)
 
 
 def _at_speed(heading: Tensor, speed: float) -> Tensor:

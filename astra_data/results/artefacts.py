@@ -1,5 +1,6 @@
 """Read what the other stages left behind: a missing key is an error, an extra one is not."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -183,3 +184,39 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
     if missing:
         raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")
     return {name: tensor.astype(np.float64) for name, tensor in tensors.items()}
+
+
+def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
+    """Return the episodes per row and seed of all rows.
+
+    Raises:
+        BadInputError: rows were evaluated differently.
+    """
+    files = [file for of_seeds in evaluations.values() for file in of_seeds.values()]
+    episodes = files[0].episodes
+    wrong = [f"{file.method} seed {file.seed} on {file.task}" for file in files if file.task != task]
+    wrong += [
+        f"{file.method} seed {file.seed} with {file.episodes} episodes"
+        for file in files
+        if file.episodes != episodes
+    ]
+    legs = files[0].leg_scale
+    wrong += [
+        f"{file.method} seed {file.seed} with legs {file.leg_scale:g} times as long"
+        for file in files
+        if file.leg_scale != legs
+    ]
+    if wrong:
+        raise BadInputError(
+            f"expected every row evaluated on {task} with {episodes} episodes, got {', '.join(wrong)}; "
+            "evaluate those rows again"
+        )
+    return episodes
+
+
+def way_to_success(path: Path, evaluation: Evaluation) -> float:
+    """Return the robot's mean way in m in the episodes at `path` that succeeded, NaN for none."""
+    robot = read_tensors(path, ("target.position",))["target.position"][..., :2]
+    ways = np.nansum(np.linalg.norm(np.diff(robot, axis=1), axis=-1), axis=1)
+    succeeded = ways[np.array(evaluation.target.success, dtype=bool)]
+    return float(succeeded.mean()) if len(succeeded) else float("nan")

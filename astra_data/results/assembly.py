@@ -16,6 +16,8 @@ from astra_data.results.artefacts import (
     Evaluation,
     Gap,
     Metrics,
+    check_alike,
+    way_to_success,
 )
 from astra_data.results.costs import Files, row_cost, seconds, throughput
 from astra_data.results.model import (
@@ -50,6 +52,7 @@ def assemble(
     replicates: int,
     groundings: Mapping[str, str] | None = None,
     percent: int | None = None,
+    paper_success: Mapping[str, float] | None = None,
 ) -> Results:
     """Read the artefacts under `root` of every row, for those of the seeds `asked` for that it has finished.
 
@@ -63,7 +66,7 @@ def assemble(
     read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
-    episodes = _check_alike(evaluations, task)
+    episodes = check_alike(evaluations, task)
     metrics = read.optional("ground", "metrics.json", Metrics)
     gaps = read.optional("ground", "gap.json", Gap)
     curves = read.optional("train", "curve.json", CurveFile)
@@ -83,6 +86,10 @@ def assemble(
             method,
             of_seeds,
             grounding,
+            [
+                way_to_success(read.path("evaluate", method, seed, TRAJECTORIES), file)
+                for seed, file in of_seeds.items()
+            ],
             gap_means.get(grounding),
             list(curves.get(method, {}).values()),
             row_cost(
@@ -118,6 +125,7 @@ def assemble(
         episodes=episodes,
         leg_scale=next(file.leg_scale for of_seeds in evaluations.values() for file in of_seeds.values()),
         methods=rows,
+        paper_success={row: value for row, value in (paper_success or {}).items() if row in rows},
         unfinished=[method_title(method) for method in methods if method not in rows],
         probability_of_improvement=_improvement(rows, replicates),
         predictive_validity=_validity(rows, replicates),
@@ -129,34 +137,11 @@ def _listed[T: Artefact](files: Mapping[str, Mapping[int, T]]) -> dict[str, list
     return {row: list(of_seeds.values()) for row, of_seeds in files.items()}
 
 
-def _check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
-    """Return the episodes per row and seed after checking that rows can be compared."""
-    files = [file for of_seeds in evaluations.values() for file in of_seeds.values()]
-    episodes = files[0].episodes
-    wrong = [f"{file.method} seed {file.seed} on {file.task}" for file in files if file.task != task]
-    wrong += [
-        f"{file.method} seed {file.seed} with {file.episodes} episodes"
-        for file in files
-        if file.episodes != episodes
-    ]
-    legs = files[0].leg_scale
-    wrong += [
-        f"{file.method} seed {file.seed} with legs {file.leg_scale:g} times as long"
-        for file in files
-        if file.leg_scale != legs
-    ]
-    if wrong:
-        raise BadInputError(
-            f"expected every row evaluated on {task} with {episodes} episodes, got {', '.join(wrong)}; "
-            "evaluate those rows again"
-        )
-    return episodes
-
-
 def _row(
     method: str,
     of_seeds: Mapping[int, Evaluation],
     grounding: str,
+    distances: Sequence[float],
     gap: GapMeans | None,
     curves: Sequence[CurveFile],
     cost: dict[str, Cost],
@@ -169,6 +154,8 @@ def _row(
     simulated = _in_world(evaluations, "simulated", "success")
     returns = {world: _in_world(evaluations, world, "return") for world in SHARED_WORLDS}
     summarised = measures | ({} if simulated is None else {"simulated_success": simulated})
+    went = [distance for distance in distances if not np.isnan(distance)]
+    summarised |= {"distance": went} if went else {}
     measured = [{name: sorted(of) for name, of in file.encoders.items()} for file in evaluations]
     _require_alike(measured, "encoders")
     encoders = {
@@ -184,6 +171,7 @@ def _row(
         wall_contact=measures["wall_contact"],
         steps=measures["steps"],
         returns=measures["return"],
+        distance=list(distances),
         simulated_success=simulated,
         simulator_returns={world: values for world, values in returns.items() if values is not None},
         encoders=encoders,

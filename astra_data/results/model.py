@@ -119,6 +119,8 @@ class MethodResults(Part):
     returns: list[float] = Field(
         validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
     )
+    distance: list[Number]
+    """Way of the robot in an episode that succeeds, in m; NaN for a seed where none does."""
     simulated_success: list[float] | None
     """Success in the simulator that the policy was trained in; None for a row that was in none."""
     simulator_returns: dict[str, list[float]]
@@ -126,7 +128,7 @@ class MethodResults(Part):
     encoders: dict[str, dict[str, list[float]]]
     """The same measures by encoder, where a row has more than one."""
     summary: dict[str, Summary]
-    """Every measure above over seeds."""
+    """Every measure above over seeds; of the distance over those that have one."""
     grounding: str | None
     """Name of the row's folder of groundings, which rows may share."""
     gap: GapMeans | None
@@ -159,6 +161,8 @@ class Results(Part):
     leg_scale: float = 1.0
     """Of the target's robot, which the data was not collected with if it is not 1."""
     methods: dict[str, MethodResults]
+    paper_success: dict[str, float] = Field(default_factory=dict)
+    """Row → what the paper prints for it."""
     unfinished: list[str] = Field(default_factory=list)
     """Titles of the recipe's rows that no seed of is finished yet."""
     probability_of_improvement: dict[str, dict[str, Comparison]]

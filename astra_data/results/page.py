@@ -52,6 +52,7 @@ COLUMNS = (
     "failed",
     "wall contact",
     "steps",
+    "way to success in m",
     "return",
     "success in its simulator",
 )
@@ -103,18 +104,22 @@ def _table(results: Results) -> str:
     rows = results.methods
     best = max((row.summary["success"].mean for row in rows.values() if not row.role), default=None)
     lines = []
-    for row in rows.values():
+    paper = results.paper_success
+    for method, row in rows.items():
         summary = row.summary
         success = spread(summary["success"], 2)
+        printed = f"{paper[method]:.2f}" if method in paper else "-"
         lines.append(
             [
                 f"{row.title} ({row.role})" if row.role else row.title,
                 str(len(row.seeds)),
                 f"**{success}**" if not row.role and summary["success"].mean == best else success,
+                *([printed] if paper else []),
                 interval(summary["success"].iqm, summary["success"].low, summary["success"].high),
                 spread(summary["failed"], 2),
                 spread(summary["wall_contact"], 2),
                 spread(summary["steps"], 0),
+                spread(summary["distance"], 1) if "distance" in summary else "-",
                 spread(summary["return"], 1),
                 spread(summary["simulated_success"], 2) if "simulated_success" in summary else "-",
             ]
@@ -126,7 +131,14 @@ def _table(results: Results) -> str:
     )
     if any(map(is_plus, rows)):
         note += " A plus marks the same method trained with the recipe's `[plus]` settings."
-    return f"## Results\n\n{table(COLUMNS, lines)}\n\n{note}"
+    head = list(COLUMNS)
+    if paper:
+        head.insert(head.index("success") + 1, "the paper's")
+        note += (
+            " The paper's success rates are of its own robot, maze and tuning, which it does not print in "
+            "full: their order can be compared, their heights cannot."
+        )
+    return f"## Results\n\n{table(head, lines)}\n\n{note}"
 
 
 def _comparison(results: Results) -> str:

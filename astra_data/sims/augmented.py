@@ -12,7 +12,7 @@ class AugmentedSimulator:
 
     Attributes:
         state: corrected abstract states, (B, X). hidden: memory of the model, (B, M).
-        blocked: (B,) bool, the last correction was stopped at a wall.
+        blocked: (B,) bool, the last step or its correction was stopped at a wall.
     """
 
     def __init__(

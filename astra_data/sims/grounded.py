@@ -12,7 +12,7 @@ class GroundedSimulator:
 
     Attributes:
         state: corrected abstract states, (B, X). latent: z, (B, Z).
-        blocked: (B,) bool, the last correction was stopped at a wall.
+        blocked: (B,) bool, the last step or its correction was stopped at a wall.
     """
 
     def __init__(

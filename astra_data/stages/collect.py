@@ -10,7 +10,7 @@ from pydantic import model_validator
 from torch import Tensor
 
 from astra_data.batched import TargetEnv
-from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands
+from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands, WallWatch
 from astra_data.columns import (
     ACTION,
     DONE,
@@ -60,6 +60,9 @@ class CollectConfig(Config):
     """Where episodes start: anywhere in the free space, or where the task does."""
     hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
+    clearance_m: NotNegative = 0.0
+    """A random command is given up once it would lead closer to a wall than this within a second, as
+    somebody who steers a robot by hand would; 0: never."""
     ppo_steps: Count = 300_000
     """Environment steps after which the suboptimal policy's training is stopped."""
     policy: str | None = None
@@ -162,7 +165,8 @@ def _behavior(
     """Return what acts, and what is to be told about it."""
     if config.behavior == "random":
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
-        return RandomCommands((fewest, most)), {}
+        watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
+        return RandomCommands((fewest, most), watch), {}
     if config.behavior == "suboptimal_ppo":
         from astra_data.suboptimal import suboptimal_policy  # noqa: PLC0415 - TorchRL is slow to import
 

@@ -32,7 +32,7 @@ from astra_data.mazes import Maze
 from astra_data.methods import method_named
 from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.recipe import Config, Share
 from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.results.assembly import assemble
 from astra_data.results.files import Found, publish_results, write_results
@@ -54,6 +54,9 @@ class ReportConfig(Config):
 
     trajectory_episodes: int = Field(default=12, ge=1)
     """Episodes drawn per row and world, the first ones of the row's first seed."""
+
+    paper_success: dict[str, Share] = Field(default_factory=dict)
+    """Row → what the paper prints for it, shown beside ours."""
 
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
     """Resamples behind each interval."""
@@ -114,6 +117,8 @@ def report(
             seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated differently.
     """
+    for row in (*config.trajectory_methods, *config.paper_success):
+        method_named(row)
     sizes = _with_common_rows(
         assemble(
             recipe.name,
@@ -125,6 +130,7 @@ def report(
             replicates=config.bootstrap_replicates,
             groundings=recipe.groundings,
             percent=percent,
+            paper_success=config.paper_success,
         )
         for percent in recipe.percents or (None,)
     )
@@ -193,8 +199,6 @@ def _success(results: Results) -> Figure:
 
 def _trajectories(results: Results, root: Path, maze: Maze, config: ReportConfig) -> Figure:
     panels = []
-    for row in config.trajectory_methods:
-        method_named(row)
     drawn = [row for row in config.trajectory_methods if row in results.methods]
     for method in drawn or results.methods:
         folder = root / "evaluate" / method / f"seed_{results.methods[method].seeds[0]}"

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,23 @@ def test_robots_with_a_ball_keep_facing_it() -> None:
     np.testing.assert_allclose(np.cos(bearing), 1.0, atol=0.1)
 
 
+def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
+    one = env("nao-kick", 2, errors=NO_ERRORS)
+    place, ball = np.zeros((2, 3)), np.array([[-0.8, 0.0], [0.8, 0.0]])
+    one.robots.reset(np.arange(2), place, np.random.default_rng(0), ball)
+    one.localisation.reset(np.arange(2), place, np.random.default_rng(0))
+    # Both believe that it lies in front of them.
+    one.sight.reset(np.arange(2), ball[[1, 1]])
+    one.sight.errors = replace(NO_ERRORS, ball_seen_rad=np.pi / 2)
+    heading = []
+    for _ in range(40):
+        one.step(torch.zeros(2, 2))
+        heading.append(one.robots.pose[:, 2])
+    assert np.abs(heading)[:, 0].max() > np.pi / 2
+    assert np.abs(heading)[:, 1].max() < 0.2
+    np.testing.assert_allclose(one.sight.position, ball, atol=0.1)
+
+
 def test_touching_a_wall_fails() -> None:
     one = env(count=2)
     for _ in range(60):
@@ -68,7 +86,7 @@ def test_touching_a_wall_fails() -> None:
     assert one.failed.tolist() == [True, False]
     assert one.wall_contact.tolist() == [True, False]
     assert step.terminated.tolist() == [True, False]
-    assert step.reward[0] < -9
+    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
 
 
 def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:

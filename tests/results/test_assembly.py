@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_runs import ROWS, SEEDS, edit_json, write_iql, write_runs
+from safetensors.numpy import load_file, save_file
 from scipy.stats import pearsonr
 
 from astra_data.errors import BadInputError, MissingStageError
@@ -42,6 +43,37 @@ def test_results_are_the_ones_worked_out_by_hand(results: Results) -> None:
     assert results.methods["follower"].learning == []
     assert (results.methods["direct_transfer"].role, results.methods["follower"].role) == ("floor", "ceiling")
     assert (results.seeds, results.episodes) == ([0, 1, 2], 4)
+
+
+def test_the_way_is_that_of_the_robot_in_episodes_that_succeed(root: Path) -> None:
+    def add_a_ball(seed: int) -> None:
+        path = root / f"evaluate/direct_transfer/seed_{seed}/trajectories.safetensors"
+        tensors = load_file(path)
+        robot = tensors["target.position"]
+        robot[0, 1:4] = robot[0, 0] + np.array([[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]])
+        robot[0, 4] = np.nan
+        tensors["target.position"] = np.concatenate([robot, -7 * robot], axis=-1)
+        save_file(tensors, path)
+
+    add_a_ball(0)
+    rows = assembled(root).methods
+    # Of four episodes of seed 0 the first alone succeeds, of seed 1 none; the others go 8 m.
+    assert rows["direct_transfer"].distance == pytest.approx([15.0, np.nan, 8.0], nan_ok=True)
+    assert rows["direct_transfer"].summary["distance"].mean == pytest.approx(11.5)
+
+
+def test_the_papers_figures_are_told_of_rows_that_are_there(root: Path) -> None:
+    found = assemble(
+        "antmaze_u",
+        "antmaze-u",
+        ROWS,
+        SEEDS,
+        root=root,
+        command="",
+        replicates=100,
+        paper_success={"astra": 0.4, "nas": 0.27},
+    )
+    assert found.paper_success == {"astra": 0.4}
 
 
 GROUND_SPEEDS = {

@@ -46,6 +46,18 @@ def test_corrections_stop_at_walls() -> None:
     assert float(state[0, 0]) == pytest.approx(HERE[0] + 0.05, abs=1e-5)
 
 
+def test_leaning_on_a_wall_is_a_touch_though_the_correction_draws_away_from_it() -> None:
+    one = simulator(2)
+    correct_by(one, (0.0, -0.2, 0.0, 0.0))
+    near_and_far = torch.tensor([[-4.0, 5.89, 0.0, 0.0], [-4.0, 5.0, 0.0, 0.0]])
+    one.reset_to(near_and_far, torch.arange(2))
+    state = one.step(torch.tensor([[0.0, 1.0]]).expand(2, 2))
+    assert float(state[0, 1]) < 5.75
+    assert one.blocked.tolist() == [True, False]
+    one.step(torch.tensor([[1.0, 0.0]]).expand(2, 2))
+    assert one.blocked.tolist() == [False, False]
+
+
 def test_a_reset_empties_the_memory_of_its_rows_alone() -> None:
     one, fresh = simulator(3), simulator(3)
     for _ in range(5):

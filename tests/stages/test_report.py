@@ -89,11 +89,28 @@ def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN
         "wall_contact",
         "steps",
         "return",
+        "distance",
         "simulated_success",
     }
     assert set(row["summary"]["success"]) == {"mean", "std", "iqm", "low", "high"}
     learning = {"steps": [0.0, 1000.0, 2000.0], "success": [None, 0.5, 0.75]}
     assert row["learning"] == [learning] * 3
+
+
+def test_the_papers_figures_stand_beside_ours(root: Path, folder: Path) -> None:
+    assert "the paper's" not in (folder / "results.md").read_text()
+    config = CONFIG.model_copy(update={"paper_success": {"astra": 0.4}})
+    report(FakeRecipe(), root=root, command="", publish=None, progress=lambda *_: None, config=config)
+    page = (root / "report/results.md").read_text()
+    assert "| method | seeds | success | the paper's | IQM [95 %] |" in page
+    assert "| ASTRA | 3 | 0.50 ± 0.25 | 0.40 | " in page
+    assert "their heights cannot" in page
+
+
+def test_a_paper_figure_of_no_row_is_refused(root: Path) -> None:
+    config = CONFIG.model_copy(update={"paper_success": {"astar": 0.4}})
+    with pytest.raises(BadInputError, match="astar"):
+        report(FakeRecipe(), root=root, command="", publish=None, progress=lambda *_: None, config=config)
 
 
 def test_origin_is_what_the_artefacts_recorded(values: Any, folder: Path) -> None:  # noqa: ANN401 - JSON
