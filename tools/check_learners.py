@@ -185,7 +185,6 @@ def ppo(seed: int, *, memory_size: int = 0) -> Returns:
         learning_rate=1e-3,
         discount=0.9,
         entropy_weight=0.0,
-        reward_scale=0.1,
     )
     env = Pendulums(64, seed=seed, hide_velocity=memory_size > 0)
     torch.manual_seed(seed)

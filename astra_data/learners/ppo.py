@@ -27,7 +27,7 @@ from astra_data.seeding import derive
 class PpoConfig(Config):
     """Settings of proximal policy optimisation."""
 
-    total_steps: Count = 2_000_000
+    total_steps: Count = 4_000_000
     """Environment steps in all."""
     rollout_steps: Count = 64
     """Steps of every environment per iteration."""
@@ -49,7 +49,7 @@ class PpoConfig(Config):
     """Of the critic's squared error in the loss."""
     gradient_norm: Positive = 0.5
     """Gradients are clipped to this norm."""
-    reward_scale: Positive = 0.5
+    reward_scale: Positive = 0.1
     """Factor on the reward that the critic learns from."""
 
 
