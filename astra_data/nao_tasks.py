@@ -126,6 +126,8 @@ def _navigation(level: Level) -> Task:
             metre_reward=4.0,
             failure_reward=-4.0,
             path_clearance_m=0.25,
+            # Without them policies without a memory, whose position is not in the latent, do not learn it.
+            position_waves=3,
             ends_at_walls=True,
         ),
         make_target=partial(NaoEnv, level=level),

@@ -29,6 +29,8 @@ class Navigation(Objective):
         metre_reward: for a metre of progress.
         path_clearance_m: distance from the walls kept by the shortest free path.
         success_radius_m: closer to the goal than this is success and ends the episode.
+        position_waves: policies also see the sines and cosines of the position, along each axis: one wave
+            across the maze, and so many in all, each half as long as the one before.
         spread_m: standard deviation of start and goal around their cells' centres, per axis.
         start_clearance_m: distance from the walls kept by starts drawn anywhere.
         start_offsets_m: of the usual starts from the centre of the start's cell; each is as likely.
@@ -37,6 +39,7 @@ class Navigation(Objective):
     reward_kind: RewardKind = "geodesic"
     metre_reward: float = 1.0
     path_clearance_m: float = 0.0
+    position_waves: int = 0
     success_radius_m: float = 0.45
     spread_m: float = 0.2
     start_clearance_m: float = 0.8
@@ -82,10 +85,12 @@ class Navigation(Objective):
         return np.asarray(np.array(self.maze.cell_centre(*cell)) + noise)
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return position, velocity, goal and the way to it, (..., 8)."""
+        """Return position, velocity, goal and the way to it, (..., 8), and waves of the position."""
         half = torch.tensor(self.maze.half_extent, dtype=state.dtype, device=state.device)
         position, velocity = state[..., :2], state[..., 2:]
-        return torch.cat([position / half, velocity, goal / half, (goal - position) / half], dim=-1)
+        waves = [torch.pi * 2**octave * position / half for octave in range(self.position_waves)]
+        seen = [position / half, velocity, goal / half, (goal - position) / half]
+        return torch.cat([*seen, *map(torch.sin, waves), *map(torch.cos, waves)], dim=-1)
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell which of `state` (B, 2 or more), which begin with the position, are at their `goal` (B, 2)."""

@@ -36,6 +36,18 @@ def test_success_and_toppling_are_paid_once_each() -> None:
     assert reward.tolist() == pytest.approx([10.0, 0.0, -10.0, 0.0], abs=1e-5)
 
 
+def test_waves_tell_the_position_finely() -> None:
+    goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
+    state = torch.tensor([[5.0, 2.5, 0.0, 0.0], [-10.0, 10.0, 0.0, 0.0]])
+    plain = TASK.observe(state, goal)
+    seen = Navigation(U_MAZE, horizon=700, position_waves=2).observe(state, goal)
+    assert torch.equal(seen[:, :8], plain)
+    # The maze reaches from -10 to 10 m: a quarter and an eighth of a wave, then twice as much.
+    sines, cosines = seen[0, 8:12].tolist(), seen[0, 12:].tolist()
+    assert sines == pytest.approx([1.0, 0.5**0.5, 0.0, 1.0], abs=1e-6)
+    assert cosines == pytest.approx([0.0, 0.5**0.5, -1.0, 0.0], abs=1e-6)
+
+
 def test_a_metre_is_paid_as_the_task_says() -> None:
     goal = torch.tensor([[-4.0, -4.0]])
     before, after, failed = (
