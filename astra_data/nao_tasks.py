@@ -111,9 +111,29 @@ def _abstract(*, ball: bool) -> Column:
     return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **told)
 
 
-def _navigation(level: Level) -> Task:
+def _task(name: str, level: Level, *, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
+    """Return a task of what is `own` to it and what all of the NAO's tasks share."""
     return Task(
-        name="nao-navigation" if level == "mujoco" else f"nao-navigation-{level}",
+        name=name if level == "mujoco" else f"{name}-{level}",
+        make_target=partial(NaoEnv, level=level, ball=ball),
+        beyond=nao_beyond,
+        state_columns=_columns(ball=ball),
+        abstract_state=_abstract(ball=ball),
+        timestep_s=CONTROL_STEP_S,
+        action_limit=1.0,
+        wall_reach_m=0.3,
+        # A robot's joints are off by what is its own.
+        is_mirrorable=False,
+        facts={"stand_in": level, "tick_s": TICK_S},
+        **own,
+    )
+
+
+def _navigation(level: Level) -> Task:
+    return _task(
+        "nao-navigation",
+        level,
+        ball=False,
         instruction="walk through the maze to the goal",
         objective=Navigation(
             S_MAZE,
@@ -130,43 +150,26 @@ def _navigation(level: Level) -> Task:
             position_waves=3,
             ends_at_walls=True,
         ),
-        make_target=partial(NaoEnv, level=level),
         make_simulator=partial(PointMass, **_BODY),
         make_varied_simulator=partial(VariedPointMass, **_BODY),
         abstraction=nao_to_point_mass,
-        beyond=nao_beyond,
-        state_columns=_columns(ball=False),
-        abstract_state=_abstract(ball=False),
-        timestep_s=CONTROL_STEP_S,
-        action_limit=1.0,
-        wall_reach_m=0.3,
-        # A robot's joints are off by what is its own.
-        is_mirrorable=False,
         ranges=WIDE_RANGES,
         simulator_id="point_mass",
-        facts={"stand_in": level, "tick_s": TICK_S},
     )
 
 
 def _kicking(level: Level) -> Task:
-    return Task(
-        name="nao-kick" if level == "mujoco" else f"nao-kick-{level}",
+    return _task(
+        "nao-kick",
+        level,
+        ball=True,
         instruction="kick the ball into the goal",
         objective=Kicking(FIELD, horizon=156),
-        make_target=partial(NaoEnv, level=level, ball=True),
         make_simulator=partial(BallAgent, **_BODY, **_CONTACT),
         make_varied_simulator=partial(VariedBallAgent, **_BODY, **_CONTACT),
         abstraction=nao_to_ball_agent,
-        beyond=nao_beyond,
-        state_columns=_columns(ball=True),
-        abstract_state=_abstract(ball=True),
-        timestep_s=CONTROL_STEP_S,
-        action_limit=1.0,
-        wall_reach_m=0.3,
-        is_mirrorable=False,
         ranges=KICK_RANGES,
         simulator_id="ball_agent",
-        facts={"stand_in": level, "tick_s": TICK_S},
     )
 
 

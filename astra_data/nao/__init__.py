@@ -1,7 +1,8 @@
 """A simulated stand-in for the NAO V6: its body, its legs' kinematics, its walk, B robots at once."""
 
 from astra_data.nao.body import nao_model
-from astra_data.nao.robot import BatchedNao, Senses
+from astra_data.nao.robot import BatchedNao
+from astra_data.nao.robots import Senses
 from astra_data.nao.steps import Gait, StepPlanner, WalkLimits
 from astra_data.nao.traits import IDENTICAL, Traits, Variation
 from astra_data.nao.walk import WalkEngine, WalkStyle

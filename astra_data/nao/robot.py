@@ -1,7 +1,7 @@
 """B walking NAOs: commanded velocities in, what the robots feel and where they truly are out."""
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from astra_data.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.nao.body import TICK_S, nao_model
 from astra_data.nao.kinematics import TO_MOTORS, leg_angles
 from astra_data.nao.links import HIP_OFFSET_Z_M
-from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits
+from astra_data.nao.robots import Robots, Senses
+from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, put_rows
 from astra_data.nao.traits import Traits, Variation
 from astra_data.nao.walk import LEFT_KICKS, NO_KICK, RIGHT_KICKS, WalkEngine, WalkStyle
 
@@ -23,35 +24,10 @@ CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS
 
 
-@dataclass(frozen=True)
-class Senses:
-    """What B robots feel at the end of a control step.
-
-    Attributes:
-        angles: measured joint angles, (B, 11) in rad (`astra_data.nao.kinematics.JOINTS`).
-        gyro: measured rates about x, y, z, (B, 3) in rad/s.
-        tilt: roll and pitch of the torso, (B, 2) in rad.
-        pressure: on the soles in N; left and right foot, front left, front right, back left, back right
-            point, (B, 2, 4).
-        phase: fraction of the step done, (B,).
-        left_swings: which foot is in the air, (B,) bool.
-        planned: velocity of the present step, m/s, m/s, rad/s, (B, 3).
-    """
-
-    angles: Floats
-    gyro: Floats
-    tilt: Floats
-    pressure: Floats
-    phase: Floats
-    left_swings: Bools
-    planned: Floats
-
-
-class BatchedNao:
+class BatchedNao(Robots):
     """B NAOs, each on a floor of its own.
 
     Attributes:
-        gait: where the robots are in their steps.
         traits: what sets them apart.
         bodies: their physics.
     """
@@ -118,10 +94,9 @@ class BatchedNao:
         """
         if ball is not None and not self.has_ball:
             raise BadInputError("These robots have no balls to place; build BatchedNao with ball=True.")
-        self.traits.put(rows, Traits.draw(self.variation, len(rows), rng))
+        put_rows(self.traits, rows, Traits.draw(self.variation, len(rows), rng))
         standing = Gait.standing(len(rows), self._limits)
-        for part in fields(Gait):
-            getattr(self.gait, part.name)[rows] = getattr(standing, part.name)
+        put_rows(self.gait, rows, standing)
         angles = leg_angles(self._engine.feet(standing)).angles
         x, y, yaw = poses.T
         qpos = np.tile(self.bodies.model.qpos0, (len(rows), 1))
@@ -169,43 +144,43 @@ class BatchedNao:
         return np.where(kick, np.where(to_the_left > 0, LEFT_KICKS, RIGHT_KICKS), NO_KICK)
 
     @property
+    @override
     def fallen(self) -> Bools:
-        """Which robots lie on the floor, (B,)."""
         return self.bodies.fallen
 
     @property
+    @override
     def touching(self) -> Bools:
-        """Which robots touched a wall in their last control step, (B,)."""
         return self.bodies.touching
 
     @property
+    @override
     def pose(self) -> Floats:
-        """The torsos' true x, y in m and heading in rad, (B, 3)."""
         rotation = rotation_matrix(self.bodies.qpos[:, 3:7])
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         return np.concatenate([self.bodies.qpos[:, :2], yaw[:, None]], axis=1)
 
     @property
+    @override
     def velocity(self) -> Floats:
-        """The torsos' true velocity on the floor, x, y in m/s, turn in rad/s, (B, 3)."""
         turn = np.einsum(
             "bi,bi->b", rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2], self.bodies.qvel[:, 3:6]
         )
         return np.concatenate([self.bodies.qvel[:, :2], turn[:, None]], axis=1)
 
     @property
+    @override
     def ball(self) -> Floats:
-        """The balls' true x, y in m, (B, 2)."""
         return self.bodies.qpos[:, _BALL : _BALL + 2]
 
     @property
+    @override
     def ball_velocity(self) -> Floats:
-        """The balls' true velocity in m/s, (B, 2)."""
         return self.bodies.qvel[:, _BALL - 1 : _BALL + 1]
 
     @property
+    @override
     def senses(self) -> Senses:
-        """What the robots feel now."""
         bodies, left_first = self.bodies, [7, *range(8, 13), *range(14, 19)]
         return Senses(
             angles=bodies.qpos[:, left_first] - self.traits.joint_offset_rad,
@@ -221,16 +196,7 @@ class BatchedNao:
         up = rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2]
         return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of all that `load_state_dict` needs to go on exactly from here."""
-        return {name: value.copy() for name, value in self._arrays().items()} | {"steps": self._steps}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state`, taken from robots that were built alike."""
-        for name, value in self._arrays().items():
-            value[:] = state[name]
-        self._steps = int(state["steps"])
-
+    @override
     def _arrays(self) -> dict[str, NDArray[Any]]:
         bodies = self.bodies
         parts = ("state", "sent", "held", "waited", "tilting", "gyro", "pressure", "fallen", "touching")

@@ -14,6 +14,12 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
+def put_rows(robots: object, rows: NDArray[np.intp], others: object) -> None:
+    """Give the robots `rows` (n,) of B what `others`, a like dataclass of arrays, says of n robots."""
+    for name, values in vars(others).items():
+        getattr(robots, name)[rows] = values
+
+
 @dataclass(frozen=True)
 class WalkLimits:
     """What B-Human's published walking configuration for the V6 allows, but where told otherwise."""

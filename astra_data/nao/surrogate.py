@@ -5,8 +5,8 @@ in place of legs, the gains and the scatter that a physical robot's log shows (p
 arXiv 2310.18247): 1.15 and 1.28 forward and sideways, 0.69 in turning.
 """
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, override
 
 import numpy as np
 import torch
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from astra_data.ball import BALL_RADIUS_M, ROLLING_M_S2, knock, roll
 from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
-from astra_data.nao.robot import CONTROL_STEP_S, Senses
-from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits
+from astra_data.nao.robot import CONTROL_STEP_S
+from astra_data.nao.robots import Robots, Senses
+from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, put_rows
 
 BODY_RADIUS_M = 0.2
 """Of the disc that touches walls."""
@@ -61,12 +62,8 @@ class _Robots:
     touching: Bools
 
 
-class SurrogateNao:
-    """B NAOs reduced to their steps; a stand-in for `BatchedNao` that never falls.
-
-    Attributes:
-        gait: where the robots are in their steps.
-    """
+class SurrogateNao(Robots):
+    """B NAOs reduced to their steps; a stand-in for `BatchedNao` that never falls."""
 
     def __init__(
         self,
@@ -119,8 +116,7 @@ class SurrogateNao:
         """Stand the robots `rows` (n,) at `poses` (n, 3) with new traits, their balls at `ball` (n, 2)."""
         count, varied, robots = len(rows), self.variation, self._robots
         standing = Gait.standing(count, self._limits)
-        for part in fields(Gait):
-            getattr(self.gait, part.name)[rows] = getattr(standing, part.name)
+        put_rows(self.gait, rows, standing)
         robots.pose[rows] = poses
         robots.velocity[rows] = robots.sent[rows] = 0.0
         robots.gain[rows] = np.maximum(rng.normal(varied.gain, varied.gain_spread, (count, 3)), 0.1)
@@ -196,38 +192,39 @@ class SurrogateNao:
         robots.touching[rows] = touching[rows]
 
     @property
+    @override
     def fallen(self) -> Bools:
-        """None of them, (B,)."""
         return np.zeros(self.num_robots, dtype=bool)
 
     @property
+    @override
     def touching(self) -> Bools:
-        """Which robots touched a wall in their last control step, (B,)."""
         return self._robots.touching
 
     @property
+    @override
     def pose(self) -> Floats:
-        """True x, y in m and heading in rad, (B, 3)."""
         return self._robots.pose
 
     @property
+    @override
     def velocity(self) -> Floats:
-        """True velocity, x, y in m/s, turn in rad/s, (B, 3)."""
         return self._robots.velocity
 
     @property
+    @override
     def ball(self) -> Floats:
-        """The balls' true x, y in m, (B, 2)."""
         return self._robots.ball
 
     @property
+    @override
     def ball_velocity(self) -> Floats:
-        """The balls' true velocity in m/s, (B, 2)."""
         return self._robots.ball_velocity
 
     @property
+    @override
     def senses(self) -> Senses:
-        """What the robots feel: their steps, and the rate of turning; legs and feet feel nothing."""
+        # Legs and feet feel nothing.
         count = self.num_robots
         gyro = np.zeros((count, 3))
         gyro[:, 2] = self._robots.velocity[:, 2]
@@ -241,13 +238,6 @@ class SurrogateNao:
             planned=self.gait.velocity(),
         )
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of all that `load_state_dict` needs to go on exactly from here."""
-        arrays = {name: value.copy() for name, value in (vars(self.gait) | vars(self._robots)).items()}
-        return arrays | {"steps": self._steps}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state`, taken from robots that were built alike."""
-        for name, value in (vars(self.gait) | vars(self._robots)).items():
-            value[:] = state[name]
-        self._steps = int(state["steps"])
+    @override
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return vars(self.gait) | vars(self._robots)

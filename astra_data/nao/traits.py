@@ -1,6 +1,6 @@
 """What sets one robot apart from the next."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +60,3 @@ class Traits:
             friction=rng.uniform(*variation.friction, count),
             quality=rng.uniform(*variation.quality, count),
         )
-
-    def put(self, rows: NDArray[np.intp], drawn: "Traits") -> None:
-        """Give the robots `rows` (n,) the traits `drawn` of n robots."""
-        for part in fields(self):
-            getattr(self, part.name)[rows] = getattr(drawn, part.name)
