@@ -17,7 +17,9 @@ from typing import Any
 from astra_data.errors import RecipeError
 from astra_data.methods import METHODS
 from astra_data.recipe import did_you_mean, load_tables, validated
-from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Recipe
+from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Point, Recipe
+from astra_data.results.files import read_published
+from astra_data.results.sizes import by_size
 from astra_data.rows import base_method
 
 ALWAYS_NEW = {"report"}
@@ -44,7 +46,7 @@ class Experiment:
         """The stages whose artefacts are the base's."""
         if self.base is None:
             return set()
-        changed = _differences(_recorded(self.base.recipe), self.recipe)
+        changed = _differences(self.base.recipe.settings, self.recipe)
         absent = set() if self.recipe.sweep.percent else {"subset"}
         absent |= set() if self.recipe.augment else {"augment"}
         return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed)
@@ -112,6 +114,30 @@ class Experiment:
                 f"give the recipe another name, or remove {' '.join(present)}"
             )
 
+    @property
+    def results(self) -> Path:
+        """The folder that its results are published in."""
+        return self.path.parent / "results"
+
+    def published(self) -> set[Point]:
+        """Return the points that its published results have.
+
+        Raises:
+            BadInputError: there are no such results.
+            RecipeError: they were made with other settings.
+        """
+        points = set()
+        for percent, found in by_size(read_published(self.results, self.path.stem)).items():
+            changed = _differences(found.settings, self.recipe) - ALWAYS_NEW
+            if changed:
+                raise RecipeError(
+                    f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
+                    f"{self.results} were made: make all rows again and publish them in their place"
+                )
+            rows = found.methods.items()
+            points |= {Point(method, seed, percent) for method, row in rows for seed in row.seeds}
+        return points
+
     def _rows_of(self, table: str, stage: str) -> list[Path]:
         """Return the folders in `stage` of the rows that `table` has settings for, or whose policy has."""
 
@@ -151,12 +177,6 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     return Experiment(recipe, path, folder, base)
 
 
-def _recorded(recipe: Recipe) -> dict[str, Any]:
-    """Return a recipe as it is recorded in its folder."""
-    values: dict[str, Any] = json.loads(recipe.model_dump_json())
-    return values
-
-
 def _stale_stages(changed: set[str]) -> set[str]:
     """Return the stages that a change of the keys `changed` of a recipe reaches."""
     stale: set[str] = set()
@@ -174,8 +194,8 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     What was not known then has its default, which is what was done.
     """
     with suppress(RecipeError):
-        before = _recorded(validated(before, type(recipe), "recipe.json"))
-    before, now = _told(dict(before)), _told(_recorded(recipe))
+        before = validated(before, type(recipe), "recipe.json").settings
+    before, now = _told(dict(before)), _told(recipe.settings)
     return {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
 
 

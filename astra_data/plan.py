@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from pydantic import JsonValue
+
 from astra_data.dataset.edit import share
 from astra_data.methods import METHODS
 from astra_data.recipe import Config
@@ -40,6 +42,7 @@ class Reported:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     groundings: Mapping[str, str]
+    settings: Mapping[str, JsonValue]
     percents: tuple[int, ...] = ()
 
 
@@ -50,7 +53,8 @@ def plan(
     part: Part | None = None,
     *,
     device: str = "cpu",
-    publish: bool = False,
+    publish: Path | None = None,
+    add_to: Path | None = None,
 ) -> tuple[Item, ...]:
     """Return every artefact of `recipe`, each after those it reads, seed after seed.
 
@@ -60,7 +64,8 @@ def plan(
         folder: where it is made, such as `runs/antmaze_long`; an item's artefact is at `folder / key`.
         part: what to make and to report of it; by default all.
         device: torch device of the networks.
-        publish: whether the report copies its results into `results/` beside the recipe.
+        publish: a folder that the report copies its results to, if any.
+        add_to: a folder with published results that the report adds to, if any.
     """
     part = part or Part.of(recipe)
     bases = tuple(dict.fromkeys(base_method(row) for row in part.methods))
@@ -84,7 +89,7 @@ def plan(
             items += (_train(data, row) for row in trained)
             items += (_align(data, base) for base in aligned)
             items += (_evaluate(data, row) for row in part.methods)
-    return (*items, _report(recipe, path, folder, part, publish))
+    return (*items, _report(recipe, path, folder, part, publish, add_to))
 
 
 def stage_of(item: Item) -> str:
@@ -220,15 +225,20 @@ def _evaluate(data: _Data, row: str) -> Item:
     return Item(key, inputs, call, is_threaded=True)
 
 
-def _report(recipe: Recipe, path: Path, folder: Path, part: Part, publish: bool) -> Item:
+def _report(
+    recipe: Recipe, path: Path, folder: Path, part: Part, publish: Path | None, add_to: Path | None
+) -> Item:
     groundings = {row: grounded_as(base_method(row)) for row in part.methods}
-    reported = Reported(path.stem, recipe.task, part.methods, part.seeds, groundings, part.percents)
+    reported = Reported(
+        path.stem, recipe.task, part.methods, part.seeds, groundings, recipe.settings, part.percents
+    )
     call = partial(
         report,
         reported,
         root=folder,
         command=_command(recipe, path, part),
-        publish=path.parent / "results" if publish else None,
+        publish=publish,
+        add_to=add_to,
         config=recipe.report,
     )
     return Item("report", tuple(point.key for point in part.points()), call)

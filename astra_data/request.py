@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, JsonValue, ValidationInfo, field_validator, model_validator
 
 from astra_data.dataset.edit import share
 from astra_data.errors import BadInputError
@@ -104,6 +104,11 @@ class Recipe(Config):
     """How IQL learns."""
     direct_transfer_iql: IqlConfig = FINE_TUNING
     """How direct transfer is fine-tuned; by default gently, for it unlearns more than it learns."""
+
+    @property
+    def settings(self) -> dict[str, JsonValue]:
+        """All that it says, with the defaults, as JSON values."""
+        return self.model_dump(mode="json")
 
     @property
     def compass_uniform(self) -> Variation:

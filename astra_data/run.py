@@ -73,8 +73,12 @@ def run_stage(
     jobs: int | None = None,
     device: str = "cpu",
     publish: bool = False,
+    add: bool = False,
 ) -> Path:
     """Make the artefacts of one stage of a recipe, of one `method` and of some `seeds` only where given.
+
+    The report is also published where asked to `publish`, and has what is published already where asked to
+    `add`.
 
     Raises:
         MissingStageError: an artefact that the stage reads is not finished.
@@ -91,7 +95,17 @@ def run_stage(
         )
     recipe, folder = experiment.recipe, experiment.folder
     part = Part.of(recipe, seeds=seeds)
-    planned = plan(recipe, recipe_path, folder, part, device=device, publish=publish)
+    if add:
+        experiment.published()
+    planned = plan(
+        recipe,
+        recipe_path,
+        folder,
+        part,
+        device=device,
+        publish=experiment.results if publish else None,
+        add_to=experiment.results if add else None,
+    )
     make(experiment, _selected(recipe, planned, stage, method), jobs=jobs, device=device)
     return folder / stage
 

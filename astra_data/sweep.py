@@ -17,6 +17,7 @@ from rich.console import Console
 
 from astra_data.board import Board, needed
 from astra_data.display import display
+from astra_data.errors import BadInputError
 from astra_data.experiment import Experiment, load_experiment
 from astra_data.extras import optional
 from astra_data.plan import plan, stage_of
@@ -48,6 +49,7 @@ def sweep(
     methods: Sequence[str] = (),
     seeds: Sequence[int] = (),
     percents: Sequence[int] = (),
+    unpublished: bool = False,
     root: Path = RUNS,
     jobs: int | None = None,
     device: str = "cpu",
@@ -61,6 +63,7 @@ def sweep(
         methods: those of its rows to make and to report; by default all.
         seeds: those of its seeds; by default all.
         percents: those of its sizes; by default all.
+        unpublished: leave out the points that its published results have.
         root: where the recipe's folder is.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
@@ -69,8 +72,8 @@ def sweep(
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made what is there.
-        BadInputError: the recipe has no such row, seed or size, Ray or trackio is asked for and missing, or
-            another process runs in the recipe's folder.
+        BadInputError: the recipe has no such row, seed or size, none that is not published or no published
+            results, Ray or trackio is asked for and missing, or another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     experiment = load_experiment(recipe_path, root)
@@ -78,10 +81,30 @@ def sweep(
     log = _tracked(trackio, experiment.folder.name) if trackio else None
     table = Table(experiment)
     items = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
+    points = part.points()
+    if unpublished:
+        points, items = _left(points, items, experiment.published())
     wanted = [item for item in items if experiment.maker(stage_of(item)) is experiment]
-    show = partial(_shown, table, part.points(), items, log)
+    show = partial(_shown, table, points, items, log)
     make(experiment, wanted, jobs=jobs, device=device, cluster=cluster, show=show)
     return experiment.folder
+
+
+def _left(
+    points: Sequence[Point], items: Sequence[Item], published: Collection[Point]
+) -> tuple[tuple[Point, ...], tuple[Item, ...]]:
+    """Return the points that are not published, and what they need, with the report."""
+    left = tuple(point for point in points if point not in published)
+    if not left:
+        raise BadInputError("all of these points are published: leave out --unpublished to make them again")
+    inputs = {item.key: item.inputs for item in items}
+    needs, to_look_at = {"report"}, [point.key for point in left]
+    while to_look_at:
+        key = to_look_at.pop()
+        if key not in needs:
+            needs.add(key)
+            to_look_at += inputs[key]
+    return left, tuple(item for item in items if item.key in needs)
 
 
 class Table:

@@ -4,10 +4,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import save_file
 
+from astra_data.results.model import MethodResults, Results
 from astra_data.rows import place
 
 ROWS = ("direct_transfer", "astra", "astra_plus", "follower")
@@ -34,6 +36,7 @@ class FakeRecipe:
     methods: tuple[str, ...] = ROWS
     seeds: tuple[int, ...] = SEEDS
     groundings: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     percents: tuple[int, ...] = ()
 
 
@@ -141,3 +144,35 @@ def write_iql(root: Path) -> None:
         write_json(path, values)
         points = [{"steps": 1000, "success": None, "loss": 1.0}]
         write_json(root / f"train/iql/seed_{seed}/curve.json", MADE | {"wall_seconds": 3.0, "points": points})
+
+
+def bare_results(recipe: str, rows: Mapping[str, list[int]], settings: dict[str, Any]) -> Results:
+    """Return results of some seeds of rows that say hardly more than that."""
+    zeros = {row: [0.0] * len(seeds) for row, seeds in rows.items()}
+    return Results(
+        recipe=recipe,
+        task="maze",
+        command="",
+        settings=settings,
+        origins=[],
+        wall_seconds={"total": 0.0},
+        cpu_seconds={"total": 0.0},
+        datasets=[],
+        evaluated_with=[],
+        episodes=1,
+        methods={
+            row: MethodResults.model_validate(
+                {
+                    "title": row,
+                    "role": None,
+                    "seeds": seeds,
+                    **dict.fromkeys(("success", "failed", "wall_contact", "steps"), zeros[row]),
+                    **{"return": zeros[row], "distance": zeros[row], "simulated_success": None},
+                    **{"simulator_returns": {}, "encoders": {}, "grounding": None, "gap": None},
+                    **{"learning": [], "cost": {}},
+                }
+            )
+            for row, seeds in rows.items()
+        },
+        throughput={},
+    )

@@ -24,6 +24,7 @@ class Reported:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     groundings: Mapping[str, str]
+    settings: Mapping[str, Any]
     percents: tuple[int, ...]
 
 
@@ -201,10 +202,11 @@ def report(
     root: Path,
     command: str,
     publish: Path | None,
+    add_to: Path | None,
     progress: Progress,
     config: FakeConfig,
 ) -> None:
     asked: dict[str, Any] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
-    asked |= {"command": command, "publish": publish}
+    asked |= {"command": command, "publish": publish, "add_to": add_to}
     shutil.rmtree(root / "report", ignore_errors=True)
     _write(config, root / "report", progress, **asked)

@@ -5,10 +5,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_runs import bare_results, write_json
 from typer.testing import CliRunner
 
 from astra_data import cli
 from astra_data.errors import BadInputError, RecipeError
+from astra_data.experiment import load_experiment
+from astra_data.results.sizes import SizesResults
 from astra_data.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
@@ -69,6 +72,42 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
     ]
     assert {line["simulated_success"] for line in lines(folder) if line["method"] == "follower"} == {""}
     assert {line["wall_seconds"] for line in lines(folder) if line["method"] == "astra"} == {"24.75"}
+
+
+def publish(recipe: Path, points: dict[int, dict[str, list[int]]]) -> Path:
+    """Write results of some seeds of rows, by size; return their file."""
+    settings = load_experiment(recipe, recipe.parent).recipe.settings
+    sizes = [
+        {"percent": percent, "results": bare_results("r", rows, settings)} for percent, rows in points.items()
+    ]
+    path = recipe.parent / "results" / "r.json"
+    whole = {"recipe": "r", "task": "maze", "command": "", "sizes": sizes}
+    write_json(path, SizesResults.model_validate(whole).model_dump(mode="json", by_alias=True))
+    return path
+
+
+def test_only_points_that_are_not_published_are_made(recipe: Path, tmp_path: Path) -> None:
+    publish(recipe, {50: {"nas": [0, 1], "astra": [0]}, 150: {"nas": [1], "follower": [0, 1]}})
+    folder = sweep(recipe, methods=["nas", "follower"], unpublished=True, root=tmp_path, jobs=2)
+    made = [tuple(line[key] for key in ("method", "percent", "seed")) for line in lines(folder)]
+    assert made == [("nas", "150", "0"), ("follower", "50", "0"), ("follower", "50", "1")]
+    # Only what they need: of seed 1 no policy, hence no grounding but for the simulators of the follower.
+    keys = set(attempts(folder))
+    assert {key for key in keys if key.startswith("train")} == {"train/nas/percent_150/seed_0"}
+    assert not {key for key in keys if key.startswith("align")}
+    publish(recipe, {50: {"nas": [0, 1]}, 150: {"nas": [0, 1]}})
+    with pytest.raises(BadInputError, match="all of these points are published"):
+        sweep(recipe, methods=["nas"], unpublished=True, root=tmp_path)
+
+
+def test_points_published_with_other_settings_do_not_count(recipe: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected published results in .*r.json, found none"):
+        sweep(recipe, unpublished=True, root=tmp_path)
+    publish(recipe, {50: {"nas": [0]}})
+    recipe.write_text(recipe.read_text() + "[report]\nsteps = 7\n[train]\nsteps = 7\n")
+    with pytest.raises(RecipeError, match=r"^plus and train changed in .*r.toml since its results in"):
+        sweep(recipe, unpublished=True, root=tmp_path)
+    assert not (tmp_path / "r").exists()
 
 
 def test_a_failed_sweep_keeps_the_points_that_are_finished(recipe: Path, tmp_path: Path) -> None:

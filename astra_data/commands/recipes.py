@@ -32,6 +32,9 @@ Until = Annotated[str | None, typer.Option(help="The last stage to run.", show_d
 Publish = Annotated[
     bool, typer.Option("--publish", help="Also copy the results to results/ beside the recipe.")
 ]
+Add = Annotated[
+    bool, typer.Option("--add", help="Add to the published results: what they have and --root lacks stays.")
+]
 
 RUNS = Path("runs")
 
@@ -117,9 +120,11 @@ def evaluate(
     run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
 
 
-def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, root: Root = RUNS) -> None:
+def report(
+    recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, add: Add = False, root: Root = RUNS
+) -> None:
     """Write the recipe's tables and figures."""
-    run_stage(recipe, "report", seeds=seeds or (), publish=publish, root=root)
+    run_stage(recipe, "report", seeds=seeds or (), publish=publish, add=add, root=root)
 
 
 def run_stage(
@@ -132,13 +137,22 @@ def run_stage(
     jobs: int | None = None,
     device: str = "cpu",
     publish: bool = False,
+    add: bool = False,
 ) -> None:
     """Run one stage of a recipe, and say where its artefacts are."""
     from astra_data.run import run_stage as run
 
     with resumable():
         folder = run(
-            recipe, stage, method=method, seeds=seeds, root=root, jobs=jobs, device=device, publish=publish
+            recipe,
+            stage,
+            method=method,
+            seeds=seeds,
+            root=root,
+            jobs=jobs,
+            device=device,
+            publish=publish,
+            add=add,
         )
         typer.echo(f"finished: {folder}")
 

@@ -27,6 +27,9 @@ def sweep(
         list[int] | None,
         typer.Option("--percent", help="Only this size; may be repeated.", show_default=False),
     ] = None,
+    unpublished: Annotated[
+        bool, typer.Option("--unpublished", help="Only the points that results/ beside the recipe lacks.")
+    ] = False,
     jobs: Jobs = None,
     device: Device = "cpu",
     root: Root = RUNS,
@@ -58,6 +61,7 @@ def sweep(
             methods=methods or (),
             seeds=seeds or (),
             percents=percents or (),
+            unpublished=unpublished,
             root=root,
             jobs=jobs,
             device=device,

@@ -5,6 +5,10 @@ runs          find those files for all rows and seeds
 model         Results: what results.json holds
 costs         what the artefacts took
 assembly      artefacts → Results
+merging       Results of several places → one
+comparing     rows → their summaries, and how they compare
+origins       where results come from, each said once
+drawing       Results → figures
 page          Results → Markdown
 sizes         Results of each size of the dataset, and their page
 files         results, pages and figures → a folder

@@ -5,6 +5,9 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from pydantic import TypeAdapter, ValidationError
+
+from astra_data.errors import BadInputError
 from astra_data.results.model import Results
 from astra_data.results.page import HOW_TO_READ
 from astra_data.results.sizes import HOW_TO_READ as HOW_TO_READ_SIZES
@@ -13,6 +16,27 @@ from astra_data.results.sizes import SizesResults
 Found = Results | SizesResults
 Page = Callable[[Mapping[str, str]], str]
 """Returns the page with the figures of these names and files."""
+
+
+def read_published(folder: Path, recipe: str) -> Found:
+    """Return the results of a recipe that are in `folder`.
+
+    Raises:
+        BadInputError: there are none, or they are not as they are written now.
+    """
+    path = folder / f"{recipe}.json"
+    if not path.is_file():
+        raise BadInputError(f"expected published results in {path}, found none: leave out what asks for them")
+    try:
+        return TypeAdapter[Found](Found).validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise BadInputError(f"{path} does not hold results as they are written now: {error}") from None
+
+
+def published_figures(folder: Path, recipe: str) -> dict[str, bytes]:
+    """Return the figures of a recipe that are in `folder`, by name."""
+    paths = {name: folder / f"{recipe}_{name}.png" for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES)}
+    return {name: path.read_bytes() for name, path in paths.items() if path.exists()}
 
 
 def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
 from astra_data.statistics import Comparison, Correlation, Summary
 
@@ -79,6 +79,7 @@ class BandMeans(Part):
 class GapMeans(Part):
     """Open-loop error by horizon for each quantity, averaged over seeds."""
 
+    seeds: list[int]
     horizons: list[int]
     """Steps ahead."""
     grounded: dict[str, BandMeans]
@@ -127,8 +128,8 @@ class MethodResults(Part):
     """Return in the simulators that all rows are tested in, "raw" and "grounded", where the row was."""
     encoders: dict[str, dict[str, list[float]]]
     """The same measures by encoder, where a row has more than one."""
-    summary: dict[str, Summary]
-    """Every measure above over seeds; of the distance over those that have one."""
+    summary: dict[str, Summary] = Field(default_factory=dict)
+    """Every measure over seeds; of the distance over those that have one."""
     grounding: str | None
     """Name of the row's folder of groundings, which rows may share."""
     gap: GapMeans | None
@@ -136,6 +137,18 @@ class MethodResults(Part):
     """Empty for a row that is not trained."""
     cost: dict[str, Cost]
     """By stage; with the grounding and alignment that it uses, though other rows may share them."""
+
+    def measures(self) -> dict[str, list[float] | None]:
+        """Return every measure over seeds by its name; None for one that the row has not."""
+        return {
+            "success": self.success,
+            "failed": self.failed,
+            "wall_contact": self.wall_contact,
+            "steps": self.steps,
+            "return": self.returns,
+            "simulated_success": self.simulated_success,
+            "distance": self.distance,
+        }
 
 
 class Results(Part):
@@ -146,6 +159,8 @@ class Results(Part):
     task: str
     command: str
     """The command that produced these results."""
+    settings: dict[str, JsonValue]
+    """Of the recipe, with its defaults."""
     origins: list[Origin]
     """Normally one; more if code or machine changed on the way."""
     wall_seconds: dict[str, float]
@@ -154,7 +169,7 @@ class Results(Part):
     """The same of all threads."""
     datasets: list[Dataset]
     evaluated_with: list[DatasetUse]
-    seeds: list[int]
+    seeds: list[int] = Field(default_factory=list)
     """Of which rows may have finished only some."""
     episodes: int
     """Per row and seed."""
@@ -165,9 +180,9 @@ class Results(Part):
     """Row → what the paper prints for it."""
     unfinished: list[str] = Field(default_factory=list)
     """Titles of the recipe's rows that no seed of is finished yet."""
-    probability_of_improvement: dict[str, dict[str, Comparison]]
+    probability_of_improvement: dict[str, dict[str, Comparison]] = Field(default_factory=dict)
     """ASTRA's row → another that is trained alike → how likely a seed of the one beats one of the other."""
-    predictive_validity: dict[str, Validity]
+    predictive_validity: dict[str, Validity] = Field(default_factory=dict)
     """Of the simulators that all rows are tested in: "raw", and "grounded" where there is one."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
     """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""

@@ -51,21 +51,29 @@ class Runs:
         return self.root / stage / self.owner(stage, method) / place(seed, self.percent) / name
 
     @cached_property
+    def _seeds(self) -> dict[str, tuple[int, ...]]:
+        return {
+            method: tuple(
+                seed for seed in self.seeds if self.path("evaluate", method, seed, EVALUATION).exists()
+            )
+            for method in self.methods
+        }
+
+    @property
+    def any_finished(self) -> bool:
+        """Whether any row has an evaluation."""
+        return any(self._seeds.values())
+
+    @property
     def finished(self) -> dict[str, tuple[int, ...]]:
         """The seeds of each row whose evaluation is finished; rows without any are left out.
 
         Raises:
             MissingStageError: no row has one.
         """
-        seeds = {
-            method: tuple(
-                seed for seed in self.seeds if self.path("evaluate", method, seed, EVALUATION).exists()
-            )
-            for method in self.methods
-        }
-        if not any(seeds.values()):
+        if not self.any_finished:
             self._require("evaluate", EVALUATION, dict.fromkeys(self.methods, self.seeds))
-        return {method: found for method, found in seeds.items() if found}
+        return {method: found for method, found in self._seeds.items() if found}
 
     def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
         """Read a file of every row and its finished seeds: row → seed → file."""

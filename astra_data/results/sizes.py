@@ -40,6 +40,13 @@ class SizesResults(Part):
     """At least one; rows and seeds are those of each other."""
 
 
+def by_size(found: Results | SizesResults) -> dict[int | None, Results]:
+    """Return the results of each size of the dataset; of None where it is not swept over."""
+    if isinstance(found, Results):
+        return {None: found}
+    return {size.percent: size.results for size in found.sizes}
+
+
 def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
     """Return the page.
 

@@ -5,45 +5,28 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from astra_data.checkpoint import finished_folder
-from astra_data.dataset.reader import Dataset
-from astra_data.figures import (
-    Curve,
-    Foretold,
-    OpenLoop,
-    Panel,
-    Visits,
-    data_efficiency,
-    dynamics_mismatch,
-    learning_curves,
-    open_loop_error,
-    png,
-    predictive_validity,
-    success_bars,
-    trajectories,
-)
-from astra_data.inspection import visited
-from astra_data.mazes import Maze
+from astra_data.figures import png
 from astra_data.methods import method_named
 from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Share
-from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.results.assembly import assemble
-from astra_data.results.files import Found, publish_results, write_results
-from astra_data.results.model import BandMeans, Results
+from astra_data.results.drawing import figure_of_sizes, figures_of
+from astra_data.results.files import (
+    Found,
+    publish_results,
+    published_figures,
+    read_published,
+    write_results,
+)
+from astra_data.results.model import Results
 from astra_data.results.page import render
-from astra_data.results.sizes import SizeResults, SizesResults, render_sizes
-from astra_data.rows import place
+from astra_data.results.sizes import SizeResults, SizesResults, by_size, render_sizes
 from astra_data.statistics import REPLICATES
 from astra_data.tasks import TASKS
-
-Floats = NDArray[np.float64]
 
 
 class ReportConfig(Config):
@@ -89,6 +72,10 @@ class Reported(Protocol):
         """Row → the method whose grounding and alignment it uses, where that is not its own."""
 
     @property
+    def settings(self) -> Mapping[str, JsonValue]:
+        """All settings of the recipe."""
+
+    @property
     def percents(self) -> Sequence[int]:
         """Sizes of the dataset that every row is repeated on; none where it is made on the whole."""
 
@@ -100,6 +87,7 @@ def report(
     command: str,
     publish: Path | None,
     progress: Progress,
+    add_to: Path | None = None,
     config: ReportConfig = DEFAULTS,
 ) -> None:
     """Write results.json, results.md and the figures to `root`/report.
@@ -110,15 +98,17 @@ def report(
         command: the command line to print as the results' origin.
         publish: a folder for copies named after the recipe, or None.
         progress: told the share done and what was written.
+        add_to: a folder with published results to which those at `root` are added, or None.
         config: how to draw.
 
     Raises:
         MissingStageError: no row has an evaluation, or one has other artefacts for some of its finished
             seeds only.
-        BadInputError: an artefact is malformed, or rows were evaluated differently.
+        BadInputError: an artefact is malformed, or rows were evaluated or made of data differently.
     """
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
+    known = {} if add_to is None else by_size(read_published(add_to, recipe.name))
     sizes = _with_common_rows(
         assemble(
             recipe.name,
@@ -128,9 +118,11 @@ def report(
             root=root,
             command=command,
             replicates=config.bootstrap_replicates,
+            settings=recipe.settings,
             groundings=recipe.groundings,
             percent=percent,
             paper_success=config.paper_success,
+            published=known.get(percent),
         )
         for percent in recipe.percents or (None,)
     )
@@ -138,16 +130,25 @@ def report(
     found: Found
     if recipe.percents:
         found = _sizes(recipe, command, sizes)
-        page, figures = partial(render_sizes, found), {"data_efficiency": _data_efficiency(found, root)}
+        page, figures = partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
     else:
-        found, figures = sizes[0], _figures(sizes[0], root, config)
+        found = sizes[0]
         page = partial(render, found)
+        figures = figures_of(
+            found,
+            root,
+            maze=TASKS[found.task].maze,
+            replay=replay_commands(TASKS[found.task]),
+            trajectory_methods=config.trajectory_methods,
+            trajectory_episodes=config.trajectory_episodes,
+        )
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
     if publish is not None:
-        publish_results(found, page, images, publish)
+        kept = {} if add_to is None else published_figures(add_to, recipe.name)
+        publish_results(found, page, kept | images, publish)
     progress(1.0, _headline(sizes[-1]))
 
 
@@ -161,105 +162,6 @@ def _with_common_rows(sizes: Iterable[Results]) -> list[Results]:
     ]
 
 
-def _figures(results: Results, root: Path, config: ReportConfig) -> dict[str, Figure]:
-    figures = {
-        "success": _success(results),
-        "trajectories": _trajectories(results, root, TASKS[results.task].maze, config),
-    }
-    replay = replay_commands(TASKS[results.task])
-    figures["mismatch"] = dynamics_mismatch(replay.time_s, replay.command, replay.simulated, replay.target)
-    curves = _curves(results)
-    if curves:
-        figures["learning"] = learning_curves(curves)
-    gaps = _gaps(results)
-    if gaps:
-        figures["gap"] = open_loop_error(gaps)
-    if results.predictive_validity:
-        figures["validity"] = predictive_validity(_foretold(results))
-    return figures
-
-
-def _success(results: Results) -> Figure:
-    rows = results.methods
-    intervals = {}
-    for method, row in rows.items():
-        summary = row.summary["success"]
-        low, high = (np.nan if end is None else end for end in (summary.low, summary.high))
-        intervals[method] = (summary.iqm, low, high)
-    return success_bars(
-        {method: np.array(row.success) for method, row in rows.items()},
-        intervals,
-        {
-            method: row.summary["simulated_success"].mean
-            for method, row in rows.items()
-            if row.simulated_success is not None
-        },
-    )
-
-
-def _trajectories(results: Results, root: Path, maze: Maze, config: ReportConfig) -> Figure:
-    panels = []
-    drawn = [row for row in config.trajectory_methods if row in results.methods]
-    for method in drawn or results.methods:
-        folder = root / "evaluate" / method / f"seed_{results.methods[method].seeds[0]}"
-        evaluation = read_json(Evaluation, folder / EVALUATION)
-        tensors = read_tensors(folder / TRAJECTORIES, ("target.position", "goal"))
-        count = config.trajectory_episodes
-        simulated = [] if evaluation.simulated is None else evaluation.simulated.success[:count]
-        panels.append(
-            Panel(
-                method=method,
-                success=results.methods[method].summary["success"].mean,
-                target=tensors["target.position"][:count],
-                target_success=np.array(evaluation.target.success[:count], dtype=bool),
-                simulated=tensors.get("simulated.position", np.empty((0, 1, 2)))[: len(simulated)],
-                simulated_success=np.array(simulated, dtype=bool),
-                goal=tensors["goal"][:count],
-            )
-        )
-    return trajectories(maze, panels)
-
-
-def _curves(results: Results) -> dict[str, list[Curve]]:
-    curves = {
-        method: [Curve(np.array(seed.steps), np.array(seed.success)) for seed in row.learning]
-        for method, row in results.methods.items()
-    }
-    return {
-        method: seeds
-        for method, seeds in curves.items()
-        if seeds and all(np.isfinite(seed.success).any() for seed in seeds)
-    }
-
-
-def _foretold(results: Results) -> list[Foretold]:
-    return [
-        Foretold(
-            title=f"{simulator} simulator".capitalize(),
-            returns={
-                method: np.array([row.simulator_returns[simulator], row.returns])
-                for method, row in results.methods.items()
-                if simulator in row.simulator_returns
-            },
-        )
-        for simulator in results.predictive_validity
-    ]
-
-
-def _gaps(results: Results) -> dict[str, OpenLoop]:
-    def stack(band: BandMeans) -> Floats:
-        return np.array([band.mean, band.low, band.high])
-
-    return {
-        name: OpenLoop(
-            horizons=np.array(gap.horizons, dtype=float),
-            grounded={quantity: stack(band) for quantity, band in gap.grounded.items()},
-            raw={quantity: stack(band) for quantity, band in gap.raw.items()},
-        )
-        for name, gap in results.gaps().items()
-    }
-
-
 def _sizes(recipe: Reported, command: str, sizes: Sequence[Results]) -> SizesResults:
     return SizesResults(
         recipe=recipe.name,
@@ -269,29 +171,6 @@ def _sizes(recipe: Reported, command: str, sizes: Sequence[Results]) -> SizesRes
             SizeResults(percent=percent, results=results)
             for percent, results in zip(recipe.percents, sizes, strict=True)
         ],
-    )
-
-
-def _data_efficiency(found: SizesResults, root: Path) -> Figure:
-    first = found.sizes[0].results
-    rows = {method: [size.results.methods[method] for size in found.sizes] for method in first.methods}
-    summaries = {method: [row.summary["success"] for row in of] for method, of in rows.items()}
-    covered: dict[str, list[Visits]] = {}
-    for size in found.sizes:
-        dataset = Dataset.open(root / "subset" / place(first.seeds[0], size.percent))
-        for label, role in (("position (m)", "position"), ("velocity (m/s)", "vector")):
-            planar = visited(dataset, role)
-            if planar is not None:
-                covered.setdefault(label, []).append(Visits(planar.counts, planar.extent))
-    return data_efficiency(
-        [size.percent for size in found.sizes],
-        {method: [np.array(row.success) for row in of] for method, of in rows.items()},
-        # Where there is a single seed, None becomes NaN.
-        {
-            method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T
-            for method, sizes in summaries.items()
-        },
-        covered,
     )
 
 

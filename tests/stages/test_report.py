@@ -63,13 +63,19 @@ def values(folder: Path) -> Any:  # noqa: ANN401 - JSON
     return json.loads((folder / "results.json").read_text())
 
 
-def make(root: Path, publish: Path | None = None, recipe: FakeRecipe | None = None) -> None:
+def make(
+    root: Path,
+    publish: Path | None = None,
+    recipe: FakeRecipe | None = None,
+    add_to: Path | None = None,
+) -> None:
     notes: list[tuple[float, str]] = []
     report(
         recipe or FakeRecipe(),
         root=root,
         command="astra-data run recipes/antmaze_u.toml",
         publish=publish,
+        add_to=add_to,
         progress=lambda fraction, note: notes.append((fraction, note)),
         config=CONFIG,
     )
@@ -244,6 +250,33 @@ def test_publishing_copies_all_under_the_recipes_name(root: Path, tmp_path: Path
     figures = {f"antmaze_u_{name}.png" for name in HOW_TO_READ}
     assert {path.name for path in published.iterdir()} == figures | {"antmaze_u.json", "antmaze_u.md"}
     assert "](antmaze_u_mismatch.png)" in (published / "antmaze_u.md").read_text()
+
+
+def test_results_are_added_to_published_ones(root: Path, tmp_path: Path) -> None:
+    published = tmp_path / "results"
+    make(root, published, FakeRecipe(seeds=(0, 1)))
+    drawn = (published / "antmaze_u_trajectories.png").read_bytes()
+    for row in ROWS:
+        for seed in (0, 1):
+            shutil.rmtree(root / f"evaluate/{row}/seed_{seed}")
+    shutil.rmtree(root / "evaluate/astra_plus")
+    make(root, published, add_to=published)
+    page = (published / "antmaze_u.md").read_text()
+    assert "| ASTRA | 3 | 0.50 ± 0.25 |" in page
+    assert "| ASTRA+ | 2 | **0.88 ± 0.18** |" in page
+    # The trajectories of ASTRA+ are not here: the figure stays as it is.
+    assert "](antmaze_u_trajectories.png)" in page
+    assert (published / "antmaze_u_trajectories.png").read_bytes() == drawn
+    assert not (root / "report/trajectories.png").exists()
+    assert "](trajectories.png)" not in (root / "report/results.md").read_text()
+
+
+def test_there_must_be_results_to_add_to(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected published results in .*antmaze_u.json, found none"):
+        make(root, add_to=tmp_path)
+    (tmp_path / "antmaze_u.json").write_text("{}")
+    with pytest.raises(BadInputError, match=r"antmaze_u.json does not hold results as they are written now"):
+        make(root, add_to=tmp_path)
 
 
 def test_one_seed_of_rows_without_training_is_enough(root: Path) -> None:

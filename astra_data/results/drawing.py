@@ -1,0 +1,187 @@
+"""Results → figures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from astra_data.dataset.reader import Dataset
+from astra_data.figures import (
+    Curve,
+    Foretold,
+    OpenLoop,
+    Panel,
+    Visits,
+    data_efficiency,
+    dynamics_mismatch,
+    learning_curves,
+    open_loop_error,
+    predictive_validity,
+    success_bars,
+    trajectories,
+)
+from astra_data.inspection import visited
+from astra_data.mazes import Maze
+from astra_data.mismatch import CommandReplay
+from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
+from astra_data.results.model import BandMeans, Results
+from astra_data.results.sizes import SizesResults
+from astra_data.rows import place
+
+Floats = NDArray[np.float64]
+
+
+def figures_of(
+    results: Results,
+    root: Path,
+    *,
+    maze: Maze,
+    replay: CommandReplay,
+    trajectory_methods: Sequence[str],
+    trajectory_episodes: int,
+) -> dict[str, Figure]:
+    """Return the figures of a page, by their names on it.
+
+    Args:
+        results: all numbers in them.
+        root: the recipe's folder of runs; without the trajectories of a row that is to be drawn there, there
+            is no figure of trajectories.
+        maze: the task's.
+        replay: the same commands in its simulator and its target.
+        trajectory_methods: rows whose trajectories are drawn; all where none of them is in the results.
+        trajectory_episodes: how many of each row.
+    """
+    figures = {"success": _success(results)}
+    drawn = [row for row in trajectory_methods if row in results.methods] or list(results.methods)
+    folders = [_with_trajectories(root, results, row) for row in drawn]
+    if None not in folders:
+        panels = [
+            _panel(results, row, folder, trajectory_episodes)
+            for row, folder in zip(drawn, folders, strict=True)
+            if folder
+        ]
+        figures["trajectories"] = trajectories(maze, panels)
+    figures["mismatch"] = dynamics_mismatch(replay.time_s, replay.command, replay.simulated, replay.target)
+    curves = _curves(results)
+    if curves:
+        figures["learning"] = learning_curves(curves)
+    gaps = _gaps(results)
+    if gaps:
+        figures["gap"] = open_loop_error(gaps)
+    if results.predictive_validity:
+        figures["validity"] = predictive_validity(_foretold(results))
+    return figures
+
+
+def _success(results: Results) -> Figure:
+    rows = results.methods
+    intervals = {}
+    for method, row in rows.items():
+        summary = row.summary["success"]
+        low, high = (np.nan if end is None else end for end in (summary.low, summary.high))
+        intervals[method] = (summary.iqm, low, high)
+    return success_bars(
+        {method: np.array(row.success) for method, row in rows.items()},
+        intervals,
+        {
+            method: row.summary["simulated_success"].mean
+            for method, row in rows.items()
+            if row.simulated_success is not None
+        },
+    )
+
+
+def _with_trajectories(root: Path, results: Results, row: str) -> Path | None:
+    """Return the folder of the first seed of a row whose trajectories are there."""
+    folders = (root / "evaluate" / row / place(seed) for seed in results.methods[row].seeds)
+    return next((folder for folder in folders if (folder / TRAJECTORIES).exists()), None)
+
+
+def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
+    evaluation = read_json(Evaluation, folder / EVALUATION)
+    tensors = read_tensors(folder / TRAJECTORIES, ("target.position", "goal"))
+    simulated = [] if evaluation.simulated is None else evaluation.simulated.success[:episodes]
+    return Panel(
+        method=row,
+        success=results.methods[row].summary["success"].mean,
+        target=tensors["target.position"][:episodes],
+        target_success=np.array(evaluation.target.success[:episodes], dtype=bool),
+        simulated=tensors.get("simulated.position", np.empty((0, 1, 2)))[: len(simulated)],
+        simulated_success=np.array(simulated, dtype=bool),
+        goal=tensors["goal"][:episodes],
+    )
+
+
+def _curves(results: Results) -> dict[str, list[Curve]]:
+    curves = {
+        method: [Curve(np.array(seed.steps), np.array(seed.success)) for seed in row.learning]
+        for method, row in results.methods.items()
+    }
+    return {
+        method: seeds
+        for method, seeds in curves.items()
+        if seeds and all(np.isfinite(seed.success).any() for seed in seeds)
+    }
+
+
+def _foretold(results: Results) -> list[Foretold]:
+    return [
+        Foretold(
+            title=f"{simulator} simulator".capitalize(),
+            returns={
+                method: np.array([row.simulator_returns[simulator], row.returns])
+                for method, row in results.methods.items()
+                if simulator in row.simulator_returns
+            },
+        )
+        for simulator in results.predictive_validity
+    ]
+
+
+def _gaps(results: Results) -> dict[str, OpenLoop]:
+    def stack(band: BandMeans) -> Floats:
+        return np.array([band.mean, band.low, band.high])
+
+    return {
+        name: OpenLoop(
+            horizons=np.array(gap.horizons, dtype=float),
+            grounded={quantity: stack(band) for quantity, band in gap.grounded.items()},
+            raw={quantity: stack(band) for quantity, band in gap.raw.items()},
+        )
+        for name, gap in results.gaps().items()
+    }
+
+
+def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
+    """Return success over sizes, and what they cover where the datasets of a seed are all at `root`."""
+    first = found.sizes[0].results
+    rows = {method: [size.results.methods[method] for size in found.sizes] for method in first.methods}
+    summaries = {method: [row.summary["success"] for row in of] for method, of in rows.items()}
+    covered: dict[str, list[Visits]] = {}
+    for folder in _subsets(found, root):
+        dataset = Dataset.open(folder)
+        for label, role in (("position (m)", "position"), ("velocity (m/s)", "vector")):
+            planar = visited(dataset, role)
+            if planar is not None:
+                covered.setdefault(label, []).append(Visits(planar.counts, planar.extent))
+    return data_efficiency(
+        [size.percent for size in found.sizes],
+        {method: [np.array(row.success) for row in of] for method, of in rows.items()},
+        # Where there is a single seed, None becomes NaN.
+        {
+            method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T
+            for method, sizes in summaries.items()
+        },
+        covered,
+    )
+
+
+def _subsets(found: SizesResults, root: Path) -> list[Path]:
+    """Return the datasets of all sizes of the first seed that has them all, or none."""
+    for seed in found.sizes[0].results.seeds:
+        folders = [root / "subset" / place(seed, size.percent) for size in found.sizes]
+        if all(folder.is_dir() for folder in folders):
+            return folders
+    return []
