@@ -7,14 +7,35 @@ from pathlib import Path
 import torch
 
 from astra_data.display import shown
-from astra_data.errors import BadInputError
+from astra_data.errors import BadInputError, RecipeError
 from astra_data.figures import png
 from astra_data.prediction.page import figure, render
 from astra_data.prediction.recordings import place_name, read_recordings
 from astra_data.prediction.study import GapRecipe, run_study
-from astra_data.recipe import load_recipe
+from astra_data.recipe import load_recipe, load_tables
 
 RUNS = Path("runs")
+
+
+def is_gap_recipe(path: Path) -> bool:
+    """Tell whether the file at `path` names what recipes for `astra-data gap` have and others have not.
+
+    Raises:
+        RecipeError: it is missing or not TOML.
+    """
+    return {"mapping", "models"} <= load_tables(path).keys()
+
+
+def check_gap(recipe_path: Path) -> None:
+    """Validate a `GapRecipe` and that its mapping is there.
+
+    Raises:
+        RecipeError: it has faults.
+    """
+    recipe = load_recipe(recipe_path, GapRecipe)
+    mapping = recipe_path.parent / recipe.mapping
+    if not mapping.is_file():
+        raise RecipeError(f"{recipe_path}: mapping: expected a file of `astra-data import`, got {mapping}")
 
 
 def measure_gap(
@@ -40,6 +61,7 @@ def measure_gap(
         RecipeError: the recipe has faults.
         BadInputError: there are no usable recordings, or the folder holds what other settings gave.
     """
+    check_gap(recipe_path)
     recipe = load_recipe(recipe_path, GapRecipe)
     unknown = sorted(set(seeds) - set(recipe.seeds))
     if unknown:

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 from toy_walks import write_archive
+from typer.testing import CliRunner
 
+from astra_data import cli
 from astra_data.errors import BadInputError, RecipeError
 from astra_data.walk_gap import measure_gap
 
@@ -89,3 +91,15 @@ def test_what_does_not_fit_is_refused(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text(RECIPE.replace('"ridge"', '"rigde"'))
     with pytest.raises(RecipeError, match="did you mean 'ridge'"):
         measure_gap(recipe, logs, root=root)
+
+
+def test_a_gap_recipe_is_checked(recipe: Path) -> None:
+    def call() -> tuple[int, str]:
+        result = CliRunner().invoke(cli.app, ["check", str(recipe)])
+        return result.exit_code, f"{result.output}{result.exception or ''}"
+
+    assert call() == (0, f"{recipe}: for `astra-data gap`, without faults\n")
+    recipe.write_text(recipe.read_text().replace("updates", "update"))
+    assert call()[0] == 1 and "fit.update: unknown key: did you mean 'updates'?" in call()[1]
+    recipe.write_text(RECIPE.replace("nao_guda.toml", "nowhere.toml"))
+    assert call()[0] == 1 and "expected a file of `astra-data import`" in call()[1]

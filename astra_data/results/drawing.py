@@ -15,7 +15,6 @@ from astra_data.figures import (
     Panel,
     Visits,
     data_efficiency,
-    dynamics_mismatch,
     learning_curves,
     open_loop_error,
     predictive_validity,
@@ -24,7 +23,6 @@ from astra_data.figures import (
 )
 from astra_data.inspection import visited
 from astra_data.mazes import Maze
-from astra_data.mismatch import CommandReplay
 from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.results.model import BandMeans, Results
 from astra_data.results.sizes import SizesResults
@@ -38,18 +36,16 @@ def figures_of(
     root: Path,
     *,
     maze: Maze,
-    replay: CommandReplay,
     trajectory_methods: Sequence[str],
     trajectory_episodes: int,
 ) -> dict[str, Figure]:
-    """Return the figures of a page, by their names on it.
+    """Return the figures of a page that are drawn of results, by their names on it.
 
     Args:
         results: all numbers in them.
         root: the recipe's folder of runs; without the trajectories of a row that is to be drawn there, there
             is no figure of trajectories.
         maze: the task's.
-        replay: the same commands in its simulator and its target.
         trajectory_methods: rows whose trajectories are drawn; all where none of them is in the results.
         trajectory_episodes: how many of each row.
     """
@@ -63,7 +59,6 @@ def figures_of(
             if folder
         ]
         figures["trajectories"] = trajectories(maze, panels)
-    figures["mismatch"] = dynamics_mismatch(replay.time_s, replay.command, replay.simulated, replay.target)
     curves = _curves(results)
     if curves:
         figures["learning"] = learning_curves(curves)

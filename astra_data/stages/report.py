@@ -8,7 +8,7 @@ from typing import Protocol
 from pydantic import Field, JsonValue
 
 from astra_data.checkpoint import finished_folder
-from astra_data.figures import png
+from astra_data.figures import dynamics_mismatch, png
 from astra_data.methods import method_named
 from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
@@ -138,9 +138,12 @@ def report(
             found,
             root,
             maze=TASKS[found.task].maze,
-            replay=replay_commands(TASKS[found.task]),
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
+        )
+        replay = replay_commands(TASKS[found.task])
+        figures["mismatch"] = dynamics_mismatch(
+            replay.time_s, replay.command, replay.simulated, replay.target
         )
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
