@@ -6,6 +6,7 @@ words       errors  extras  columns  layouts  seeding  recipe  rows  batched  si
             digest  lock  cores  stopwatch
 knowledge   geometry  mazes  free_space  objective  navigation  ant  physics  abstraction  checkpoint  models/
             recording  import_mapping  conversion  variation  planar  ball  kicking  nao/
+            humanoid/
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
 exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, varied, scattered, grounded)

@@ -5,7 +5,7 @@ Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thre
 `MjData`, which so stays in the core's cache; `mj_step` releases the interpreter lock.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -30,6 +30,7 @@ class BatchedPhysics:
         state: all that the copies' futures depend on, warm starts included, (B, N) float64; what was copied
             from it may be written back into it.
         touching: whether anything touched a watched geom when the copy was last stepped, (B,) bool.
+        measured: what was measured of each copy when it was last stepped or set, (B, M) float64.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class BatchedPhysics:
         *,
         substeps: int,
         watched_geoms: tuple[int, int] | None = None,
+        measure: Callable[[mujoco.MjData], Sequence[float]] | None = None,
         num_threads: int | None = None,
     ) -> None:
         """Allocate B copies in the model's initial state.
@@ -48,6 +50,7 @@ class BatchedPhysics:
             num_envs: B.
             substeps: physics steps per control step.
             watched_geoms: first and last id of the geoms whose touch is reported, by default none.
+            measure: reads M numbers off a copy that was just stepped or set; must not change its state.
             num_threads: by default one per core.
         """
         self.model = model
@@ -55,6 +58,7 @@ class BatchedPhysics:
         self.substeps = substeps
         self.num_threads = min(num_threads or cores(), num_envs)
         self._watched = watched_geoms
+        self._measure = measure
         self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
         after_time, end = 1 + model.nq, 1 + model.nq + model.nv
         self.qpos: Floats = self.state[:, 1:after_time]
@@ -64,6 +68,8 @@ class BatchedPhysics:
         self._rows = list(self.state)
         self._data = [mujoco.MjData(model) for _ in range(self.num_threads)]
         self._pool = ThreadPoolExecutor(self.num_threads)
+        size = 0 if measure is None else len(measure(self._data[0]))
+        self.measured: Floats = np.zeros((num_envs, size))
         self.set_state(np.arange(num_envs), np.tile(model.qpos0, (num_envs, 1)), np.zeros_like(self.qvel))
 
     def set_state(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats) -> None:
@@ -75,6 +81,8 @@ class BatchedPhysics:
             data.qvel[:] = velocity
             mujoco.mj_forward(self.model, data)
             mujoco.mj_getState(self.model, data, self._rows[row], _STATE)
+            if self._measure is not None:
+                self.measured[row] = self._measure(data)
         self.touching[rows] = False
 
     def step(self, control: Floats, active: Bools | None = None) -> None:
@@ -88,7 +96,7 @@ class BatchedPhysics:
             helper.result()
 
     def _step_rows(self, data: mujoco.MjData, rows: Iterator[int]) -> None:
-        model, substeps, watched = self.model, self.substeps, self._watched
+        model, substeps, watched, measure = self.model, self.substeps, self._watched, self._measure
         get_state, set_state, step = mujoco.mj_getState, mujoco.mj_setState, mujoco.mj_step
         for row in rows:
             state = self._rows[row]
@@ -98,3 +106,5 @@ class BatchedPhysics:
             if watched is not None:
                 geoms = data.contact.geom
                 self.touching[row] = ((geoms >= watched[0]) & (geoms <= watched[1])).any()
+            if measure is not None:
+                self.measured[row] = measure(data)

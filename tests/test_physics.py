@@ -82,3 +82,27 @@ def test_a_watched_floor_is_felt_by_those_who_touch_it() -> None:
     assert physics.touching.tolist() == [True, False]
     physics.set_state(np.arange(2), qpos, qvel)
     assert not physics.touching.any()
+
+
+def test_what_is_measured_is_of_the_copys_own_last_step() -> None:
+    model = ant_model()
+    physics = BatchedPhysics(
+        model,
+        3,
+        substeps=5,
+        measure=lambda data: (data.ctrl[0], data.actuator_force[0], data.qpos[2]),
+        num_threads=2,
+    )
+    qpos, qvel = standing(3)
+    qpos[:, 2] = [1.0, 2.0, 3.0]
+    physics.set_state(np.arange(3), qpos, qvel)
+    assert physics.measured[:, 2].tolist() == [1.0, 2.0, 3.0]
+    control = np.zeros((3, 8))
+    control[:, 0] = [0.5, -0.25, 1.0]
+    physics.step(control, np.array([True, False, True]))
+    assert physics.measured[:, 0].tolist() == [0.5, 0.0, 1.0]
+    assert physics.measured[:, 1].tolist() == [0.5, 0.0, 1.0]
+    np.testing.assert_array_equal(physics.measured[:, 2], physics.qpos[:, 2])
+    assert physics.measured[0, 2] != 1.0
+    unmeasured = BatchedPhysics(model, 1, substeps=1, num_threads=1)
+    assert unmeasured.measured.shape == (1, 0)
