@@ -25,11 +25,14 @@ COMMANDED = tuple(JOINTS.index(name) for name in ("left_hip_y", "left_knee", "ri
 """The commanded joints among all, in the order of actions."""
 FEET = ("left_foot", "right_foot")
 """Geoms that are spheres at the ends of the shins."""
+FOOT_RADIUS_M = 0.075
 
 POSITIONS = 24
 """qpos: x, y, z, quaternion, 17 joint angles."""
 STATE_SIZE = 47
 """qpos, then qvel (23): linear, angular, 17 joint rates."""
+STANDING = (0.0, 0.0, 1.4, 1.0, *[0.0] * 43)
+"""The state in which the model starts: upright, at rest, every joint at zero."""
 CONTROL_SUBSTEPS = 5
 """Physics steps per control step: 5 x 0.003 s, as in Gymnasium."""
 TIMESTEP_S = 0.015
@@ -77,6 +80,16 @@ class CommandRanges:
 
     hip_deg: tuple[float, float] = (-50.0, 20.0)
     knee_deg: tuple[float, float] = (-70.0, -2.0)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The ends of the ranges by name, for what records a simulator."""
+        ranges = {"hip": self.hip_deg, "knee": self.knee_deg}
+        return {
+            f"{name}_{end}_deg": value
+            for name, ends in ranges.items()
+            for end, value in zip(("low", "high"), ends, strict=True)
+        }
 
     def targets(self, action: Tensor) -> Tensor:
         """Return the angles (..., 4) in rad that commands (..., 4), clipped to ±1, stand for."""

@@ -1,0 +1,94 @@
+"""φ of the humanoid: what each of its abstract simulators knows of target states (..., 47).
+
+numpy in, numpy out, torch in, torch out. Where the humanoid is on the floor is dropped by all: it does not
+matter to how it walks.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, POSITIONS
+from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
+
+_HEIGHT = 2
+_QUATERNION = slice(3, 7)
+_JOINTS = slice(7, POSITIONS)
+_VELOCITY = slice(POSITIONS, POSITIONS + 3)
+_SPIN = slice(POSITIONS + 3, POSITIONS + 6)
+_RATES = slice(POSITIONS + 6, None)
+
+
+def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+    """Keep what a planar walker has: (..., 47) to (..., 15).
+
+    Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee;
+    velocities of all of these, that along x first; and whether left and right foot touch the floor, 1 or 0.
+    The pitch is the angle by which the torso's forward axis points below the horizon, whatever its heading.
+    Velocities along x and z are the torso's in the world, m/s. Dropped: the velocity along y, how the torso
+    rolls and turns, and the joints that no command moves, though the feet's height is theirs too.
+    """
+    return _mapped(_walker2d, state)
+
+
+def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+    """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34).
+
+    Dropped: everything that tells how the body stands in the world.
+    """
+    return _mapped(_kinematics, state)
+
+
+def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
+    state: Array,
+) -> Array:
+    """Keep all joints, and the centre of mass and its velocity: (..., 47) to (..., 40).
+
+    After the joints (34): x and y of the centre of mass, seen from the middle between the feet, and its
+    height above the floor, in m; its velocity (3) in m/s. All along the world's axes. A humanoid that falls
+    first moves its centre of mass from above its feet, then down. Dropped: how the torso is turned.
+    """
+    return _mapped(_extended_kinematics, state)
+
+
+def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
+    abstraction: Callable[[Tensor], Tensor], state: Array
+) -> Array:
+    return abstraction(state) if isinstance(state, Tensor) else abstraction(torch.from_numpy(state)).numpy()
+
+
+def _walker2d(state: Tensor) -> Tensor:
+    height, velocity, spin = state[..., _HEIGHT], state[..., _VELOCITY], state[..., _SPIN]
+    joints = state[..., _JOINTS]
+    # How far the torso's axes point up.
+    forward, left, up = rotation(state[..., _QUATERNION])[..., 2, :].unbind(-1)
+    level = torch.hypot(left, up).clamp_min(1e-6)
+    pitch = torch.atan2(-forward, level)
+    pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level
+    _, feet = mass_and_feet(joints)
+    axes = torch.stack([forward, left, up], dim=-1).unsqueeze(-2)
+    clearance = height.unsqueeze(-1) + (axes * feet).sum(-1) - FOOT_RADIUS_M
+    pose = [torch.stack([height, pitch], dim=-1), joints[..., COMMANDED]]
+    rates = [velocity[..., [0, 2]], pitch_rate.unsqueeze(-1), state[..., _RATES][..., COMMANDED]]
+    return torch.cat([*pose, *rates, (clearance < CONTACT_M).to(state.dtype)], dim=-1)
+
+
+def _kinematics(state: Tensor) -> Tensor:
+    return torch.cat([state[..., _JOINTS], state[..., _RATES]], dim=-1)
+
+
+def _extended_kinematics(state: Tensor) -> Tensor:
+    joints, rates = state[..., _JOINTS], state[..., _RATES]
+    turn = rotation(state[..., _QUATERNION])
+
+    def turned(vector: Tensor) -> Tensor:
+        return (turn @ vector.unsqueeze(-1)).squeeze(-1)
+
+    mass, feet = mass_and_feet(joints)
+    aside = turned(mass - feet.mean(-2))[..., :2]
+    height = state[..., _HEIGHT, None] + turned(mass)[..., 2:]
+    swept = torch.linalg.cross(state[..., _SPIN], mass) + mass_velocity(joints, rates)
+    return torch.cat([joints, rates, aside, height, state[..., _VELOCITY] + turned(swept)], dim=-1)

@@ -1,0 +1,160 @@
+"""The humanoid's joints without its body: they follow commands, whatever these do to its balance.
+
+Every joint of the humanoid is there. Commanded joints go toward their targets, all others toward zero, as
+position control moves a joint that weighs nothing against its damping: the difference shrinks by a constant
+share in each moment, K / (D + d), with the paper's gains K and D and the joint's damping d: 13 per second at
+the hips, 18 at the knees. Within commands' ranges that asks no motor for more than it has. Against the
+humanoid under random commands, each held for 7 steps, angles of commanded joints are 0.24 rad off after 10
+steps; joints that reach their targets at once are 0.36 rad off, joints that do not move 0.30 rad.
+
+The extended simulator adds the centre of mass and its velocity. The torso stays level and looks along x, so
+that the joints alone say how the centre of mass moves, seen from the feet. Its velocity goes toward what it
+would be if the lower foot did not move, with a time constant of 0.3 s, about that of a body of its height
+when it topples; the height follows the velocity. Without that delay, joints that weigh nothing throw the body
+about: under those commands, its velocity along x is 3.3 m/s off after a single step, and not 0.17 m/s.
+
+Both leave out:
+
+* Forces. No joint is ever slowed by what it carries, or pushed by what the foot stands on; none swings past
+  its target. Rates are told, but how fast a joint was does not matter to where it goes.
+* The world, without the extension: height, balance, walking and falling are nowhere in the state.
+
+The extended one leaves out:
+
+* Falling by itself: there is no weight. A centre of mass that has left the feet stays beside them, and sinks
+  no faster than it did. The state can tell a fall, and so a correction of it can make one.
+* How the body leans and turns: the motion that legs give to the centre of mass is as of an upright one.
+* Flight, slipping and double support: one foot always stands, the other never brakes. The floor is nowhere.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from astra_data.columns import ABSTRACT_STATE, Column
+from astra_data.humanoid.abstraction import humanoid_to_extended_kinematics, humanoid_to_kinematics
+from astra_data.humanoid.model import (
+    COMMANDED,
+    DAMPING,
+    JOINTS,
+    STANDING,
+    STIFFNESS,
+    TIMESTEP_S,
+    CommandRanges,
+    humanoid_model,
+)
+from astra_data.humanoid.skeleton import mass_and_feet
+
+_COUNT = len(JOINTS)
+_CENTRE = slice(2 * _COUNT, 2 * _COUNT + 3)
+_VELOCITY = slice(2 * _COUNT + 3, None)
+_NAMES = (*JOINTS, *(f"{name}_rate" for name in JOINTS))
+_UNITS = ["rad"] * _COUNT + ["rad/s"] * _COUNT
+
+
+class HumanoidKinematics:
+    """B humanoids' joints; action: angles of left hip and knee, right hip and knee, (B, 4), clipped to ±1.
+
+    Attributes:
+        state: (B, 34) float32, as `humanoid_to_kinematics` makes it.
+    """
+
+    action_size = 4
+    abstract_state = Column(
+        ABSTRACT_STATE,
+        size=2 * _COUNT,
+        names=_NAMES,
+        meaning="angles and rates of all joints",
+        astra={"unit": _UNITS, "frame": ["joint"] * 2 * _COUNT, "role": ["invariant"] * 2 * _COUNT},
+    )
+    abstraction = staticmethod(humanoid_to_kinematics)
+
+    def __init__(self, num_envs: int, *, ranges: CommandRanges | None = None, device: str = "cpu") -> None:
+        """Put B humanoids' joints at zero; `ranges` says what commands stand for."""
+        self.ranges = ranges or CommandRanges()
+        standing = type(self).abstraction(torch.tensor(STANDING))
+        self.state = standing.repeat(num_envs, 1).to(device)
+        damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
+        self._approach = STIFFNESS / (DAMPING + damping)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What a dataset paired with this simulator records about it."""
+        return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
+        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+
+    def step(self, action: Tensor) -> Tensor:
+        """Follow the commands `action` (B, 4) for 0.015 s; return the new state (B, X)."""
+        self.state = self._moved(action)
+        return self.state
+
+    def _moved(self, action: Tensor) -> Tensor:
+        """Return angles and rates (B, 34) of all joints after the step."""
+        angles = self.state[:, :_COUNT]
+        target = torch.zeros_like(angles)
+        target[:, COMMANDED] = self.ranges.targets(action)
+        left = (target - angles) * torch.exp(-self._approach * TIMESTEP_S)
+        return torch.cat([target - left, self._approach * left], dim=-1)
+
+
+class HumanoidExtendedKinematics(HumanoidKinematics):
+    """The same, with the centre of mass and its velocity.
+
+    Attributes:
+        state: (B, 40) float32, as `humanoid_to_extended_kinematics` makes it.
+    """
+
+    abstract_state = Column(
+        ABSTRACT_STATE,
+        size=2 * _COUNT + 6,
+        names=(*_NAMES, "mass_x", "mass_y", "mass_z", "mass_vx", "mass_vy", "mass_vz"),
+        meaning="angles and rates of all joints; centre of mass, from between the feet, and its velocity",
+        astra={
+            "unit": [*_UNITS, *["m"] * 3, *["m/s"] * 3],
+            "frame": ["joint"] * 2 * _COUNT + ["world"] * 6,
+            "role": ["invariant"] * 2 * _COUNT + ["vector", "vector", "invariant"] * 2,
+        },
+    )
+    abstraction = staticmethod(humanoid_to_extended_kinematics)
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        ranges: CommandRanges | None = None,
+        follow_s: float = 0.3,
+        device: str = "cpu",
+    ) -> None:
+        """Stand B humanoids up.
+
+        Args:
+            num_envs: B.
+            ranges: what commands stand for.
+            follow_s: time constant of the body's velocity, above 0.
+            device: torch device.
+        """
+        super().__init__(num_envs, ranges=ranges, device=device)
+        self.follow_s = follow_s
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What a dataset paired with this simulator records about it."""
+        return {**super().parameters, "follow_s": self.follow_s}
+
+    def _moved(self, action: Tensor) -> Tensor:
+        """Return joints, centre of mass and its velocity (B, 40) after the step."""
+        joints = super()._moved(action)
+        mass, feet = mass_and_feet(self.state[:, :_COUNT])
+        later_mass, later_feet = mass_and_feet(joints[:, :_COUNT])
+        aside = (later_mass - later_feet.mean(1)) - (mass - feet.mean(1))
+        stance = feet[..., 2].argmin(dim=-1)
+        rows = torch.arange(len(feet), device=feet.device)
+        driven = ((later_mass - later_feet[rows, stance]) - (mass - feet[rows, stance])) / TIMESTEP_S
+        share = 1.0 - math.exp(-TIMESTEP_S / self.follow_s)
+        velocity = torch.lerp(self.state[:, _VELOCITY], driven, share)
+        shift = torch.cat([aside[:, :2], velocity[:, 2:] * TIMESTEP_S], dim=-1)
+        return torch.cat([joints, self.state[:, _CENTRE] + shift, velocity], dim=-1)

@@ -1,0 +1,100 @@
+"""The most abstract simulator of the humanoid: a walker in the plane, with legs under one rigid link.
+
+It has what the plane has. The legs' links, feet, joints, motors and masses are the humanoid's; trunk, head
+and arms are one link that weighs and balances as they do with their joints at zero. It stands, steps, swings
+its legs and falls forward or backward, by the same physics and the same position control.
+
+It leaves out:
+
+* Falling to the side, as a humanoid that learns to walk mostly does. Here no policy ever pays for it, nor
+  learns to shift its weight from foot to foot.
+* Turning. The walker always looks along x; a humanoid that turned away walks, but not there.
+* Waist, hips' other axes, arms. The humanoid's hold their angles only as well as their motors can, and give
+  way to gravity and to the legs' motion; here they are stiff.
+* Legs that hit each other.
+* Which part of a foot touches: both worlds have spheres for feet, but a humanoid that rolls lifts one of them
+  at joint angles at which the walker stands on both. Contacts come from the joints and the torso here, and
+  so may change as soon as a state that was set takes its first step.
+* The memory of MuJoCo's solver from step to step: a state says all about what follows from it.
+"""
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.rollout import Rollout
+from torch import Tensor
+
+from astra_data.columns import ABSTRACT_STATE, Column
+from astra_data.cores import cores
+from astra_data.humanoid.abstraction import humanoid_to_walker2d
+from astra_data.humanoid.model import CONTACT_M, CONTROL_SUBSTEPS, STANDING, TIMESTEP_S, CommandRanges
+from astra_data.humanoid.walker import sole_clearance, walker_model
+
+_JOINTS = ("left_hip", "left_knee", "right_hip", "right_knee")
+_POSE = slice(0, 6)
+_MOTION = slice(0, 13)
+
+
+class HumanoidWalker2d:
+    """B walkers; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
+
+    Attributes:
+        state: (B, 15) float32, as `humanoid_to_walker2d` makes it.
+    """
+
+    action_size = 4
+    abstract_state = Column(
+        ABSTRACT_STATE,
+        size=15,
+        names=(
+            *("z", "pitch", *_JOINTS),
+            *("vx", "vz", "pitch_rate", *(f"{name}_rate" for name in _JOINTS)),
+            *("left_contact", "right_contact"),
+        ),
+        meaning="torso, legs and foot contacts of a planar walker",
+        astra={
+            "unit": ["m", *["rad"] * 5, "m/s", "m/s", *["rad/s"] * 5, "1", "1"],
+            "frame": ["world"] * 2 + ["joint"] * 4 + ["world"] * 3 + ["joint"] * 4 + ["world"] * 2,
+            "role": ["invariant"] * 15,
+        },
+    )
+    abstraction = staticmethod(humanoid_to_walker2d)
+
+    def __init__(
+        self, num_envs: int, *, ranges: CommandRanges | None = None, num_threads: int | None = None
+    ) -> None:
+        """Stand B walkers up.
+
+        Args:
+            num_envs: B.
+            ranges: what commands stand for.
+            num_threads: physics threads, by default one per core.
+        """
+        self.ranges = ranges or CommandRanges()
+        self.state = humanoid_to_walker2d(torch.tensor(STANDING)).repeat(num_envs, 1)
+        self._model = walker_model()
+        self._data = [mujoco.MjData(self._model) for _ in range(min(num_threads or cores(), num_envs))]
+        self._rollout = Rollout(nthread=len(self._data))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What a dataset paired with this simulator records about it."""
+        return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, 15)."""
+        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+
+    def step(self, action: Tensor) -> Tensor:
+        """Follow the commands `action` (B, 4) for 0.015 s; return the new state (B, 15)."""
+        model, count = self._model, len(self.state)
+        initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
+        # Behind the time, and x, where every step begins anew.
+        initial[:, 2 : 2 + _MOTION.stop] = self.state[:, _MOTION].numpy()
+        targets = self.ranges.targets(action.double()).numpy()
+        control = np.repeat(targets[:, None], CONTROL_SUBSTEPS, axis=1)
+        states, _ = self._rollout.rollout(model, self._data, initial, control)
+        motion = torch.from_numpy(states[:, -1, 2 : 2 + _MOTION.stop])
+        contact = sole_clearance(motion[:, _POSE]) < CONTACT_M
+        self.state = torch.cat([motion, contact], dim=-1).float()
+        return self.state
