@@ -110,6 +110,8 @@ def test_heights_outside_of_the_range_end_an_episode(height: float, failed: bool
     assert env.failed.tolist() == step.terminated.tolist() == [failed, False]
     assert not step.success.any()
     assert (float(step.reward[0]) < 3.0) == failed  # without the bonus for health
+    env.reset(step.terminated)
+    assert not env.failed.any()
 
 
 def test_a_saved_state_goes_on_alike() -> None:
