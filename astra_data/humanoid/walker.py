@@ -27,10 +27,10 @@ _MODEL = """
   <compiler angle="radian"/>
   <option integrator="RK4" solver="PGS" iterations="50" timestep="0.003"/>
   <default>
-    <geom contype="1" conaffinity="0" condim="1" margin="0.001"/>
+    <geom condim="1" margin="0.001"/>
   </default>
   <worldbody>
-    <geom type="plane" contype="0" conaffinity="1" condim="3" friction="1 .1 .1" size="20 20 0.125"/>
+    <geom type="plane" condim="3" friction="1 .1 .1" size="20 20 0.125"/>
     <body>
       <joint name="x" type="slide" axis="1 0 0"/>
       <joint name="z" type="slide" axis="0 0 1"/>
