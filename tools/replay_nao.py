@@ -37,9 +37,7 @@ def main(
     """Print how far the simulated robots and the abstract simulator are from the physical one."""
     with TemporaryDirectory() as home:
         recordings = read_recordings(data, MAPPING, Path(home), WalkingConfig())
-    pieces = [
-        (piece, recording.fps * CONTROL_STEP_S) for recording in recordings for piece in recording.pieces
-    ]
+    pieces = [(piece, one.fps * CONTROL_STEP_S) for one in recordings for piece in one.pieces]
     counts = [int(len(piece) / rows) for piece, rows in pieces]
     walked, told, fallen = _walked(_actions(pieces, counts), seed)
     motions = []
@@ -51,9 +49,7 @@ def main(
                 pairs = (logged, walked[[step, step + AHEAD], number], told[[step, step + AHEAD], number])
                 motions.append(torch.stack([between(before, after) for before, after in pairs]))
     robot, simulated, raw = torch.stack(motions, dim=1).numpy()
-    print(
-        "| in 0.96 s | the robot, rms | rms error of the simulated NAO | moving at once as told | correlations |"
-    )
+    print("| in 0.96 s | robot, rms | simulated NAO, rms error | moving at once as told | correlations |")
     print("| --- | --- | --- | --- | --- |")
     for axis, name in enumerate(("forward (m)", "sideways (m)", "turn (rad)")):
         errors = [_rms(robot[:, axis])] + [_rms((its - robot)[:, axis]) for its in (simulated, raw)]
@@ -74,7 +70,7 @@ def _actions(pieces: list[tuple[Piece, float]], counts: list[int]) -> Tensor:
 
 
 def _walked(actions: Tensor, seed: int) -> tuple[Tensor, Tensor, NDArray[np.bool_]]:
-    """Return poses (T + 1, B, 3) of the simulated NAOs and of the abstract simulator, and who lies, (T + 1, B)."""
+    """Return poses (T + 1, B, 3) of simulated NAOs and abstract simulator, and which fell, (T + 1, B)."""
     robots = actions.shape[1]
     nao, abstract = BatchedNao(robots, seed=seed), PlanarWalker(robots, timestep_s=CONTROL_STEP_S)
     walked, told, fallen = [nao.pose], [abstract.state[:, :3]], [nao.fallen.copy()]
