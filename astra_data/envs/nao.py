@@ -186,7 +186,8 @@ class NaoEnv:
     def _body_command(self, action: Tensor) -> Floats:
         """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3), as believed.
 
-        Robots turn to where they go, or to their ball, or look around for it.
+        Robots turn to where they go. With a ball they turn to it, and walk the slower the farther it is
+        aside; when it is lost they look around.
         """
         command = action.clamp(-1.0, 1.0).double().numpy()
         x, y = (SPEED_M_S * command).T
@@ -201,6 +202,8 @@ class NaoEnv:
         turn *= np.linalg.norm(command, axis=1) > _STANDING
         if self.has_ball:
             turn = np.where(self.sight.unseen_s > SEARCH_AFTER_S, TURN_LIMIT_RAD_S, turn)
+            facing = np.cos(astray).clip(0.0) ** 2
+            x, y = facing * x, facing * y
         return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
 
     def state_dict(self) -> dict[str, Tensor]:

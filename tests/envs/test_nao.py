@@ -60,6 +60,17 @@ def test_robots_with_a_ball_keep_facing_it() -> None:
     np.testing.assert_allclose(np.cos(bearing), 1.0, atol=0.1)
 
 
+def test_robots_turn_to_their_ball_before_they_walk() -> None:
+    one = env("nao-kick", 4, errors=NO_ERRORS)
+    place, angle = np.zeros((4, 3)), np.array([0.0, np.pi / 4, np.pi / 2, -3.0])
+    one.robots.reset(np.arange(4), place, np.random.default_rng(0))
+    one.localisation.reset(np.arange(4), place, np.random.default_rng(0))
+    one.sight.reset(np.arange(4), np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    command = one._body_command(torch.tensor([[1.0, 0.0]]).expand(4, 2))
+    np.testing.assert_allclose(command[:, 0] / command[0, 0], [1.0, 0.5, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(np.sign(command[:, 2]), [0.0, 1.0, 1.0, -1.0])
+
+
 def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
     one = env("nao-kick", 2, errors=NO_ERRORS)
     place, ball = np.zeros((2, 3)), np.array([[-0.8, 0.0], [0.8, 0.0]])
