@@ -161,7 +161,7 @@ def augment(
                 writer.add(_copied(source, world, episode, uid, *drawn, rng))
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
-        if not placed:
+        if copies.any() and not placed:
             raise BadInputError(
                 f"{source.reference}: no place was found for any of {lost} copies: lower --margin-m "
                 f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
@@ -228,8 +228,8 @@ def _shares(
     copies[usable] = config.copies or DEFAULT_COPIES
     if config.episodes is not None:
         kept = count if config.keep_originals else held
-        if config.episodes <= kept:
-            raise BadInputError(f"--episodes {config.episodes}: expected more than the {kept} that are kept")
+        if config.episodes < kept:
+            raise BadInputError(f"--episodes {config.episodes}: expected at least the {kept} that are kept")
         each, more = divmod(config.episodes - kept, int(usable.sum()))
         copies[usable] = each
         copies[order[usable[order]][:more]] += 1
