@@ -35,3 +35,18 @@ def test_only_the_legs_differ_in_the_morphology_test() -> None:
     experiment = load_experiment(HOUSE / "recipes" / "leg_scale.toml", Path("runs"))
     assert experiment.recipe.evaluate.leg_scale == 1.25
     assert experiment.borrowed == {"collect", "pair", "ground", "train", "align"}
+
+
+@pytest.mark.parametrize(
+    ("name", "borrowed"), [("nao_navigation_50", {"collect"}), ("nao_navigation_200", set())]
+)
+def test_only_the_data_differs_in_the_augmentation_test(name: str, borrowed: set[str]) -> None:
+    experiment = load_experiment(HOUSE / "recipes" / f"{name}.toml", Path("runs"))
+    assert experiment.borrowed == borrowed
+    ours, base = (
+        experiment.recipe,
+        load_experiment(HOUSE / "recipes/nao_navigation.toml", Path("runs")).recipe,
+    )
+    assert ours.augment is not None
+    assert ours.augment.episodes == ours.collect.episodes
+    assert (ours.ground, ours.train, ours.align) == (base.ground, base.train, base.align)
