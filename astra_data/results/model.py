@@ -175,6 +175,8 @@ class Results(Part):
     """Per row and seed."""
     leg_scale: float = 1.0
     """Of the target's robot, which the data was not collected with if it is not 1."""
+    stand_in: str | None = None
+    """What stands in for a physical robot in the target, where something does."""
     methods: dict[str, MethodResults]
     paper_success: dict[str, float] = Field(default_factory=dict)
     """Row → what the paper prints for it."""

@@ -89,6 +89,12 @@ def _head(results: Results) -> str:
     if any(row.seeds != results.seeds for row in results.methods.values()):
         seeds += " (rows have as many of them as the table says)"
     to_come = f" Not finished yet: {', '.join(results.unfinished)}." if results.unfinished else ""
+    stand_in = (
+        f"\n\n**A simulated stand-in (`{results.stand_in}`) takes the physical robot's place: no figure is "
+        "of a real robot, and none compares with one in absolute terms.**"
+        if results.stand_in
+        else ""
+    )
     legs = f" The target's legs are {results.leg_scale:g} times as long." if results.leg_scale != 1 else ""
     return (
         f"# {results.recipe}\n\n"
@@ -96,7 +102,7 @@ def _head(results: Results) -> str:
         f"Produced by\n\n"
         f"```\n{results.command}\n```\n\n"
         f"on {machines or 'a machine that was not recorded'}. "
-        f"Wall time of the stages, summed: {duration(results.wall_seconds['total'])}.{to_come}"
+        f"Wall time of the stages, summed: {duration(results.wall_seconds['total'])}.{to_come}{stand_in}"
     )
 
 

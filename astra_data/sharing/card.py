@@ -97,10 +97,12 @@ def render_card(
 
 
 def _opening(dataset: Dataset) -> str:
+    stand_in = dataset.description["environment"].get("stand_in")
+    told = f" The robot is a simulated stand-in (`{stand_in}`) for a physical one." if stand_in else ""
     return (
         f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
         f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. Task: “{dataset.task}”. "
-        f"The format is LeRobot {layout.CODEBASE_VERSION}."
+        f"The format is LeRobot {layout.CODEBASE_VERSION}.{told}"
     )
 
 

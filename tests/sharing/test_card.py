@@ -53,6 +53,15 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
     assert str(dataset.description["git_commit"]) in text
 
 
+def test_the_card_says_that_a_robot_is_a_stand_in(fake: Dataset, tmp_path: Path) -> None:
+    assert "stand-in" not in render_card(fake, NOTES)
+    description = {**DESCRIPTION, "environment": {"id": "nao", "stand_in": "surrogate"}}
+    dataset = write_fake(tmp_path / "fake", description=description)
+    assert "The robot is a simulated stand-in (`surrogate`) for a physical one." in render_card(
+        dataset, NOTES
+    )
+
+
 def test_without_notes_their_sections_are_left_out(fake: Dataset) -> None:
     text = render_card(fake, Notes())
     assert "license: unknown" in text

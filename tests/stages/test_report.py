@@ -40,7 +40,7 @@ CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
 @pytest.fixture(scope="module", autouse=True)
 def tasks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(maze=U_MAZE)})
+        patch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(maze=U_MAZE, facts={})})
         patch.setattr(stage, "replay_commands", lambda task: REPLAY)
         yield
 
@@ -216,6 +216,18 @@ def test_the_page_tells_of_longer_legs(root: Path) -> None:
     edit_json(file, leg_scale=1.0)
     with pytest.raises(BadInputError, match=r"with legs 1"):
         make(root)
+
+
+def test_the_page_says_that_a_robot_is_a_stand_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make(root)
+    assert "stand-in" not in (root / "report/results.md").read_text()
+    task = SimpleNamespace(maze=U_MAZE, facts={"stand_in": "mujoco"})
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task})
+    make(root)
+    assert (
+        "**A simulated stand-in (`mujoco`) takes the physical robot's place"
+        in (root / "report/results.md").read_text()
+    )
 
 
 def test_the_page_says_which_rows_are_not_finished(root: Path) -> None:
