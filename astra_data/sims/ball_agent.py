@@ -7,6 +7,9 @@ from astra_data.ball import ROLLING_M_S2, knock, roll
 from astra_data.mazes import Maze
 from astra_data.planar import PlanarStates
 
+_LIES_M_S = 0.05
+"""Balls that are slower lie still: a robot's estimate is never quite zero."""
+
 
 class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
@@ -14,6 +17,9 @@ class BallAgent(PlanarStates):
     A command is the velocity of the next step, in units of the top speed along each axis. Walls stop the
     mass, not the ball. A mass that walks into its ball knocks it away, at one speed, along the line between
     their centres. Left out: legs, feet and where they are, and which way the robot looks.
+
+    Corrections move a ball only where it rolled or was touched before: how probably it will be touched, they
+    would turn into a ball that creeps, and policies wait for it.
 
     Attributes:
         parameters: what a dataset paired with this simulator records about it.
@@ -54,6 +60,7 @@ class BallAgent(PlanarStates):
             "reach_m": reach_m,
             "knock_m_s": knock_m_s,
         }
+        self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2), clipped to ±1 per axis; return the new state (B, 8)."""
@@ -64,6 +71,14 @@ class BallAgent(PlanarStates):
         ball, velocity = knock(
             position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"]
         )
+        self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
         ball, velocity = roll(ball, velocity, of["timestep_s"], ROLLING_M_S2)
         self.state = torch.cat([moved, (moved - position) / of["timestep_s"], ball, velocity], dim=-1)
+        return self.state
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Slide the masses as planar states do; a ball that lay untouched stays where it was."""
+        moved = super().settle(before, landed)
+        still = torch.cat([before[:, 4:6], torch.zeros_like(before[:, 6:])], dim=-1)
+        self.reset_to(torch.cat([moved[:, :4], torch.where(self._rolls, moved[:, 4:], still)], dim=-1))
         return self.state

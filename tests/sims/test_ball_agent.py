@@ -51,6 +51,7 @@ def test_walls_stop_the_mass_but_not_the_ball() -> None:
 
 def test_a_correction_is_taken_over_as_far_as_there_is_room() -> None:
     simulator = one()
+    simulator.step(torch.tensor([[1.0, 0.0]]))
     landed = torch.tensor([[0.3, 0.1, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
     assert torch.equal(simulator.settle(START, landed), landed)
     assert torch.equal(simulator.state, landed)
@@ -98,3 +99,18 @@ def test_noise_of_sensors_only_shows() -> None:
     torch.testing.assert_close(
         error, torch.tensor([0.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.2, 0.2]), atol=1e-4, rtol=0.01
     )
+
+
+def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
+    simulator = one(3)
+    states = START.repeat(3, 1)
+    # The first is walked away from, the second rolls, the third is walked into.
+    states[1, 6] = 0.1
+    simulator.reset_to(states)
+    simulator.step(torch.tensor([[-1.0, 0.0], [-1.0, 0.0], [1.0, 0.0]]))
+    landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.5, 0.5, 0.3, 0.3]).repeat(3, 1)
+    settled = simulator.settle(states, landed)
+    assert torch.equal(settled[:, :4], landed[:, :4])
+    assert torch.equal(settled[0, 4:], START[0, 4:])
+    assert torch.equal(settled[1:, 4:], landed[1:, 4:])
+    assert torch.equal(simulator.state, settled)
