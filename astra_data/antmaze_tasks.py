@@ -1,5 +1,6 @@
 """AntMaze: Gymnasium's ant in a maze, and a planar point mass as its abstract simulator (Section V-A)."""
 
+from functools import partial
 from typing import get_args
 
 from astra_data.abstraction import ant_beyond_point_mass, ant_to_point_mass
@@ -10,7 +11,7 @@ from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.navigation import Navigation, RewardKind
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
-from astra_data.task import Task, roles
+from astra_data.task import Plane, Task, roles
 from astra_data.variation import WIDE_RANGES
 
 _JOINTS = tuple(f"{joint}_{leg}" for leg in range(1, 5) for joint in ("hip", "ankle"))
@@ -65,22 +66,24 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
     return Task(
         name=name if reward == "geodesic" else f"{name}-{reward}",
         instruction="walk through the maze to the goal",
-        objective=Navigation(maze, horizon, reward),
+        objective=Navigation(maze, reward, horizon=horizon),
         make_target=AntMazeEnv,
-        make_simulator=PointMass,
-        make_varied_simulator=VariedPointMass,
+        make_simulator=partial(PointMass, maze, timestep_s=TIMESTEP_S),
         abstraction=ant_to_point_mass,
         beyond=ant_beyond_point_mass,
         state_columns=_ANT_COLUMNS,
         abstract_state=_POINT_MASS,
         timestep_s=TIMESTEP_S,
         action_limit=1.0,
-        wall_reach_m=WALL_REACH_M,
-        # The body is its own mirror image, the learned low-level controller is not.
-        is_mirrorable=False,
-        ranges=WIDE_RANGES,
         simulator_id="point_mass",
         facts={"integrator": "RK4", "leg_scale": 1.0},
+        plane=Plane(
+            partial(VariedPointMass, maze, timestep_s=TIMESTEP_S),
+            WIDE_RANGES,
+            wall_reach_m=WALL_REACH_M,
+            # The body is its own mirror image, the learned low-level controller is not.
+            is_mirrorable=False,
+        ),
     )
 
 

@@ -34,7 +34,7 @@ class WallWatch:
     def __init__(self, task: Task, clearance_m: float) -> None:
         """Watch that robots stay `clearance_m` away from the walls of the task's maze."""
         self.clearance_m = clearance_m
-        self._task = task
+        self._task, self._maze = task, task.maze
 
     def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least clearance in m (B, K) on the ways of `commands` (B, K, 2) from `state` (B, S)."""
@@ -45,7 +45,7 @@ class WallWatch:
         nearest = np.full((count, choices), np.inf)
         for _ in range(round(_FORESIGHT_S / task.timestep_s)):
             position = simulator.step(action)[:, :2].double().numpy()
-            nearest = np.minimum(nearest, task.maze.clearance(position).reshape(count, choices))
+            nearest = np.minimum(nearest, self._maze.clearance(position).reshape(count, choices))
         return nearest
 
 

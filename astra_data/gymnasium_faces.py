@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.batched import BatchedEnv, Step
-from astra_data.envs.antmaze import AntMazeEnv
 from astra_data.objective import Objective
 from astra_data.simulators import Simulator
 from astra_data.tasks import task_named
@@ -156,7 +155,7 @@ def _fresh_seed() -> int:
 
 def ant_maze(task: str, **options: Any) -> WorldEnv:  # noqa: ANN401 - handed on
     """Build one target environment of `task`; `options` as for `AntMazeEnv`."""
-    return WorldEnv(AntMazeEnv(task_named(task).objective, 1, seed=_fresh_seed(), **options))
+    return WorldEnv(task_named(task).target(1, seed=_fresh_seed(), **options))
 
 
 def ant_maze_vector(
@@ -166,7 +165,7 @@ def ant_maze_vector(
     **options: Any,  # noqa: ANN401 - handed on
 ) -> WorldVectorEnv:
     """Build `num_envs` target environments of `task`; `options` as for `AntMazeEnv`."""
-    world = AntMazeEnv(task_named(task).objective, num_envs, seed=_fresh_seed(), **options)
+    world = task_named(task).target(num_envs, seed=_fresh_seed(), **options)
     return WorldVectorEnv(world, max_episode_steps)
 
 

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.objective import Objective
+from astra_data.objective import PlanarObjective
 
 
 @dataclass(frozen=True)
-class Kicking(Objective):
+class Kicking(PlanarObjective):
     """Knock the ball through the goal at the right end of `maze`, an empty field, within `horizon` steps.
 
     Abstract states begin with robot position and velocity, ball position and velocity, (..., 8). The goal

@@ -21,14 +21,14 @@ from astra_data.sims.ball_agent import BallAgent
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_ball_agent import VariedBallAgent
 from astra_data.sims.varied_point_mass import VariedPointMass
-from astra_data.task import Task, roles
-from astra_data.variation import WIDE_RANGES, BallVariation
+from astra_data.task import MakeVariedSimulator, Plane, Task, roles
+from astra_data.variation import WIDE_RANGES, BallVariation, Variation
 
 Level = Literal["mujoco", "surrogate"]
 
 _RADIUS_M = 0.1
 """Of the disc that the robot is at walls in its simulators: as in AntMaze, and less than the robot's 0.14."""
-_BODY: dict[str, Any] = {"radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
+_BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
 _CONTACT: dict[str, Any] = {"reach_m": 0.19, "knock_m_s": 1.0}
 
 KICK_RANGES = BallVariation(
@@ -121,12 +121,14 @@ def _task(name: str, level: Level, *, ball: bool, **own: Any) -> Task:  # noqa: 
         abstract_state=_abstract(ball=ball),
         timestep_s=CONTROL_STEP_S,
         action_limit=1.0,
-        wall_reach_m=0.3,
-        # A robot's joints are off by what is its own.
-        is_mirrorable=False,
         facts={"stand_in": level, "tick_s": TICK_S},
         **own,
     )
+
+
+def _plane(make_varied_simulator: MakeVariedSimulator, ranges: Variation) -> Plane:
+    # A robot's joints are off by what is its own.
+    return Plane(make_varied_simulator, ranges, wall_reach_m=0.3, is_mirrorable=False)
 
 
 def _navigation(level: Level) -> Task:
@@ -150,10 +152,9 @@ def _navigation(level: Level) -> Task:
             position_waves=3,
             ends_at_walls=True,
         ),
-        make_simulator=partial(PointMass, **_BODY),
-        make_varied_simulator=partial(VariedPointMass, **_BODY),
+        make_simulator=partial(PointMass, S_MAZE, **_BODY),
+        plane=_plane(partial(VariedPointMass, S_MAZE, **_BODY), WIDE_RANGES),
         abstraction=nao_to_point_mass,
-        ranges=WIDE_RANGES,
         simulator_id="point_mass",
     )
 
@@ -165,10 +166,9 @@ def _kicking(level: Level) -> Task:
         ball=True,
         instruction="kick the ball into the goal",
         objective=Kicking(FIELD, horizon=156),
-        make_simulator=partial(BallAgent, **_BODY, **_CONTACT),
-        make_varied_simulator=partial(VariedBallAgent, **_BODY, **_CONTACT),
+        make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT),
+        plane=_plane(partial(VariedBallAgent, FIELD, **_BODY, **_CONTACT), KICK_RANGES),
         abstraction=nao_to_ball_agent,
-        ranges=KICK_RANGES,
         simulator_id="ball_agent",
     )
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.free_space import GoalDistance
-from astra_data.objective import Objective
+from astra_data.objective import PlanarObjective
 
 RewardKind = Literal["geodesic", "euclidean", "sparse"]
 
 
 @dataclass(frozen=True)
-class Navigation(Objective):
+class Navigation(PlanarObjective):
     """Reach the goal of `maze` within `horizon` steps.
 
     Attributes:

@@ -16,24 +16,17 @@ class Objective(ABC):
     """Starts, goals, what a policy is shown, and how steps are judged; states are abstract ones, (..., X).
 
     Attributes:
-        maze: where it happens. horizon: steps until an episode is cut off.
-        ends_at_walls: whether touching a wall is a failure, which ends an episode.
+        horizon: steps until an episode is cut off.
         success_reward: for reaching the goal. failure_reward: for ending badly.
     """
 
-    maze: Maze
-    horizon: int
-    ends_at_walls: bool = field(default=False, kw_only=True)
+    horizon: int = field(kw_only=True)
     success_reward: float = field(default=10.0, kw_only=True)
     failure_reward: float = field(default=-10.0, kw_only=True)
 
     @abstractmethod
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, X), at rest, where the task starts."""
-
-    @abstractmethod
-    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states (count, X), at rest, anywhere in the free space."""
 
     @abstractmethod
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -48,8 +41,8 @@ class Objective(ABC):
         """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
 
     def places(self, state: Tensor) -> Tensor:
-        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""
-        return state[..., :2]
+        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of nothing, K = 0."""
+        return state[..., :0]
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
@@ -58,3 +51,24 @@ class Objective(ABC):
     @abstractmethod
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states (B, X), which perhaps ended badly (B,)."""
+
+
+@dataclass(frozen=True)
+class PlanarObjective(Objective):
+    """An objective in a maze; states begin with x and y of the robot in m.
+
+    Attributes:
+        maze: where it happens.
+        ends_at_walls: whether touching a wall is a failure, which ends an episode.
+    """
+
+    maze: Maze
+    ends_at_walls: bool = field(default=False, kw_only=True)
+
+    @abstractmethod
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X), at rest, anywhere in the free space."""
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""
+        return state[..., :2]

@@ -25,7 +25,7 @@ class Pairing:
     Attributes:
         id: names the simulator in the dataset.
         origin: where it comes from: the task that it belongs to, or the sha256 of the file.
-        maze: the one that it has, if it belongs to a task.
+        maze: the one that it has, if it belongs to a task with one.
         abstract_state: the column of abstract states, with names, units, frames and roles.
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
         simulator: builds B simulators.
@@ -53,9 +53,8 @@ def pairing_named(name: str) -> Pairing:
             raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
         task = task_named(name)
         origin = {"task": task.name}
-        return Pairing(
-            task.simulator_id, origin, task.maze, task.abstract_state, task.abstraction, task.simulator
-        )
+        maze = None if task.plane is None else task.maze
+        return Pairing(task.simulator_id, origin, maze, task.abstract_state, task.abstraction, task.simulator)
     path, _, kind = name.rpartition(":")
     made = _load_class(Path(path), kind)
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")

@@ -23,13 +23,13 @@ class Simulation:
     """The abstract simulator that a policy was trained in.
 
     Attributes:
-        thinness: of the data, (height, width).
+        thinness: of the data, (height, width); None where there is no maze.
         scatter: factor of the noise added in training, (X, X); zeros where there was none.
         world: the switches of the training world.
         variation: of the simulator's parameters from episode to episode.
     """
 
-    thinness: Tensor
+    thinness: Tensor | None
     scatter: Tensor
     world: WorldConfig
     variation: Variation | None = None
@@ -63,7 +63,9 @@ class PolicyFile:
             "observed": self.observed,
         }
         if self.simulation:
-            tensors |= {"thinness": self.simulation.thinness, "scatter": self.simulation.scatter}
+            tensors["scatter"] = self.simulation.scatter
+            if self.simulation.thinness is not None:
+                tensors["thinness"] = self.simulation.thinness
             variation = self.simulation.variation
             told["simulation"] = {
                 "world": self.simulation.world.model_dump(mode="json"),
@@ -96,7 +98,7 @@ class PolicyFile:
             if said := told.get("simulation"):
                 varied = said["variation"]
                 simulation = Simulation(
-                    tensors["thinness"],
+                    tensors.get("thinness"),
                     tensors["scatter"],
                     WorldConfig(**said["world"]),
                     Variation.of_json(varied) if varied else None,

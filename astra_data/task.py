@@ -8,8 +8,9 @@ from torch import Tensor
 
 from astra_data.batched import TargetEnv
 from astra_data.columns import Column
+from astra_data.errors import BadInputError
 from astra_data.mazes import Maze
-from astra_data.objective import Objective
+from astra_data.objective import Objective, PlanarObjective
 from astra_data.planar import VariedStates
 from astra_data.simulator import PairedSimulator
 from astra_data.variation import Variation
@@ -18,19 +19,34 @@ from astra_data.variation import Variation
 class MakeSimulator(Protocol):
     """Builds B abstract simulators."""
 
-    def __call__(self, maze: Maze, num_envs: int, *, timestep_s: float, device: str) -> PairedSimulator:
-        """Build `num_envs` simulators in `maze`."""
+    def __call__(self, num_envs: int, *, device: str) -> PairedSimulator:
+        """Build `num_envs` simulators."""
         ...
 
 
 class MakeVariedSimulator(Protocol):
     """Builds B abstract simulators whose parameters vary."""
 
-    def __call__(
-        self, maze: Maze, num_envs: int, variation: Variation, *, timestep_s: float, device: str
-    ) -> VariedStates:
-        """Build `num_envs` simulators in `maze`."""
+    def __call__(self, num_envs: int, variation: Variation, *, device: str) -> VariedStates:
+        """Build `num_envs` simulators."""
         ...
+
+
+@dataclass(frozen=True)
+class Plane:
+    """What is known of a robot in a plane, among the walls of a maze.
+
+    Attributes:
+        make_varied_simulator: builds abstract simulators whose parameters vary.
+        ranges: of these parameters, as the paper prints them for COMPASS.
+        wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
+        is_mirrorable: whether the robot, its controller included, is its own mirror image.
+    """
+
+    make_varied_simulator: MakeVariedSimulator
+    ranges: Variation
+    wall_reach_m: float
+    is_mirrorable: bool
 
 
 @dataclass(frozen=True)
@@ -39,19 +55,17 @@ class Task:
 
     Attributes:
         name: in recipes. instruction: what LeRobot calls the task.
-        objective: maze, horizon, reward and success.
-        make_target, make_simulator, make_varied_simulator: the worlds.
+        objective: horizon, reward and success; the maze, if there is one.
+        make_target, make_simulator: the worlds.
         abstraction: φ, target states (..., S) to abstract states (..., X).
         beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., S - X).
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
         action_limit: largest action along each axis; both worlds cut off what is beyond.
-        wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
-        is_mirrorable: whether the robot, its controller included, is its own mirror image.
-        ranges: of the simulator's parameters, as the paper prints them for COMPASS.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
+        plane: what only a task in a maze has; None for others.
     """
 
     name: str
@@ -59,23 +73,45 @@ class Task:
     objective: Objective
     make_target: Callable[..., TargetEnv]
     make_simulator: MakeSimulator
-    make_varied_simulator: MakeVariedSimulator
     abstraction: Callable[[Any], Any]
     beyond: Callable[[Tensor], Tensor]
     state_columns: tuple[Column, ...]
     abstract_state: Column
     timestep_s: float
     action_limit: float
-    wall_reach_m: float
-    is_mirrorable: bool
-    ranges: Variation
     simulator_id: str
     facts: Mapping[str, str | float]
+    plane: Plane | None = None
+
+    @property
+    def planar(self) -> Plane:
+        """What only a task in a maze has.
+
+        Raises:
+            BadInputError: this one has no maze.
+        """
+        if self.plane is None:
+            raise self.without_maze()
+        return self.plane
 
     @property
     def maze(self) -> Maze:
-        """The maze."""
+        """The maze.
+
+        Raises:
+            BadInputError: there is none.
+        """
+        if not isinstance(self.objective, PlanarObjective):
+            raise self.without_maze()
         return self.objective.maze
+
+    def without_maze(self) -> BadInputError:
+        """Return the error of who asks for something planar though there is no maze."""
+        return BadInputError(
+            f"expected a task in a maze, got '{self.name}', which has neither walls nor places: leave out "
+            "what needs them (augment, follower, varied parameters, support_penalty, command_limit_m_s, "
+            "clearance_m, start 'anywhere')"
+        )
 
     @property
     def fps(self) -> int:
@@ -88,13 +124,15 @@ class Task:
 
     def simulator(self, num_envs: int, device: str = "cpu") -> PairedSimulator:
         """Build `num_envs` abstract simulators."""
-        return self.make_simulator(self.maze, num_envs, timestep_s=self.timestep_s, device=device)
+        return self.make_simulator(num_envs, device=device)
 
     def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedStates:
-        """Build `num_envs` abstract simulators whose parameters vary."""
-        return self.make_varied_simulator(
-            self.maze, num_envs, variation, timestep_s=self.timestep_s, device=device
-        )
+        """Build `num_envs` abstract simulators whose parameters vary.
+
+        Raises:
+            BadInputError: the task has no maze, and so none of these.
+        """
+        return self.planar.make_varied_simulator(num_envs, variation, device=device)
 
 
 def roles(

@@ -11,6 +11,7 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import scatter_factor
 from astra_data.free_space import FreeSpace
 from astra_data.grounding_file import Grounding
+from astra_data.mazes import Maze
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.residual import ResidualModel
 from astra_data.recipe import Config, NotNegative, Positive, Share
@@ -59,13 +60,14 @@ class WorldParts:
     """What a training world is made of beside its switches.
 
     Attributes:
-        thinness: 1 where there is no data, 0 where there is enough, on the maze's fine grid (height, width).
+        thinness: 1 where there is no data, 0 where there is enough, on the maze's fine grid (height, width);
+            None where there is no maze.
         scatter: factor of the state noise, (X, X).
         starts: recorded moments, if episodes may start there.
         variation: of the simulator's parameters from episode to episode.
     """
 
-    thinness: Tensor
+    thinness: Tensor | None
     scatter: Tensor
     starts: DataStarts | None = None
     variation: Variation | None = None
@@ -81,7 +83,9 @@ def world_parts(
 ) -> WorldParts:
     """Derive thinness, scatter and starts from paired episodes, as far as `config` asks for them."""
     windows = episodes.windows
-    thinness = _thinness(task, episodes.steps(windows.state)[:, :2], config.support_density)
+    thinness = None
+    if task.plane is not None:
+        thinness = _thinness(task.maze, episodes.steps(windows.state)[:, :2], config.support_density)
     if isinstance(grounding, GroundingModel | ResidualModel):
         scatter = grounding.residual_factor
     else:
@@ -101,14 +105,14 @@ def world_parts(
     return WorldParts(thinness, config.residual_noise * scatter, starts, variation)
 
 
-def _thinness(task: Task, positions: Tensor, density: float) -> Tensor:
-    free = FreeSpace.of_maze(task.maze, radius_m=0.0, device=str(positions.device))
+def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:
+    free = FreeSpace.of_maze(maze, radius_m=0.0, device=str(positions.device))
     height, width = free.blocked.shape
     rows, columns = free.cells(positions)
     counts = torch.bincount(rows * width + columns, minlength=height * width).reshape(height, width)
-    smooth = gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / task.maze.fine_m)
+    smooth = gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / maze.fine_m)
     # Where most of the maze was never visited, the median is nothing, and any visit at all is enough.
-    enough = max(density * float(np.median(smooth[~task.maze.fine_walls])), 1e-9)
+    enough = max(density * float(np.median(smooth[~maze.fine_walls])), 1e-9)
     return torch.from_numpy(1.0 - smooth / enough).clamp_min(0.0).float().to(positions.device)
 
 
@@ -125,7 +129,13 @@ def training_world(
     """Build the world: the task in the raw, varied, scattered or grounded simulator.
 
     With `tells_parameters`, observations end with the normalised parameters of a simulator that varies.
+
+    Raises:
+        BadInputError: `config` asks for what needs a maze, and the task has none.
     """
+    usual = WorldConfig.model_fields["command_limit_m_s"].default
+    if task.plane is None and (config.support_penalty or config.command_limit_m_s != usual):
+        raise task.without_maze()
     scatter = parts.scatter if config.residual_noise else None
     simulator = simulator_of(task, grounding, num_envs, device, variation=parts.variation, scatter=scatter)
     return SimulatorWorld(
@@ -135,7 +145,7 @@ def training_world(
         topple=config.topple,
         risk_weight=config.risk_weight,
         command_limit_m_s=config.command_limit_m_s,
-        thinness=config.support_penalty * parts.thinness,
+        thinness=None if parts.thinness is None else config.support_penalty * parts.thinness,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,
         tells_parameters=tells_parameters,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.batched import Step
 from astra_data.free_space import FreeSpace
-from astra_data.objective import Objective
+from astra_data.objective import Objective, PlanarObjective
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.simulators import Simulator, start_simulator, varied_within
@@ -92,7 +92,8 @@ class SimulatorWorld:
             topple: end episodes by the topple head.
             risk_weight: how many topples a predicted one counts for in the reward "blend".
             command_limit_m_s: longer commands are shortened to this.
-            thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width).
+            thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width);
+                only where there is a maze.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
             tells_parameters: end observations with the parameters of a simulator that varies, normalised.
@@ -105,7 +106,10 @@ class SimulatorWorld:
         self.caution = 1.0
         self.risk_weight = risk_weight
         self.command_limit_m_s = command_limit_m_s
-        self.free = FreeSpace.of_maze(objective.maze, radius_m=0.0, device=str(simulator.state.device))
+        self.free, self._ends_at_walls = None, False
+        if isinstance(objective, PlanarObjective):
+            self.free = FreeSpace.of_maze(objective.maze, radius_m=0.0, device=str(simulator.state.device))
+            self._ends_at_walls = objective.ends_at_walls
         self.thinness = thinness
         self.starts = starts
         self.data_start_share = data_start_share
@@ -161,10 +165,10 @@ class SimulatorWorld:
         after = self.simulator.step(action)
         success = self.objective.reached(after, self.goal)
         self.failed = self.objective.missed(after, self.goal)
-        if self.objective.ends_at_walls:
+        if self._ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
         penalty = torch.zeros(self.num_envs, device=self.device)
-        if self.thinness is not None:
+        if self.thinness is not None and self.free is not None:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
         if self.grounded is not None and latent is not None and (self.topple or self.reward == "blend"):
             with torch.no_grad():

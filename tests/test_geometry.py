@@ -177,7 +177,7 @@ def test_the_point_mass_does_not_feel_the_map(change: PlanarMap) -> None:
 
 def walking(count: int, steps: int) -> Array:
     """Return states (count, 29) of ants that have walked for a while, in contact with the ground."""
-    env = AntMazeEnv(Navigation(OPEN, 100, "sparse"), count, seed=3, num_threads=1)
+    env = AntMazeEnv(Navigation(OPEN, "sparse", horizon=100), count, seed=3, num_threads=1)
     env.reset()
     command = torch.from_numpy(np.random.default_rng(4).uniform(-1, 1, (count, 2)))
     for _ in range(steps):
@@ -268,7 +268,7 @@ def test_the_walking_ant_follows_the_turned_command(rotation: float) -> None:
     command = np.random.default_rng(6).uniform(-0.7, 0.7, (3, 2))
 
     def stepped(state: Array, command: Array) -> Array:
-        env = AntMazeEnv(Navigation(OPEN, 100, "sparse"), len(state), seed=0, num_threads=1)
+        env = AntMazeEnv(Navigation(OPEN, "sparse", horizon=100), len(state), seed=0, num_threads=1)
         env.reset_to(np.arange(len(state)), state)
         env.step(torch.from_numpy(command))
         return np.concatenate([env.physics.qpos, env.physics.qvel], axis=1)

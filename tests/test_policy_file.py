@@ -27,6 +27,7 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
     assert loaded.simulation is not None
     assert (loaded.simulation.world, loaded.simulation.variation) == (world, variation)
+    assert loaded.simulation.thinness is not None
     assert torch.equal(loaded.simulation.thinness, thinness)
     assert torch.equal(loaded.simulation.scatter, scatter)
     assert loaded.policy.shape == policy.shape

@@ -1,11 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from astra_data.errors import BadInputError
 from astra_data.free_space import FreeSpace
+from astra_data.objective import PlanarObjective
 from astra_data.task import Task
 from astra_data.tasks import TASKS, task_named
+from astra_data.variation import RANDOMIZED_ACTIONS
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -38,6 +42,17 @@ def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
 def test_an_unknown_task_answers_with_the_known_ones() -> None:
     with pytest.raises(BadInputError, match=r"unknown task 'antmaze-umase'.*antmaze-umaze"):
         task_named("antmaze-umase")
+
+
+def test_who_asks_for_a_maze_where_there_is_none_is_told() -> None:
+    nowhere = replace(TASKS["antmaze-umaze"], plane=None)
+    with pytest.raises(BadInputError, match=r"a task in a maze, got 'antmaze-umaze'.*leave out"):
+        nowhere.varied_simulator(1, RANDOMIZED_ACTIONS)
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_a_task_in_a_maze_has_an_objective_there(task: Task) -> None:
+    assert isinstance(task.objective, PlanarObjective) == (task.plane is not None)
 
 
 @pytest.mark.parametrize(("name", "metres"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import BadInputError
 from astra_data.free_space import FreeSpace
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.sims.grounded import GroundedSimulator
@@ -82,6 +83,7 @@ def test_scatter_is_what_the_simulator_does_not_explain(
 
 def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
     thinness = world_parts(TASK, WorldConfig(), episodes, None).thinness
+    assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     far = HERE + torch.tensor([[1.5, 0.0], [0.0, -1.5]])
     assert (thinness[cells(far)] == 1.0).all()
@@ -93,8 +95,20 @@ def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> N
     config = WorldConfig(support_penalty=0.3)
     parts = world_parts(TASK, config, episodes, None)
     world = training_world(TASK, config, parts, None, num_envs=1, device="cpu")
-    assert world.thinness is not None
+    assert world.thinness is not None and parts.thinness is not None
     torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
+
+
+def test_what_needs_a_maze_is_refused_without_one(episodes: PairedEpisodes) -> None:
+    nowhere = replace(TASK, plane=None)
+    plain, *asked = WorldConfig(), WorldConfig(support_penalty=0.3), WorldConfig(command_limit_m_s=1.0)
+    parts = world_parts(nowhere, plain, episodes, None)
+    assert parts.thinness is None
+    world = training_world(nowhere, plain, parts, None, num_envs=1, device="cpu")
+    assert world.thinness is None
+    for config in asked:
+        with pytest.raises(BadInputError, match="expected a task in a maze"):
+            training_world(nowhere, config, parts, None, num_envs=1, device="cpu")
 
 
 def test_recorded_starts_come_with_the_history_before_them(

@@ -25,6 +25,7 @@ from rich.table import Table
 from astra_data.ant import CONTROL_SUBSTEPS, VelocityController, ant_model
 from astra_data.cores import cores
 from astra_data.envs.antmaze import AntMazeEnv
+from astra_data.objective import PlanarObjective
 from astra_data.physics import Floats
 from astra_data.tasks import TASKS
 
@@ -80,6 +81,7 @@ class RecordingController(VelocityController):
 def measure_target(num_envs: int, threads: int, rounds: int) -> dict[str, float]:
     """Return control steps per second of our target, of bare physics, and of Gymnasium's own maze."""
     controller = RecordingController(VelocityController.load())
+    assert isinstance(TASK.objective, PlanarObjective)
     env = AntMazeEnv(TASK.objective, num_envs, seed=0, controller=controller, num_threads=threads)
     env.reset()
     generator = torch.Generator().manual_seed(0)

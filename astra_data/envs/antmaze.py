@@ -17,7 +17,7 @@ from astra_data.ant import (
     wall_geoms,
 )
 from astra_data.batched import Step
-from astra_data.objective import Objective
+from astra_data.objective import PlanarObjective
 from astra_data.physics import BatchedPhysics, Floats
 
 
@@ -36,7 +36,7 @@ class AntMazeEnv:
 
     def __init__(
         self,
-        objective: Objective,
+        objective: PlanarObjective,
         num_envs: int,
         *,
         seed: int,

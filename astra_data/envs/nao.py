@@ -15,7 +15,7 @@ from astra_data.geometry import wrapped
 from astra_data.nao.perception import BallSight, Localisation, PerceptionErrors
 from astra_data.nao.robot import CONTROL_STEP_S, BatchedNao
 from astra_data.nao.surrogate import SurrogateNao
-from astra_data.objective import Objective
+from astra_data.objective import PlanarObjective
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class NaoEnv:
 
     def __init__(
         self,
-        objective: Objective,
+        objective: PlanarObjective,
         num_envs: int,
         *,
         seed: int,

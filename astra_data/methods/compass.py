@@ -82,7 +82,7 @@ class CompassConfig(BallVariation, CausalConfig):
 
     def ranges_for(self, task: Task) -> Variation:
         """Return the ranges of the parameters that the simulator of `task` has."""
-        kind = type(task.ranges)
+        kind = type(task.planar.ranges)
         return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 

@@ -30,7 +30,7 @@ class TeacherThenStudent(SimulatorPpo):
         """Return the student, and the teacher's learning curve with the student's as "adaptation"."""
         config, seed = training.config, training.seed
         settings = training.settings if isinstance(training.settings, RmaConfig) else RmaConfig()
-        told = replace(self, variation=training.task.ranges)
+        told = replace(self, variation=training.task.planar.ranges)
         env, simulation = told.world(training, tells_parameters=True)
         torch.manual_seed(derive(seed, "policy"))
         shape = AdaptiveShape(

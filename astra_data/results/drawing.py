@@ -35,7 +35,7 @@ def figures_of(
     results: Results,
     root: Path,
     *,
-    maze: Maze,
+    maze: Maze | None,
     trajectory_methods: Sequence[str],
     trajectory_episodes: int,
 ) -> dict[str, Figure]:
@@ -45,14 +45,14 @@ def figures_of(
         results: all numbers in them.
         root: the recipe's folder of runs; without the trajectories of a row that is to be drawn there, there
             is no figure of trajectories.
-        maze: the task's.
+        maze: the task's; without one there is no figure of trajectories either.
         trajectory_methods: rows whose trajectories are drawn; all where none of them is in the results.
         trajectory_episodes: how many of each row.
     """
     figures = {"success": _success(results)}
     drawn = [row for row in trajectory_methods if row in results.methods] or list(results.methods)
     folders = [_with_trajectories(root, results, row) for row in drawn]
-    if None not in folders:
+    if maze is not None and None not in folders:
         panels = [
             _panel(results, row, folder, trajectory_episodes)
             for row, folder in zip(drawn, folders, strict=True)

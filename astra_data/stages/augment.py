@@ -117,19 +117,20 @@ def augment(
         progress: is told how far it is.
 
     Raises:
-        BadInputError: the dataset does not fit the task, was paired or augmented, does not say how its
-            columns move, or has no stretch to copy or no place for any copy.
+        BadInputError: the task has no maze; the dataset does not fit it, was paired or augmented, does not
+            say how its columns move, or has no stretch to copy or no place for any copy.
         CorruptDatasetError: `dataset` is incomplete.
     """
     source = Dataset.open(dataset)
     world = _task_of(source, task)
+    plane = world.planar
     _check(source, world, config)
     relocation = Relocation(
         world,
         rotations=config.rotations,
         translations=config.translations,
         reflections=config.reflections,
-        margin_m=world.wall_reach_m if config.margin_m is None else config.margin_m,
+        margin_m=plane.wall_reach_m if config.margin_m is None else config.margin_m,
         min_steps=config.min_steps,
         tries=config.tries,
     )
@@ -192,7 +193,7 @@ def _check(source: Dataset, world: Task, config: AugmentConfig) -> None:
         faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")
-    if config.reflections and not world.is_mirrorable:
+    if config.reflections and not world.planar.is_mirrorable:
         faults.append("its controller does not act in mirror images: leave out --reflections")
     change = PlanarMap(reflected=config.reflections)
     for column in _moving(source):

@@ -132,20 +132,21 @@ def report(
         found = _sizes(recipe, command, sizes)
         page, figures = partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
     else:
-        stand_in = TASKS[recipe.task].facts.get("stand_in")
-        found = sizes[0].model_copy(update={"stand_in": stand_in})
+        task = TASKS[recipe.task]
+        found = sizes[0].model_copy(update={"stand_in": task.facts.get("stand_in")})
         page = partial(render, found)
         figures = figures_of(
             found,
             root,
-            maze=TASKS[found.task].maze,
+            maze=None if task.plane is None else task.maze,
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
         )
-        replay = replay_commands(TASKS[found.task])
-        figures["mismatch"] = dynamics_mismatch(
-            replay.time_s, replay.command, replay.simulated, replay.target
-        )
+        if task.plane is not None:
+            replay = replay_commands(task)
+            figures["mismatch"] = dynamics_mismatch(
+                replay.time_s, replay.command, replay.simulated, replay.target
+            )
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
     with finished_folder(root / "report", replace=True) as folder:

@@ -51,7 +51,7 @@ def augmented(collected: Path) -> Path:
 def mirrored(collected: Path) -> Path:
     """Let the ant's controller pass for its own mirror image."""
     with short_task():
-        TASKS[TASK] = replace(TASKS[TASK], is_mirrorable=True)
+        TASKS[TASK] = replace(TASKS[TASK], plane=replace(TASKS[TASK].planar, is_mirrorable=True))
         return augment(
             None, MIRRORED, dataset=collected, seed=1, out=collected.with_name("mirrored"), progress=silent
         )

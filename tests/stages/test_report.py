@@ -40,7 +40,8 @@ CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
 @pytest.fixture(scope="module", autouse=True)
 def tasks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(maze=U_MAZE, facts={})})
+        task = SimpleNamespace(maze=U_MAZE, plane=object(), facts={})
+        patch.setattr(stage, "TASKS", {"antmaze-u": task})
         patch.setattr(stage, "replay_commands", lambda task: REPLAY)
         yield
 
@@ -221,7 +222,7 @@ def test_the_page_tells_of_longer_legs(root: Path) -> None:
 def test_the_page_says_that_a_robot_is_a_stand_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(root)
     assert "stand-in" not in (root / "report/results.md").read_text()
-    task = SimpleNamespace(maze=U_MAZE, facts={"stand_in": "mujoco"})
+    task = SimpleNamespace(maze=U_MAZE, plane=object(), facts={"stand_in": "mujoco"})
     monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task})
     make(root)
     assert (
@@ -254,6 +255,13 @@ def test_page_holds_the_table_and_only_figures_that_exist(folder: Path) -> None:
     images = {path.name for path in folder.glob("*.png")}
     assert images == {f"{name}.png" for name in HOW_TO_READ}
     assert {image for image in images if f"]({image})" in page} == images
+
+
+def test_without_a_maze_there_is_nothing_to_draw_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(plane=None)})
+    make(root)
+    images = {path.stem for path in (root / "report").glob("*.png")}
+    assert images == {*HOW_TO_READ} - {"trajectories", "mismatch"}
 
 
 def test_publishing_copies_all_under_the_recipes_name(root: Path, tmp_path: Path) -> None:
