@@ -50,21 +50,22 @@ class WallWatch:
 
 
 class RandomCommands:
-    """Commands from U[-1, 1]², each held for a random number of steps."""
+    """Commands from U[-1, 1] per axis, each held for a random number of steps."""
 
-    def __init__(self, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
-        """Hold commands from the fewest to the most steps, or until `watch` foresees a wall."""
+    def __init__(self, action_size: int, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
+        """Hold commands (A,) from the fewest to the most steps, or until `watch` foresees a wall."""
+        self._size = action_size
         self._hold_steps = hold_steps
         self._watch = watch
 
     def start(self, count: int, seed: int) -> None:
         """Begin new episodes of B = `count` robots."""
         self._rng = generator(seed, "behavior")
-        self._command = np.zeros((count, 2))
+        self._command = np.zeros((count, self._size))
         self._left = np.zeros(count, dtype=int)
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return commands (B, 2); goals do not matter, nor do states unless walls are watched for."""
+        """Return commands (B, A); goals do not matter, nor do states unless walls are watched for."""
         over = self._left == 0
         if self._watch is not None:
             over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
@@ -76,10 +77,10 @@ class RandomCommands:
         return torch.from_numpy(self._command).float()
 
     def _drawn(self, state: Tensor, due: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Draw commands (n, 2) for the robots `due` (n,): of some, the first that stays clear or clearest."""
+        """Draw commands (n, A) for the robots `due` (n,): of some, the first that stays clear or clearest."""
         if self._watch is None:
-            return self._rng.uniform(-1.0, 1.0, (len(due), 2))
-        choices = self._rng.uniform(-1.0, 1.0, (len(due), _CHOICES, 2))
+            return self._rng.uniform(-1.0, 1.0, (len(due), self._size))
+        choices = self._rng.uniform(-1.0, 1.0, (len(due), _CHOICES, self._size))
         clearance = self._watch.clearance(state[due], choices).clip(max=self._watch.clearance_m)
         return np.asarray(choices[np.arange(len(due)), clearance.argmax(axis=1)])
 

@@ -10,7 +10,7 @@ from astra_data.models.actor_critic import ActorCritic
 from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
 from astra_data.task import Task
-from astra_data.world import limit_command, policy_observation
+from astra_data.world import policy_observation
 
 EncoderKind = Literal["target", "source"]
 Observed = Literal["abstract", "full"]
@@ -49,7 +49,8 @@ class DeployedPolicy:
     def observation_size(self) -> int:
         """Values that the task and the grounding show to a policy."""
         state = torch.zeros(self.task.state_columns[0].size)
-        seen = len(target_observation(self.task, state, torch.zeros(2), None, self.observed))
+        goal = torch.zeros(self.task.objective.goal_size)
+        seen = len(target_observation(self.task, state, goal, None, self.observed))
         return seen + (self.model.shape.latent_size if self.model is not None else 0)
 
     def start(self, count: int, generator: torch.Generator | None = None) -> None:
@@ -89,5 +90,5 @@ class DeployedPolicy:
         if self._generator is not None:
             output = torch.normal(output, std, generator=self._generator).clamp(-1.0, 1.0)
         self._previous_output = output
-        self._previous_action = limit_command(output, self.command_limit_m_s)
+        self._previous_action = self.task.objective.limit_command(output, self.command_limit_m_s)
         return self._previous_action

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -18,7 +19,11 @@ class Objective(ABC):
     Attributes:
         horizon: steps until an episode is cut off.
         success_reward: for reaching the goal. failure_reward: for ending badly.
+        action_size: A. goal_size: G, 0 where there is nothing to tell apart.
     """
+
+    action_size: ClassVar[int]
+    goal_size: ClassVar[int]
 
     horizon: int = field(kw_only=True)
     success_reward: float = field(default=10.0, kw_only=True)
@@ -35,6 +40,10 @@ class Objective(ABC):
     @abstractmethod
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
         """Assemble what a policy sees of states (..., X) and goals (..., G), each part about one long."""
+
+    def limit_command(self, action: Tensor, limit: float) -> Tensor:
+        """Clip actions (..., A) to ±1; a `limit` in m/s is for velocities alone, and without effect here."""
+        return action.clamp(-1.0, 1.0)
 
     @abstractmethod
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -55,12 +64,15 @@ class Objective(ABC):
 
 @dataclass(frozen=True)
 class PlanarObjective(Objective):
-    """An objective in a maze; states begin with x and y of the robot in m.
+    """An objective in a maze; states begin with x and y of the robot in m, actions are velocities.
 
     Attributes:
         maze: where it happens.
         ends_at_walls: whether touching a wall is a failure, which ends an episode.
     """
+
+    action_size = 2
+    goal_size = 2
 
     maze: Maze
     ends_at_walls: bool = field(default=False, kw_only=True)
@@ -68,6 +80,13 @@ class PlanarObjective(Objective):
     @abstractmethod
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, X), at rest, anywhere in the free space."""
+
+    def limit_command(self, action: Tensor, limit: float) -> Tensor:
+        """Shorten velocity commands (..., 2), ±1 m/s per axis, to at most `limit` m/s."""
+        command = super().limit_command(action, limit)
+        speed = command.norm(dim=-1, keepdim=True)
+        shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
+        return command * shorten
 
     def places(self, state: Tensor) -> Tensor:
         """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""

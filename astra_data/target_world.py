@@ -37,8 +37,6 @@ class TargetWorld:
     randomness comes from torch's global generator.
     """
 
-    action_size = 2
-
     def __init__(
         self,
         task: Task,
@@ -62,6 +60,7 @@ class TargetWorld:
             num_threads: of the physics, by default one per core.
         """
         self.num_envs = num_envs
+        self.action_size = task.objective.action_size
         self._task, self._observed, self._device = task, observed, device
         self._starts, self._data_start_share = starts, data_start_share
         self._env = task.target(num_envs, seed=0, num_threads=num_threads)
@@ -81,7 +80,7 @@ class TargetWorld:
         return self._observe()
 
     def step(self, action: Tensor) -> Step:
-        """Apply `action` (B, 2), clipped to ±1 m/s per axis."""
+        """Apply `action` (B, A), clipped to ±1."""
         step = self._env.step(action.cpu())
         reward, terminated, success = (
             values.to(self._device) for values in (step.reward, step.terminated, step.success)

@@ -43,14 +43,6 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
     return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
 
 
-def limit_command(action: Tensor, limit: float) -> Tensor:
-    """Shorten velocity commands (..., 2), ±1 m/s per axis, to at most `limit` m/s."""
-    command = action.clamp(-1.0, 1.0)
-    speed = command.norm(dim=-1, keepdim=True)
-    shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
-    return command * shorten
-
-
 class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
@@ -66,8 +58,6 @@ class SimulatorWorld:
         failed: which episodes ended badly in the last step, (B,) bool.
         caution: factor on the penalties for thin data and for risk; 1 unless the training ramps it up.
     """
-
-    action_size = 2
 
     def __init__(
         self,
@@ -91,7 +81,7 @@ class SimulatorWorld:
             reward: where the reward comes from.
             topple: end episodes by the topple head.
             risk_weight: how many topples a predicted one counts for in the reward "blend".
-            command_limit_m_s: longer commands are shortened to this.
+            command_limit_m_s: longer velocity commands are shortened to this.
             thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width);
                 only where there is a maze.
             starts: recorded moments to start from.
@@ -115,7 +105,8 @@ class SimulatorWorld:
         self.data_start_share = data_start_share
         self.device = simulator.state.device
         self.num_envs = len(simulator.state)
-        self.goal = torch.zeros(self.num_envs, 2, device=self.device)
+        self.action_size = objective.action_size
+        self.goal = torch.zeros(self.num_envs, objective.goal_size, device=self.device)
         self.failed = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._told = varied_within(simulator) if tells_parameters else None
         self.parameter_count = 0 if self._told is None else self._told.parameters.shape[1]
@@ -158,8 +149,8 @@ class SimulatorWorld:
         return torch.from_numpy(values).float().to(self.device)
 
     def step(self, action: Tensor) -> Step:
-        """Apply `action` (B, 2), clipped to ±1 and to the command limit."""
-        action = limit_command(action, self.command_limit_m_s)
+        """Apply `action` (B, A), clipped to ±1 and to the command limit."""
+        action = self.objective.limit_command(action, self.command_limit_m_s)
         before = self.simulator.state
         latent = None if self.grounded is None else self.grounded.latent
         after = self.simulator.step(action)

@@ -40,12 +40,12 @@ def test_a_watch_foresees_the_clearance_of_a_second() -> None:
 
 
 def test_commands_that_are_watched_keep_clear_of_walls() -> None:
-    assert nearest(RandomCommands(HOLD)) < 0.2
-    assert nearest(RandomCommands(HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6
+    assert nearest(RandomCommands(2, HOLD)) < 0.2
+    assert nearest(RandomCommands(2, HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6
 
 
 def test_a_robot_that_is_too_near_is_led_away() -> None:
-    behavior = RandomCommands(HOLD, WallWatch(TASK, 0.3))
+    behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.3))
     behavior.start(64, seed=0)
     near = torch.tensor([[0.0, 2.35]]).expand(64, 2)
     command = behavior.act(believed(near), torch.zeros(64, 2))
@@ -53,7 +53,7 @@ def test_a_robot_that_is_too_near_is_led_away() -> None:
 
 
 def test_commands_are_held_and_repeat_with_the_seed() -> None:
-    first, second = RandomCommands((4, 4)), RandomCommands((4, 4))
+    first, second = RandomCommands(2, (4, 4)), RandomCommands(2, (4, 4))
     first.start(5, seed=1)
     second.start(5, seed=1)
     state = believed(torch.zeros(5, 2))
@@ -61,3 +61,13 @@ def test_commands_are_held_and_repeat_with_the_seed() -> None:
     assert torch.equal(commands, torch.stack([second.act(state, state[:, :2]) for _ in range(8)]))
     assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4])
     assert not torch.equal(commands[3], commands[4])
+
+
+def test_each_axis_of_a_command_is_drawn_by_itself() -> None:
+    behavior = RandomCommands(4, (1, 1))
+    behavior.start(500, seed=0)
+    command = behavior.act(torch.zeros(500, 47), torch.zeros(500, 0))
+    assert command.shape == (500, 4)
+    correlation = torch.corrcoef(command.T) - torch.eye(4)
+    assert float(correlation.abs().max()) < 0.2
+    assert 0.5 < float(command.std()) < 0.65

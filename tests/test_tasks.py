@@ -21,7 +21,8 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     observation = env.reset()
     assert observation.shape == (2, sizes[0] + sizes[1])
     assert env.step(observation[:, :2] * 0).observation.shape == observation.shape
-    assert sizes[2] == env.action_size
+    assert sizes[2] == env.action_size == task.objective.action_size
+    assert sizes[1] == task.objective.goal_size
     abstract = task.abstraction(env.state)
     simulator = task.simulator(2)
     assert abstract.shape == simulator.state.shape == (2, task.abstract_state.size)

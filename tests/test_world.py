@@ -8,7 +8,7 @@ from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
 from astra_data.variation import Variation
-from astra_data.world import DataStarts, SimulatorWorld, limit_command, policy_observation
+from astra_data.world import DataStarts, SimulatorWorld, policy_observation
 
 TASK = Navigation(U_MAZE, horizon=700)
 
@@ -108,10 +108,10 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
 
 def test_commands_are_clipped_and_shortened() -> None:
     commands = torch.tensor([[3.0, 0.0], [0.6, 0.8], [1.0, 1.0], [0.1, -0.2], [0.0, 0.0]])
-    limited = limit_command(commands, 0.5)
+    limited = TASK.limit_command(commands, 0.5)
     expected = torch.tensor([[0.5, 0.0], [0.3, 0.4], [0.5 / 2**0.5] * 2, [0.1, -0.2], [0.0, 0.0]])
     torch.testing.assert_close(limited, expected)
-    torch.testing.assert_close(limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
+    torch.testing.assert_close(TASK.limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
 
 
 def test_caution_scales_the_penalties() -> None:

@@ -27,7 +27,7 @@ from astra_data.models.grounding import RISK_STEPS, Windows
 from astra_data.seeding import generator
 
 _COLUMNS = (
-    *(STATE, GOAL, ACTION, REWARD, TERMINATED, SUCCESS),
+    *(STATE, ACTION, REWARD, TERMINATED, SUCCESS),
     *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE),
 )
 
@@ -63,7 +63,7 @@ class PairedEpisodes:
         dataset = Dataset.open(root)
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
-        columns = dataset.columns(_COLUMNS)
+        columns = dataset.columns([*_COLUMNS, *({GOAL} & dataset.features.keys())])
         ends = np.cumsum(dataset.lengths)[:-1]
 
         def padded(values: Array) -> Tensor:
@@ -72,6 +72,7 @@ class PairedEpisodes:
 
         said = [bool(word) for word in dataset.metadata.get("held_out", ())]
         action = padded(columns[ACTION])
+        goal = columns.get(GOAL, np.empty((len(columns[ACTION]), 0)))
         ended = columns[TERMINATED]
         return cls(
             target_state=padded(columns[STATE]),
@@ -81,7 +82,7 @@ class PairedEpisodes:
                 state=padded(columns[ABSTRACT_STATE]),
                 action=action,
                 previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
-                goal=padded(columns[GOAL]),
+                goal=padded(goal),
                 simulated_next=padded(columns[ABSTRACT_SIMULATED_NEXT_STATE]),
                 next_state=padded(columns[ABSTRACT_NEXT_STATE]),
                 reward=padded(

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.batched import Step
+from astra_data.errors import BadInputError
 from astra_data.humanoid import CommandRanges, Humanoids, Locomotion
 from astra_data.humanoid.model import COMMANDED, JOINTS, STATE_SIZE
 from astra_data.physics import Floats
@@ -20,7 +21,8 @@ class HumanoidEnv:
     which Humanoid-v5 begins with too. Falling ends an episode; nothing else does.
 
     Attributes:
-        bodies: the humanoids. failed: (B,) bool, at an unhealthy height after the last step.
+        bodies: the humanoids. goal: (B, 0), there is none.
+        failed: (B,) bool, at an unhealthy height after the last step.
     """
 
     observation_size = STATE_SIZE - 2
@@ -32,6 +34,8 @@ class HumanoidEnv:
         num_envs: int,
         *,
         seed: int,
+        leg_scale: float = 1.0,
+        start_anywhere: bool = False,
         ranges: CommandRanges | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -41,13 +45,23 @@ class HumanoidEnv:
             locomotion: reward, ends and starts.
             num_envs: B.
             seed: of starts.
+            leg_scale: 1; a humanoid's legs are as they are.
+            start_anywhere: false; a humanoid has no place, and starts upright.
             ranges: what commands stand for.
             num_threads: physics threads, by default one per core.
+
+        Raises:
+            BadInputError: another leg scale or start.
         """
+        if leg_scale != 1.0:
+            raise BadInputError(f"evaluate.leg_scale: expected 1 for a humanoid, got {leg_scale}")
+        if start_anywhere:
+            raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")
         self.locomotion = locomotion
         self.num_envs = num_envs
         self.ranges = ranges or CommandRanges()
         self.bodies = Humanoids(locomotion, num_envs, num_threads=num_threads)
+        self.goal = torch.zeros(num_envs, 0)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._start = self.bodies.state[0]
         self.reseed(seed)
@@ -61,6 +75,11 @@ class HumanoidEnv:
     def position(self) -> Tensor:
         """Where the humanoids are, (B, 2) float32 in m."""
         return self.state[:, :2]
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Nothing, for there are no walls: (B,) bool."""
+        return torch.zeros(self.num_envs, dtype=torch.bool)
 
     def reseed(self, seed: int) -> None:
         """Draw later starts from `seed`."""

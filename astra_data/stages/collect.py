@@ -48,7 +48,7 @@ class CollectConfig(Config):
     """What to collect; 200 episodes of random behaviour of up to 500 steps are the paper's."""
 
     behavior: Literal["random", "policy", "suboptimal_ppo"] = "random"
-    """"random": commands drawn from U[-1, 1]² m/s, each held for a while. "policy": a saved policy, and
+    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "policy": a saved policy, and
     "suboptimal_ppo": one trained by PPO in the target and stopped early; both draw actions as in training."""
     episodes: Count = 200
     """In all."""
@@ -166,7 +166,7 @@ def _behavior(
     if config.behavior == "random":
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
-        return RandomCommands((fewest, most), watch), {}
+        return RandomCommands(task.objective.action_size, (fewest, most), watch), {}
     if config.behavior == "suboptimal_ppo":
         from astra_data.suboptimal import suboptimal_policy  # noqa: PLC0415 - TorchRL is slow to import
 
@@ -251,7 +251,7 @@ def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> 
     action = behavior.act(state, goal)
     outcome = env.step(action, active)
     truncated = torch.full_like(outcome.terminated, last) & ~outcome.terminated
-    return {
+    row = {
         STATE: state,
         GOAL: goal,
         ACTION: action,
@@ -262,6 +262,9 @@ def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> 
         DONE: outcome.terminated | truncated,
         SUCCESS: outcome.success,
     }
+    if not goal.shape[1]:
+        del row[GOAL]
+    return row
 
 
 def _episode(uid: int, values: dict[str, Array], seed: int) -> Episode:

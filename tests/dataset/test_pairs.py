@@ -34,11 +34,11 @@ def label(episode: int, step: int) -> float:
     return 100.0 * (episode + 1) + step
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    sizes = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
+SIZES = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
+
+
+def write(folder: Path, sizes: dict[str, int]) -> Path:
     columns = [*(Column(name, size=size) for name, size in sizes.items()), *OUTCOME_COLUMNS]
-    folder = tmp_path_factory.mktemp("pairs") / "dataset"
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
     description |= {"environment": {"id": "toy"}, "simulator": {"id": "toy"}, "parents": []}
     with DatasetWriter(folder, columns, fps=20, task="toy", description=description) as writer:
@@ -53,6 +53,20 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
             values |= {REWARD: -steps, TERMINATED: ended, TRUNCATED: last & ~ended, DONE: last}
             writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}))
     return folder
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("pairs") / "dataset", SIZES)
+
+
+def test_without_a_goal_all_else_is_the_same(root: Path, tmp_path: Path) -> None:
+    sizes = {name: size for name, size in SIZES.items() if name != GOAL}
+    aimless, usual = PairedEpisodes.load(write(tmp_path / "dataset", sizes)), PairedEpisodes.load(root)
+    for name, values in vars(usual.windows).items():
+        found = getattr(aimless.windows, name)
+        assert found.shape == (5, 30, 0) if name == "goal" else torch.equal(found, values)
+    assert aimless.draw_windows(3, 10)[0].goal.shape == (3, 10, 0)
 
 
 @pytest.fixture

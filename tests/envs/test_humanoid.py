@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from astra_data.envs.humanoid import HumanoidEnv
+from astra_data.errors import BadInputError
 from astra_data.humanoid import CommandRanges, Humanoids, Locomotion
 
 
@@ -78,6 +79,21 @@ def test_commands_reach_the_joints_they_name() -> None:
     joints = env.state[:, 7:24]
     moved = (joints[:4] - joints[4]).abs().argmax(dim=1)
     assert moved.tolist() == [9, 10, 5, 6]  # of the 17 joints: left hip and knee, right hip and knee
+
+
+def test_there_is_neither_goal_nor_wall() -> None:
+    env = make(2)
+    env.reset(torch.tensor([False, True]))
+    assert env.goal.shape == (2, 0)
+    env.step(torch.zeros(2, 4))
+    assert env.wall_contact.tolist() == [False, False]
+
+
+def test_what_is_not_for_a_humanoid_is_refused() -> None:
+    with pytest.raises(BadInputError, match=r"leg_scale: expected 1 for a humanoid, got 1\.25"):
+        HumanoidEnv(Locomotion(), 1, seed=0, leg_scale=1.25)
+    with pytest.raises(BadInputError, match="start: expected 'task' for a humanoid, got 'anywhere'"):
+        HumanoidEnv(Locomotion(), 1, seed=0, start_anywhere=True)
 
 
 def test_commands_are_clipped() -> None:
