@@ -33,6 +33,7 @@ import torch
 from torch import Tensor
 
 from astra_data.columns import ABSTRACT_STATE, Column
+from astra_data.free_states import FreeStates
 from astra_data.humanoid.abstraction import humanoid_to_extended_kinematics, humanoid_to_kinematics
 from astra_data.humanoid.model import (
     COMMANDED,
@@ -53,7 +54,7 @@ _NAMES = (*JOINTS, *(f"{name}_rate" for name in JOINTS))
 _UNITS = ["rad"] * _COUNT + ["rad/s"] * _COUNT
 
 
-class HumanoidKinematics:
+class HumanoidKinematics(FreeStates):
     """B humanoids' joints; action: angles of left hip and knee, right hip and knee, (B, 4), clipped to ±1.
 
     Attributes:
@@ -74,7 +75,7 @@ class HumanoidKinematics:
         """Put B humanoids' joints at zero; `ranges` says what commands stand for."""
         self.ranges = ranges or CommandRanges()
         standing = type(self).abstraction(torch.tensor(STANDING))
-        self.state = standing.repeat(num_envs, 1).to(device)
+        super().__init__(standing.repeat(num_envs, 1).to(device))
         damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
         self._approach = STIFFNESS / (DAMPING + damping)
 
@@ -82,10 +83,6 @@ class HumanoidKinematics:
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
-
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
 
     def step(self, action: Tensor) -> Tensor:
         """Follow the commands `action` (B, 4) for 0.015 s; return the new state (B, X)."""

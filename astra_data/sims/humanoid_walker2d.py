@@ -26,6 +26,7 @@ from torch import Tensor
 
 from astra_data.columns import ABSTRACT_STATE, Column
 from astra_data.cores import cores
+from astra_data.free_states import FreeStates
 from astra_data.humanoid.abstraction import humanoid_to_walker2d
 from astra_data.humanoid.model import CONTACT_M, CONTROL_SUBSTEPS, STANDING, TIMESTEP_S, CommandRanges
 from astra_data.humanoid.walker import sole_clearance, walker_model
@@ -35,7 +36,7 @@ _POSE = slice(0, 6)
 _MOTION = slice(0, 13)
 
 
-class HumanoidWalker2d:
+class HumanoidWalker2d(FreeStates):
     """B walkers; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
 
     Attributes:
@@ -61,7 +62,12 @@ class HumanoidWalker2d:
     abstraction = staticmethod(humanoid_to_walker2d)
 
     def __init__(
-        self, num_envs: int, *, ranges: CommandRanges | None = None, num_threads: int | None = None
+        self,
+        num_envs: int,
+        *,
+        ranges: CommandRanges | None = None,
+        num_threads: int | None = None,
+        device: str = "cpu",
     ) -> None:
         """Stand B walkers up.
 
@@ -69,9 +75,11 @@ class HumanoidWalker2d:
             num_envs: B.
             ranges: what commands stand for.
             num_threads: physics threads, by default one per core.
+            device: torch device of states and actions; the physics runs on the CPU.
         """
+        standing = humanoid_to_walker2d(torch.tensor(STANDING))
+        super().__init__(standing.repeat(num_envs, 1).to(device))
         self.ranges = ranges or CommandRanges()
-        self.state = humanoid_to_walker2d(torch.tensor(STANDING)).repeat(num_envs, 1)
         self._model = walker_model()
         self._data = [mujoco.MjData(self._model) for _ in range(min(num_threads or cores(), num_envs))]
         self._rollout = Rollout(nthread=len(self._data))
@@ -81,20 +89,25 @@ class HumanoidWalker2d:
         """What a dataset paired with this simulator records about it."""
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
 
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the rows in `rows` (n,), by default all, to `state` (n, 15)."""
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move to `landed` (B, 15), but for its contacts: they are what torso and legs say; return it."""
+        motion = landed[:, _MOTION]
+        return super().settle(before, torch.cat([motion, _contacts(motion)], dim=-1))
 
     def step(self, action: Tensor) -> Tensor:
         """Follow the commands `action` (B, 4) for 0.015 s; return the new state (B, 15)."""
         model, count = self._model, len(self.state)
         initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
         # Behind the time, and x, where every step begins anew.
-        initial[:, 2 : 2 + _MOTION.stop] = self.state[:, _MOTION].numpy()
-        targets = self.ranges.targets(action.double()).numpy()
+        initial[:, 2 : 2 + _MOTION.stop] = self.state[:, _MOTION].cpu().numpy()
+        targets = self.ranges.targets(action.cpu().double()).numpy()
         control = np.repeat(targets[:, None], CONTROL_SUBSTEPS, axis=1)
         states, _ = self._rollout.rollout(model, self._data, initial, control)
         motion = torch.from_numpy(states[:, -1, 2 : 2 + _MOTION.stop])
-        contact = sole_clearance(motion[:, _POSE]) < CONTACT_M
-        self.state = torch.cat([motion, contact], dim=-1).float()
+        self.state = torch.cat([motion, _contacts(motion)], dim=-1).float().to(self.state.device)
         return self.state
+
+
+def _contacts(motion: Tensor) -> Tensor:
+    """Tell for `motion` (B, 13) which feet touch the floor, (B, 2), 1 or 0."""
+    return (sole_clearance(motion[:, _POSE]) < CONTACT_M).to(motion.dtype)

@@ -149,3 +149,23 @@ def test_parameters_name_the_commands() -> None:
         "knee_low_deg": -70.0,
         "knee_high_deg": -2.0,
     }
+
+
+def test_a_correction_keeps_contacts_true() -> None:
+    walker = HumanoidWalker2d(3, num_threads=1)
+    landed = walker.state.clone()
+    model = walker_model()
+    data = mujoco.MjData(model)
+    data.qpos[1] = float(landed[0, 0])
+    mujoco.mj_forward(model, data)
+    soles = data.geom_xpos[:, 2] - model.geom_size[:, 0]
+    # Lowered to the floor; lifted far above it; with the left leg drawn up. Contacts are told wrong.
+    landed[0, 0] -= soles[model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE].min()
+    landed[1, 0] += 0.5
+    landed[2, 0] = landed[0, 0]
+    landed[2, 3] = -1.5
+    landed[:, 13:] = torch.tensor([[0.3, 0.0], [1.0, 0.7], [0.5, 0.5]])
+    settled = walker.settle(walker.state, landed)
+    assert torch.equal(settled[:, :13], landed[:, :13])
+    assert settled[:, 13:].tolist() == [[1.0, 1.0], [0.0, 0.0], [0.0, 1.0]]
+    assert torch.equal(walker.state, settled)
