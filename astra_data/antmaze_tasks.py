@@ -73,6 +73,7 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         beyond=ant_beyond_point_mass,
         state_columns=_ANT_COLUMNS,
         abstract_state=_POINT_MASS,
+        quantities={"position_m": (0, 1), "velocity_m_s": (2, 3)},
         timestep_s=TIMESTEP_S,
         action_limit=1.0,
         simulator_id="point_mass",

@@ -42,7 +42,8 @@ class GroundConfig(Config):
     latent_size: Count = 64
     """Z, also the size of the encoder's memory."""
     position_octaves: int = 4
-    """Sines and cosines of the position from 16 m down by halves; 0 for the bare position."""
+    """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
+    where a task has no positions."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes on which nothing is fitted but the residual's scatter, unless the dataset sets
     some aside itself."""
@@ -93,7 +94,7 @@ class HistoryFit:
                 action_size=windows.action.shape[-1],
                 goal_size=windows.goal.shape[-1],
                 latent_size=config.latent_size,
-                position_octaves=config.position_octaves,
+                position_octaves=config.position_octaves if fitting.task.plane else 0,
             ),
             config.target,
         ).to(fitting.device)

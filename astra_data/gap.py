@@ -16,8 +16,11 @@ from astra_data.variation import Variation
 
 HORIZONS = (1, 10, 50, 200)
 _START_EVERY = 25
-QUANTITIES = ("position_m", "velocity_m_s", "ball_position_m", "ball_velocity_m_s")
-"""What abstract states are made of, two entries each; those without a ball end before it."""
+
+
+def distances(task: Task, wrong: Tensor) -> Tensor:
+    """Return the length of errors (..., X) of abstract states in each of the task's quantities, (..., Q)."""
+    return torch.stack([wrong[..., list(entries)].norm(dim=-1) for entries in task.quantities.values()], -1)
 
 
 @torch.no_grad()
@@ -25,8 +28,8 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     """Replay the actions of `episodes` open loop in both simulators and compare with the target.
 
     Replays start every 25 steps, a grounding with a memory having seen the true history so far. Errors
-    are distances in m and m/s after 1, 10, 50 and 200 steps; means and 95 % bootstrap intervals over
-    episodes.
+    are distances in the task's quantities after 1, 10, 50 and 200 steps; means and 95 % bootstrap intervals
+    over episodes.
     """
     torch.manual_seed(derive(seed, "gap noise"))
     windows = episodes.windows
@@ -62,14 +65,14 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         if step + 1 in horizons:
             for name, state in states.items():
                 wrong = state - windows.next_state[episode, now]
-                apart = wrong.unflatten(-1, (-1, 2)).norm(dim=-1)
+                apart = distances(task, wrong)
                 apart[start + step >= lengths[episode]] = torch.nan
                 errors[name][step + 1] = apart
     rng = generator(seed, "gap bootstrap")
     report: dict[str, Any] = {"horizons": horizons, "replays": len(pairs)}
     for name, by_horizon in errors.items():
         report[name] = {}
-        for index, quantity in enumerate(QUANTITIES[: windows.state.shape[-1] // 2]):
+        for index, quantity in enumerate(task.quantities):
             rows = [_interval(by_horizon[h][:, index], episode, rng) for h in horizons]
             report[name][quantity] = dict(zip(("mean", "low", "high"), zip(*rows, strict=True), strict=True))
     return report

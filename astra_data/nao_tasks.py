@@ -41,6 +41,9 @@ KICK_RANGES = BallVariation(
 """Of COMPASS in kicking: the paper names the ball's friction, position, velocity and direction after contact,
 and prints no ranges for them; those of the robot are taken."""
 
+_QUANTITIES = {"position_m": (0, 1), "velocity_m_s": (2, 3)}
+_BALL_QUANTITIES = {"ball_position_m": (4, 5), "ball_velocity_m_s": (6, 7)}
+
 Roles = tuple[tuple[str, ...], list[str], list[str], list[str], list[str]]
 
 
@@ -119,6 +122,7 @@ def _task(name: str, level: Level, *, ball: bool, **own: Any) -> Task:  # noqa: 
         beyond=nao_beyond,
         state_columns=_columns(ball=ball),
         abstract_state=_abstract(ball=ball),
+        quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
         timestep_s=CONTROL_STEP_S,
         action_limit=1.0,
         facts={"stand_in": level, "tick_s": TICK_S},

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
+from astra_data.gap import distances
 from astra_data.task import Task
 from astra_data.variation import Variation
 
@@ -57,7 +58,7 @@ def beginnings(episodes: PairedEpisodes, length: int) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def trajectory_gaps(task: Task, recorded: Recorded, parameters: Tensor, seed: int) -> Tensor:
-    """Replay W windows with each of `parameters` (C, P) and the same noise; return their gaps (C, W, G)."""
+    """Replay W windows with each of `parameters` (C, P) and the same noise; return their gaps (C, W, Q)."""
     count, length = recorded.action.shape[:2]
     simulator = task.varied_simulator(count, Variation(), str(recorded.state.device))
     gaps = []
@@ -66,6 +67,5 @@ def trajectory_gaps(task: Task, recorded: Recorded, parameters: Tensor, seed: in
         simulator.parameters = context.expand(count, -1)
         simulator.reset_to(recorded.state)
         wrong = [simulator.step(recorded.action[:, i]) - recorded.next_state[:, i] for i in range(length)]
-        errors = torch.stack(wrong).unflatten(-1, (-1, 2))  # (H, W, gap, x or y)
-        gaps.append(errors.norm(dim=-1).mean(0))
+        gaps.append(distances(task, torch.stack(wrong)).mean(0))
     return torch.stack(gaps)

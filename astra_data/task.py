@@ -63,6 +63,7 @@ class Task:
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
         action_limit: largest action along each axis; both worlds cut off what is beyond.
+        quantities: of abstract states that the gap report tells of, named with their unit: their indices.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
         plane: what only a task in a maze has; None for others.
@@ -79,6 +80,7 @@ class Task:
     abstract_state: Column
     timestep_s: float
     action_limit: float
+    quantities: Mapping[str, tuple[int, ...]]
     simulator_id: str
     facts: Mapping[str, str | float]
     plane: Plane | None = None

@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.gap import gap_report
+from astra_data.gap import distances, gap_report
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.tasks import TASKS
 
@@ -47,6 +49,12 @@ def episodes(speed: float) -> PairedEpisodes:
 
 def untrained() -> GroundingModel:
     return GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(8,)))
+
+
+def test_quantities_are_measured_apart() -> None:
+    task = replace(TASK, quantities={"height_m": (2,), "way_m": (0, 3)})
+    wrong = torch.tensor([[[3.0, 9.0, -2.0, 4.0], [0.0, 9.0, 0.5, -1.0]]])
+    assert distances(task, wrong).tolist() == [[[2.0, 5.0], [0.5, 1.0]]]
 
 
 def test_a_perfect_simulator_has_no_gap() -> None:

@@ -24,6 +24,8 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     assert sizes[2] == env.action_size == task.objective.action_size
     assert sizes[1] == task.objective.goal_size
     abstract = task.abstraction(env.state)
+    entries = [entry for group in task.quantities.values() for entry in group]
+    assert set(entries) <= set(range(task.abstract_state.size)) and len(entries) == len(set(entries))
     simulator = task.simulator(2)
     assert abstract.shape == simulator.state.shape == (2, task.abstract_state.size)
     assert simulator.parameters["timestep_s"] == task.timestep_s

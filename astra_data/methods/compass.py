@@ -18,7 +18,6 @@ from torch import Tensor
 from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.errors import BadInputError
 from astra_data.fitting import Fitting
-from astra_data.gap import QUANTITIES
 from astra_data.method import Method
 from astra_data.models.causal import CausalConfig, descend, fit_causes
 from astra_data.recipe import Count
@@ -38,7 +37,7 @@ the target is: noise keeps its ranges, and is drawn from them while the policy i
 
 Mask = dict[str, dict[str, float]]
 """How probably each parameter reaches each gap, by their names. Gaps, the effects, are means over a window of
-the distance between the simulator's and the target's `QUANTITIES`."""
+the distance between the simulator and the target in each of the task's quantities."""
 
 
 class CompassConfig(BallVariation, CausalConfig):
@@ -157,7 +156,7 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
     def held_out_gap(point: Mapping[str, float]) -> dict[str, float]:
         at = parameters_at(point, type(ranges)).unsqueeze(0).to(fitting.device)
         gaps = trajectory_gaps(fitting.task, held_out, at, fitting.seed)
-        return dict(zip(QUANTITIES, gaps.mean((0, 1)).tolist(), strict=False))
+        return dict(zip(fitting.task.quantities, gaps.mean((0, 1)).tolist(), strict=True))
 
     search, plain = Search.begin(ranges, checkpoint), held_out_gap({})
     stopwatch, replays = Stopwatch(search.spent), config.contexts * config.windows
@@ -231,7 +230,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     if after < before:
         search.point |= moved
     search.narrow(moved, config.shrink)
-    rows = (dict(zip(QUANTITIES, row, strict=False)) for row in model.probability.tolist())
+    rows = (dict(zip(fitting.task.quantities, row, strict=True)) for row in model.probability.tolist())
     return dict(zip(varied, rows, strict=False))
 
 

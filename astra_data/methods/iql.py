@@ -29,6 +29,10 @@ _CHECKPOINT_EVERY = 500
 _POSITION_OCTAVES = 4
 
 
+def _position_features(task: Task) -> PositionFeatures:
+    return PositionFeatures(_POSITION_OCTAVES if task.plane else 0)
+
+
 def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
     """Learn by IQL from the target's side of the paired episodes, in no simulator.
 
@@ -42,7 +46,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
         shape = ActorCriticShape(
-            observation_size=experience.observation.shape[-1] - 4 * _POSITION_OCTAVES,
+            observation_size=experience.observation.shape[-1] - _position_features(training.task).size,
             action_size=experience.action.shape[-1],
             memory_size=training.config.memory_size,
             hidden_sizes=training.config.hidden_sizes,
@@ -57,10 +61,10 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     """Return the target's side of `episodes` as a policy sees it: φ(s_i), goal, actions, rewards.
 
-    The critics also see sines and cosines of the position.
+    The critics also see sines and cosines of the position, where there is one.
     """
     windows = episodes.windows
-    features = PositionFeatures(_POSITION_OCTAVES).to(windows.state.device)
+    features = _position_features(task).to(windows.state.device)
 
     def observation(state: Tensor) -> Tensor:
         seen = policy_observation(task.objective, state, windows.goal, None)

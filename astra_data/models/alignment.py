@@ -10,7 +10,8 @@ class TargetEncoder(nn.Module):
     """ψ^t: encode histories of full target states into the source encoder's latent space.
 
     The first two entries of a target state are its planar position in m; they are seen as the source
-    encoder sees them, with `PositionFeatures`. Without these, ψ^t cannot follow what ψ^s makes of walls.
+    encoder sees them, with `PositionFeatures`. Without these, ψ^t cannot follow what ψ^s makes of walls;
+    with 0 octaves there are none.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ class GroundingShape:
 
     Attributes:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
-        position_octaves: of `PositionFeatures`; 0 leaves positions as they are.
+        position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
     """
 
     state_size: int

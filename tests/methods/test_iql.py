@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,11 @@ def test_only_the_targets_side_is_learned_from(episodes: PairedEpisodes) -> None
     assert torch.equal(experience.reward, episodes.reward)
     assert experience.lengths.tolist() == [STEPS] * 5 + [20]
     assert experience.terminated.nonzero().tolist() == [[5, 19]]
+
+
+def test_without_places_the_critics_see_what_the_policy_sees(episodes: PairedEpisodes) -> None:
+    seen = experience_of(replace(TASK, plane=None), episodes).observation
+    assert torch.equal(seen, experience_of(TASK, episodes).observation[..., :8])
 
 
 def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
