@@ -10,9 +10,10 @@ knowledge   geometry  mazes  free_space  objective  navigation  ant  physics  ab
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
 exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, varied, scattered, grounded)
-learning    task  antmaze_tasks  nao_tasks  tasks  simulators  world  target_world  training_world
-            policy_file  deployment  behaviors  suboptimal  gap  mismatch  outcome  gymnasium_faces  pairing
-            relocation  replays  fitting  training  target_training  method  learners/
+learning    task  antmaze_tasks  nao_tasks  humanoid_tasks  tasks  simulators  world  target_world
+            training_world  policy_file  deployment  behaviors  suboptimal  gap  mismatch  outcome
+            gymnasium_faces  pairing  relocation  replays  fitting  training  target_training  method
+            learners/
 methods     methods/ (one file each: what is different about it)
 prediction  prediction/ (open-loop prediction of a real robot's recorded walk)
 stages      stages/ (one file per step: collect augment pair subset ground train align evaluate report)

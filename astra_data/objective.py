@@ -19,9 +19,11 @@ class Objective(ABC):
     Attributes:
         horizon: steps until an episode is cut off.
         success_reward: for reaching the goal. failure_reward: for ending badly.
+        is_lasting: whether success is to last to the horizon, not to reach something before.
         action_size: A. goal_size: G, 0 where there is nothing to tell apart.
     """
 
+    is_lasting: ClassVar[bool] = False
     action_size: ClassVar[int]
     goal_size: ClassVar[int]
 
@@ -52,6 +54,10 @@ class Objective(ABC):
     def places(self, state: Tensor) -> Tensor:
         """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of nothing, K = 0."""
         return state[..., :0]
+
+    def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
+        """Tell which episodes (B,) succeed in their `step`, from 1 on, that `reached` or `failed` (B,)."""
+        return ~failed if self.is_lasting and step >= self.horizon else reached
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""

@@ -58,7 +58,7 @@ class Task:
         objective: horizon, reward and success; the maze, if there is one.
         make_target, make_simulator: the worlds.
         abstraction: φ, target states (..., S) to abstract states (..., X).
-        beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., S - X).
+        beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., R).
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.

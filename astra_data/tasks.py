@@ -2,11 +2,12 @@
 
 from astra_data.antmaze_tasks import ANTMAZE_TASKS
 from astra_data.errors import BadInputError
+from astra_data.humanoid_tasks import HUMANOID_TASKS
 from astra_data.nao_tasks import NAO_TASKS
 from astra_data.recipe import did_you_mean
 from astra_data.task import Task
 
-TASKS: dict[str, Task] = {task.name: task for task in (*ANTMAZE_TASKS, *NAO_TASKS)}
+TASKS: dict[str, Task] = {task.name: task for task in (*ANTMAZE_TASKS, *NAO_TASKS, *HUMANOID_TASKS)}
 
 
 def task_named(name: str) -> Task:

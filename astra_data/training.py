@@ -203,6 +203,9 @@ def optimise(
         metrics = learner.iterate()
         # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
+        if training.task.objective.is_lasting:
+            # Horizons pass unseen here: what ended is what failed.
+            known["success"] = None
         points.append({"steps": learner.steps, **known})
         rate = learner.steps / stopwatch.seconds
         recent = [point["success"] for point in points[-10:] if point["success"] is not None]

@@ -1,12 +1,17 @@
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 
+from astra_data.behaviors import WallWatch
+from astra_data.columns import ACTION, GOAL, STATE
 from astra_data.errors import BadInputError
 from astra_data.free_space import FreeSpace
+from astra_data.methods.compass import CompassConfig
+from astra_data.methods.follower import careful
 from astra_data.objective import PlanarObjective
+from astra_data.simulators import simulator_of
 from astra_data.task import Task
 from astra_data.tasks import TASKS, task_named
 from astra_data.variation import RANDOMIZED_ACTIONS
@@ -16,24 +21,35 @@ from astra_data.variation import RANDOMIZED_ACTIONS
 def test_worlds_and_columns_fit_together(task: Task) -> None:
     assert TASKS[task.name] is task
     assert task.fps * task.timestep_s == pytest.approx(1.0, abs=0.05)
-    sizes = [column.size for column in task.state_columns]
+    sizes = {column.name: column.size for column in task.state_columns}
     env = task.target(2, seed=0, num_threads=1)
     observation = env.reset()
-    assert observation.shape == (2, sizes[0] + sizes[1])
-    assert env.step(observation[:, :2] * 0).observation.shape == observation.shape
-    assert sizes[2] == env.action_size == task.objective.action_size
-    assert sizes[1] == task.objective.goal_size
+    assert env.state.shape == (2, sizes[STATE])
+    assert env.step(torch.zeros(2, sizes[ACTION])).observation.shape == observation.shape
+    assert sizes[ACTION] == env.action_size == task.objective.action_size
+    assert sizes.get(GOAL, 0) == env.goal.shape[1] == task.objective.goal_size
     abstract = task.abstraction(env.state)
     entries = [entry for group in task.quantities.values() for entry in group]
     assert set(entries) <= set(range(task.abstract_state.size)) and len(entries) == len(set(entries))
     simulator = task.simulator(2)
     assert abstract.shape == simulator.state.shape == (2, task.abstract_state.size)
     assert simulator.parameters["timestep_s"] == task.timestep_s
+    started = torch.from_numpy(task.objective.draw_starts(np.random.default_rng(0), 2))
+    assert started.shape == abstract.shape
+
+
+IN_A_MAZE = [task for task in TASKS.values() if task.plane is not None]
+
+
+@pytest.mark.parametrize("task", IN_A_MAZE, ids=lambda task: task.name)
+def test_targets_start_in_the_free_space(task: Task) -> None:
+    env = task.target(2, seed=0, num_threads=1)
+    env.reset()
     free = FreeSpace.of_maze(task.maze, radius_m=0.1)
-    assert not free.blocked[free.cells(abstract[:, :2])].any()
+    assert not free.blocked[free.cells(task.abstraction(env.state)[:, :2])].any()
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.parametrize("task", IN_A_MAZE, ids=lambda task: task.name)
 def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
     maze = task.maze
     start = maze.fine_index(np.array(maze.cell_centre(*maze.start)))
@@ -48,9 +64,18 @@ def test_an_unknown_task_answers_with_the_known_ones() -> None:
 
 
 def test_who_asks_for_a_maze_where_there_is_none_is_told() -> None:
-    nowhere = replace(TASKS["antmaze-umaze"], plane=None)
-    with pytest.raises(BadInputError, match=r"a task in a maze, got 'antmaze-umaze'.*leave out"):
-        nowhere.varied_simulator(1, RANDOMIZED_ACTIONS)
+    nowhere = TASKS["humanoid-walker2d"]
+    asked: list[Callable[[], object]] = [
+        lambda: nowhere.maze,
+        lambda: nowhere.varied_simulator(1, RANDOMIZED_ACTIONS),
+        lambda: WallWatch(nowhere, 0.2),
+        lambda: careful(nowhere, torch.zeros(1, 0)),
+        lambda: simulator_of(nowhere, None, 1, "cpu", variation=RANDOMIZED_ACTIONS),
+        lambda: CompassConfig().ranges_for(nowhere),
+    ]
+    for ask in asked:
+        with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):
+            ask()
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)

@@ -11,8 +11,6 @@ from astra_data.humanoid import CommandRanges, Humanoids, Locomotion
 from astra_data.humanoid.model import COMMANDED, JOINTS, STATE_SIZE
 from astra_data.physics import Floats
 
-_QUATERNION = slice(3, 7)
-
 
 class HumanoidEnv:
     """B humanoids; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
@@ -63,7 +61,6 @@ class HumanoidEnv:
         self.bodies = Humanoids(locomotion, num_envs, num_threads=num_threads)
         self.goal = torch.zeros(num_envs, 0)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
-        self._start = self.bodies.state[0]
         self.reseed(seed)
 
     @property
@@ -88,10 +85,7 @@ class HumanoidEnv:
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Stand the humanoids in `mask` (B,) up, almost upright and at rest, by default all."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
-        noise = self.locomotion.reset_noise
-        state = self._start + self._rng.uniform(-noise, noise, (len(rows), STATE_SIZE))
-        state[:, _QUATERNION] /= np.linalg.norm(state[:, _QUATERNION], axis=1, keepdims=True)
-        self.reset_to(rows, state)
+        self.reset_to(rows, self.locomotion.draw_starts(self._rng, len(rows)))
         return self._observe()
 
     def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, POSITIONS
+from astra_data.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
 from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
 
 _HEIGHT = 2
@@ -20,6 +20,7 @@ _JOINTS = slice(7, POSITIONS)
 _VELOCITY = slice(POSITIONS, POSITIONS + 3)
 _SPIN = slice(POSITIONS + 3, POSITIONS + 6)
 _RATES = slice(POSITIONS + 6, None)
+_RATE = 0.2
 
 
 def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
@@ -52,6 +53,29 @@ def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.floa
     first moves its centre of mass from above its feet, then down. Dropped: how the torso is turned.
     """
     return _mapped(_extended_kinematics, state)
+
+
+def beyond_walker2d(state: Tensor) -> Tensor:
+    """Return what `humanoid_to_walker2d` drops: (..., 47) to (..., 34).
+
+    How the torso is turned and spins, the velocity along y, and the joints that no command moves; a fifth of
+    all angular rates, which reach 10 rad/s, and all else in SI units.
+    """
+    rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
+    joints, rates = state[..., _JOINTS][..., rest], state[..., _RATES][..., rest]
+    turned = [state[..., _QUATERNION], joints, state[..., _VELOCITY][..., 1:2]]
+    return torch.cat([*turned, _RATE * state[..., _SPIN], _RATE * rates], dim=-1)
+
+
+def beyond_kinematics(state: Tensor) -> Tensor:
+    """Return what `humanoid_to_kinematics` drops, but for x and y: (..., 47) to (..., 11), likewise."""
+    height, quaternion = state[..., [_HEIGHT]], state[..., _QUATERNION]
+    return torch.cat([height, quaternion, state[..., _VELOCITY], _RATE * state[..., _SPIN]], dim=-1)
+
+
+def beyond_extended_kinematics(state: Tensor) -> Tensor:
+    """Return what `humanoid_to_extended_kinematics` drops: (..., 47) to (..., 7), likewise."""
+    return torch.cat([state[..., _QUATERNION], _RATE * state[..., _SPIN]], dim=-1)
 
 
 def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](

@@ -4,7 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from astra_data.humanoid.model import STANDING
 from astra_data.physics import Bools, Floats
+
+_QUATERNION = slice(3, 7)
 
 
 @dataclass(frozen=True)
@@ -12,7 +15,6 @@ class Locomotion:
     """Rewards and ends of an episode.
 
     Attributes:
-        horizon: steps until an episode is cut off, by whoever runs it.
         forward_reward: per m/s of the centre of mass along x.
         healthy_reward: for every step that ends at a healthy height.
         healthy_m: the torso's height is between these, or the episode ends.
@@ -21,7 +23,6 @@ class Locomotion:
         reset_noise: half width of the uniform noise on positions and velocities at the start.
     """
 
-    horizon: int = 1000
     forward_reward: float = 1.25
     healthy_reward: float = 5.0
     healthy_m: tuple[float, float] = (1.0, 2.0)
@@ -29,6 +30,13 @@ class Locomotion:
     contact_cost: float = 5e-7
     contact_cost_limit: float = 10.0
     reset_noise: float = 0.01
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
+        """Draw target states (count, 47): almost upright and at rest."""
+        noise = rng.uniform(-self.reset_noise, self.reset_noise, (count, len(STANDING)))
+        state = np.array(STANDING) + noise
+        state[:, _QUATERNION] /= np.linalg.norm(state[:, _QUATERNION], axis=1, keepdims=True)
+        return state
 
     def healthy(self, height: Floats) -> Bools:
         """Tell which torso heights (B,) in m are healthy."""

@@ -228,6 +228,7 @@ def _record(
     began = time.perf_counter()
     for step in range(config.max_steps):
         row = _step(env, behavior, active, last=step == config.max_steps - 1)
+        row[SUCCESS] = task.objective.succeeded(row[SUCCESS], row[TERMINATED] & ~row[SUCCESS], step + 1)
         for name, values in row.items():
             if name not in columns:
                 columns[name] = np.empty((config.max_steps, *values.shape), values.numpy().dtype)

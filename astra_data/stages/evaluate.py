@@ -177,7 +177,8 @@ def _in_target(
     began = time.perf_counter()
     for step in range(task.objective.horizon):
         outcome = env.step(act(env.state, env.goal), record.active)
-        record.add(env.position, outcome.reward, outcome.success, env.failed, env.wall_contact)
+        success = task.objective.succeeded(outcome.success, env.failed, step + 1)
+        record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
         rate = record.total_steps / (time.perf_counter() - began)
         progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
@@ -215,11 +216,12 @@ def _in_simulator(world: SimulatorWorld, begin: Begin, horizon: int, seed: int) 
     world.reset()
     act = begin(world.goal)
     record = EpisodeRecord(world.objective.places(world.simulator.state))
-    for _ in range(horizon):
+    for number in range(horizon):
         step = world.step(act(world.simulator.state, world.goal))
+        success = world.objective.succeeded(step.success, world.failed, number + 1)
         blocked = world.simulator.blocked
         places = world.objective.places(world.simulator.state)
-        record.add(places, step.reward, step.success, world.failed, blocked)
+        record.add(places, step.reward, success, world.failed, blocked)
         if not record.active.any():
             break
     return record.outcome()

@@ -1,0 +1,96 @@
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from astra_data.envs.humanoid import HumanoidEnv
+from astra_data.humanoid import Locomotion, humanoid_model
+from astra_data.humanoid.model import COMMANDED, FEET, STANDING, TIMESTEP_S
+from astra_data.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
+
+KINDS = (PlanarWalking, JointWalking, MassWalking)
+NOTHING = torch.zeros(3, 0)
+
+
+def made(kind: type[Walking]) -> Walking:
+    return kind(horizon=5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_starts_are_the_targets(kind: type[Walking]) -> None:
+    env = HumanoidEnv(Locomotion(), 3, seed=4, num_threads=1)
+    env.reset()
+    starts = made(kind).draw_starts(np.random.default_rng(4), 3)
+    expected = made(kind).abstracted(env.state.double().numpy())
+    np.testing.assert_allclose(starts, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_policy_sees_of_random_motion_is_about_one_long(kind: type[Walking]) -> None:
+    env = HumanoidEnv(Locomotion(), 8, seed=0, num_threads=1)
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(30):
+        env.step(2 * torch.rand(8, 4, generator=generator) - 1)
+    state = torch.from_numpy(made(kind).abstracted(env.state.numpy()))
+    seen = made(kind).observe(state, torch.zeros(8, 0))
+    assert seen.shape == state.shape
+    assert 0.1 < float(seen.abs().mean(0).max()) < 3.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_to_last_is_to_succeed(kind: type[Walking]) -> None:
+    objective, failed = made(kind), torch.tensor([True, False])
+    state = torch.from_numpy(objective.draw_starts(np.random.default_rng(0), 2))
+    reached = objective.reached(state, torch.zeros(2, 0))
+    assert objective.succeeded(reached, failed, 4).tolist() == [False, False]
+    assert objective.succeeded(reached, failed, 5).tolist() == [False, True]
+
+
+def test_the_walker_is_paid_as_the_target_but_for_costs() -> None:
+    objective = PlanarWalking(horizon=5)
+    before, after = torch.zeros(4, 15), torch.zeros(4, 15)
+    after[:, 0] = torch.tensor([1.4, 0.9, 1.4, 2.1])
+    after[:, 6] = torch.tensor([0.0, 1.0, -2.0, 0.5])
+    failed = objective.missed(after, torch.zeros(4, 0))
+    assert failed.tolist() == [False, True, False, True]
+    free = np.zeros(4)
+    expected = Locomotion().reward(after[:, 6].numpy(), ~failed.numpy(), free, free)
+    reward = objective.reward(before, after, torch.zeros(4, 0), failed)
+    np.testing.assert_allclose(reward.numpy(), expected)
+
+
+def test_joints_are_paid_for_the_way_of_the_torso_over_the_lower_foot() -> None:
+    objective, model = JointWalking(horizon=5), humanoid_model()
+    data = mujoco.MjData(model)
+    # The left knee is drawn up, so that the right foot is the lower one; then both hips turn.
+    poses = np.zeros((2, 17))
+    poses[:, COMMANDED[1]] = -1.0
+    poses[1, [COMMANDED[0], COMMANDED[2]]] = 0.02, 0.1
+    feet = []
+    for pose in poses:
+        data.qpos[:] = STANDING[:24]
+        data.qpos[7:] = pose
+        mujoco.mj_forward(model, data)
+        feet.append([data.geom(name).xpos.copy() for name in FEET])
+    (left, right), (_, later) = feet
+    assert right[2] < left[2]
+    velocity = (right[0] - later[0]) / TIMESTEP_S
+    before, after = torch.zeros(2, 1, 34)
+    before[0, :17], after[0, :17] = torch.from_numpy(poses).float()
+    reward = objective.reward(before, after, NOTHING[:1], torch.zeros(1, dtype=torch.bool))
+    assert abs(velocity) > 1.0
+    assert float(reward) == pytest.approx(5.0 + 1.25 * velocity, rel=1e-4)
+    assert not objective.missed(after, NOTHING[:1]).any()
+
+
+def test_a_centre_of_mass_near_the_floor_has_fallen() -> None:
+    objective = MassWalking(horizon=5)
+    lying = np.tile(STANDING, (3, 1))
+    lying[1, 2], lying[1, 3:7] = 0.2, [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # on its back
+    lying[2, 24] = 2.0
+    state = torch.from_numpy(objective.abstracted(lying))
+    failed = objective.missed(state, NOTHING)
+    assert failed.tolist() == [False, True, False]
+    reward = objective.reward(state, state, NOTHING, failed)
+    np.testing.assert_allclose(reward.numpy(), [5.0, 0.0, 5.0 + 1.25 * 2.0], atol=1e-6)

@@ -1,0 +1,153 @@
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.columns import GOAL, SUCCESS
+from astra_data.dataset import Dataset
+from astra_data.errors import BadInputError
+from astra_data.grounding_file import load_history_model
+from astra_data.humanoid.model import STANDING
+from astra_data.humanoid_tasks import HUMANOID_TASKS
+from astra_data.progress import silent
+from astra_data.run import run
+from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.collect import CollectConfig, collect
+from astra_data.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.stages.train import train
+from astra_data.task import Task
+from astra_data.tasks import TASKS
+from astra_data.training import TrainConfig
+
+RECIPE = """
+task = "humanoid-walker2d"
+methods = ["direct_transfer", "nas", "astra"]
+seeds = [0]
+
+[collect]
+episodes = 8
+max_steps = 40
+start = "task"
+hold_s = [0.03, 0.2]
+
+[ground]
+updates = 10
+batch_windows = 4
+window = 20
+latent_size = 8
+held_out_share = 0.25
+
+[train]
+num_envs = 8
+rollout_steps = 16
+total_steps = 512
+hidden_sizes = [8]
+memory_size = 8
+data_start_share = 0.5
+
+[align]
+updates = 10
+batch_windows = 4
+window = 20
+held_out_share = 0.25
+
+[evaluate]
+episodes = 3
+"""
+LASTING = "humanoid-short"
+HORIZON = 12
+"""Steps after which none has fallen yet."""
+
+
+@pytest.mark.parametrize("task", HUMANOID_TASKS, ids=lambda task: task.name)
+def test_phi_and_what_is_beyond_it_lose_only_the_place(task: Task) -> None:
+    generator = torch.Generator().manual_seed(0)
+    state = torch.tensor(STANDING) + 0.1 * torch.randn(47, generator=generator)
+    state[3:7] /= state[3:7].norm()
+    changed = state + 1e-2 * torch.eye(47)
+
+    def known(states: torch.Tensor) -> torch.Tensor:
+        return torch.cat([task.abstraction(states), task.beyond(states)], dim=-1)
+
+    kept = (known(changed) - known(state)).abs().amax(-1) > 1e-3
+    assert kept.tolist() == [False] * 2 + [True] * 45
+
+
+def test_a_recipe_runs_whole(tmp_path: Path) -> None:
+    (tmp_path / "toy.toml").write_text(RECIPE)
+    folder = run(tmp_path / "toy.toml", root=tmp_path / "runs", jobs=1)
+    results = json.loads((folder / "report" / "results.json").read_text())
+    assert set(results["methods"]) == {"direct_transfer", "nas", "astra"}
+    assert not (folder / "report" / "trajectories.png").exists()
+    dataset = Dataset.open(folder / "pair" / "seed_0")
+    assert GOAL not in dataset.features
+    for method in ("nas", "astra"):
+        model = load_history_model(folder / "ground" / method / "seed_0" / "grounding.safetensors")
+        assert (model.shape.goal_size, model.shape.position_octaves) == (0, 0)
+        gap = json.loads((folder / "ground" / method / "seed_0" / "gap.json").read_text())
+        assert gap["raw"].keys() == TASKS["humanoid-walker2d"].quantities.keys()
+    evaluation = json.loads((folder / "evaluate" / "astra" / "seed_0" / "evaluation.json").read_text())
+    for world in ("target", "simulated", "raw"):
+        assert all(1 < steps < 1000 for steps in evaluation[world]["steps"])
+        assert evaluation[world]["failed"] == [1.0] * 3
+
+
+@pytest.fixture
+def lasting() -> Iterator[None]:
+    usual = TASKS["humanoid-kinematics"]
+    TASKS[LASTING] = replace(usual, name=LASTING, objective=replace(usual.objective, horizon=HORIZON))
+    yield
+    del TASKS[LASTING]
+
+
+def recorded(out: Path, max_steps: int) -> Path:
+    config = CollectConfig(episodes=3, max_steps=max_steps, start="task", hold_s=(0.03, 0.2))
+    return collect(LASTING, config, seed=0, out=out, progress=silent, num_threads=1)
+
+
+@pytest.mark.usefixtures("lasting")
+def test_who_lasts_to_the_horizon_succeeds_everywhere(tmp_path: Path) -> None:
+    early = Dataset.open(recorded(tmp_path / "early", HORIZON - 1))
+    late = Dataset.open(recorded(tmp_path / "late", HORIZON))
+    assert early.metadata["success"] == [False] * 3
+    for episode in late.episodes():
+        np.testing.assert_array_equal(episode.columns[SUCCESS], np.arange(HORIZON) == HORIZON - 1)
+    paired = pair(LASTING, PairConfig(), dataset=tmp_path / "late", out=tmp_path / "paired", progress=silent)
+    config = TrainConfig(num_envs=4, rollout_steps=8, total_steps=64, hidden_sizes=(8,), memory_size=8)
+    train(
+        *(LASTING, "direct_transfer", config),
+        dataset=paired,
+        grounding=None,
+        out=tmp_path / "policy",
+        device="cpu",
+        seed=0,
+        progress=silent,
+    )
+    curve = json.loads((tmp_path / "policy" / "curve.json").read_text())
+    assert {point["success"] for point in curve["points"]} == {None}
+    evaluate(
+        *(LASTING, "direct_transfer", EvaluateConfig(episodes=2)),
+        policy=tmp_path / "policy",
+        grounding=None,
+        target_encoder=None,
+        seed=0,
+        out=tmp_path / "evaluated",
+        progress=silent,
+        num_threads=1,
+    )
+    evaluation = json.loads((tmp_path / "evaluated" / "evaluation.json").read_text())
+    for world in ("target", "simulated", "raw"):
+        assert evaluation[world]["success"] == [1.0, 1.0]
+        assert evaluation[world]["steps"] == [HORIZON, HORIZON]
+
+
+@pytest.mark.usefixtures("lasting")
+def test_its_episodes_are_not_augmented(tmp_path: Path) -> None:
+    dataset = recorded(tmp_path / "dataset", 3)
+    with pytest.raises(BadInputError, match="expected a task in a maze"):
+        augment(None, AugmentConfig(), dataset=dataset, seed=0, out=tmp_path / "more", progress=silent)
