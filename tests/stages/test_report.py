@@ -258,7 +258,7 @@ def test_page_holds_the_table_and_only_figures_that_exist(folder: Path) -> None:
 
 
 def test_without_a_maze_there_is_nothing_to_draw_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(plane=None)})
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(plane=None, facts={})})
     make(root)
     images = {path.stem for path in (root / "report").glob("*.png")}
     assert images == {*HOW_TO_READ} - {"trajectories", "mismatch"}
