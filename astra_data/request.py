@@ -150,6 +150,24 @@ class Recipe(Config):
         return rows
 
     @model_validator(mode="after")
+    def _fits_the_task(self) -> Self:
+        if TASKS[self.task].plane is not None:
+            return self
+        faults = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].planar]
+        asked = {
+            "augment": self.augment is not None,
+            "collect.clearance_m": self.collect.clearance_m > 0,
+            "train.support_penalty": self.train.support_penalty > 0,
+            "plus.support_penalty": self.plus.support_penalty > 0,
+        }
+        faults += [setting for setting, is_asked in asked.items() if is_asked]
+        if faults:
+            raise ValueError(
+                f"{self.task} has no maze, which these need: {', '.join(faults)}; leave them out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _has_no_repeats(self) -> Self:
         axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
         for name, values in axes.items():

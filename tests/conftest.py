@@ -1,4 +1,5 @@
 import importlib
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import fake_stages
@@ -25,7 +26,7 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     experiment = importlib.import_module("astra_data.experiment")
     for module in (plan, request, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
-    monkeypatch.setattr(request, "TASKS", {"maze": None})
+    monkeypatch.setattr(request, "TASKS", {"maze": SimpleNamespace(plane=object())})
     monkeypatch.setattr("astra_data.experiment.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from astra_data.errors import RecipeError
 from astra_data.experiment import load_experiment
 from astra_data.plan import plan
 from astra_data.prediction.study import GapRecipe
@@ -50,3 +51,25 @@ def test_only_the_data_differs_in_the_augmentation_test(name: str, borrowed: set
     assert ours.augment is not None
     assert ours.augment.episodes == ours.collect.episodes
     assert (ours.ground, ours.train, ours.align) == (base.ground, base.train, base.align)
+
+
+HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[collect]\nstart = "task"\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "end", "asked"),
+    [
+        (', "rma", "follower"', "", "methods: rma, methods: follower"),
+        ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
+        ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
+    ],
+)
+def test_what_needs_a_maze_is_refused_where_there_is_none(
+    tmp_path: Path, more: str, end: str, asked: str
+) -> None:
+    path = tmp_path / "humanoid.toml"
+    path.write_text(HUMANOID.format(""))
+    assert load_experiment(path, tmp_path).recipe.task == "humanoid-walker2d"
+    path.write_text(HUMANOID.format(more) + end)
+    with pytest.raises(RecipeError, match=f"humanoid-walker2d has no maze, which these need: {asked};"):
+        load_experiment(path, tmp_path)

@@ -234,11 +234,12 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     return dict(zip(varied, rows, strict=False))
 
 
-COMPASS = Method(name="compass", title="COMPASS", fit=identify)
+COMPASS = Method(name="compass", title="COMPASS", fit=identify, planar=True)
 
 COMPASS_UNIFORM = Method(
     name="compass_uniform",
     title="COMPASS, uniform",
     learn=SimulatorPpo(variation=WIDE_RANGES),
+    planar=True,
 )
 """COMPASS as the paper describes it: every episode draws its parameters from the ranges."""

@@ -11,4 +11,5 @@ DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",
     title="Domain randomization",
     learn=SimulatorPpo(variation=RANDOMIZED_ACTIONS),
+    planar=True,
 )

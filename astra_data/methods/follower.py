@@ -12,7 +12,7 @@ from astra_data.mazes import Maze
 from astra_data.method import Method
 from astra_data.task import Task
 
-FOLLOWER = Method(name="follower", title="Careful follower", learn=None)
+FOLLOWER = Method(name="follower", title="Careful follower", learn=None, planar=True)
 
 Act = Callable[[Tensor, Tensor], Tensor]
 

@@ -62,4 +62,5 @@ RMA = Method(
     name="rma",
     title="RMA",
     learn=TeacherThenStudent(),
+    planar=True,
 )
