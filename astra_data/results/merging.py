@@ -22,13 +22,17 @@ def merge(
 ) -> Results:
     """Return one Results of those `methods` and `seeds` that any of the `sources` has, compared anew.
 
-    Times are summed, so what was made twice counts twice. A grounding's gap is that of the source that has
+    A source of which later ones have all rows and seeds is left out. Times are summed, so what else was made
+    twice counts twice. A grounding's gap is that of the source that has
     most seeds of it.
 
     Raises:
         BadInputError: the sources differ in task, episodes, robot or data.
     """
     _check_alike(sources)
+    sources = [
+        source for number, source in enumerate(sources) if not _is_replaced(source, sources[number + 1 :])
+    ]
     gaps = _gaps(sources)
     rows, uses = {}, {}
     for method in methods:
@@ -53,6 +57,11 @@ def merge(
             "throughput": reduce(_sum, (source.throughput for source in sources)),
         }
     )
+
+
+def _is_replaced(source: Results, later: Sequence[Results]) -> bool:
+    again = {(method, seed) for other in later for method, row in other.methods.items() for seed in row.seeds}
+    return all((method, seed) in again for method, row in source.methods.items() for seed in row.seeds)
 
 
 def _check_alike(sources: Sequence[Results]) -> None:

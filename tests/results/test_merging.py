@@ -92,6 +92,11 @@ def test_what_is_found_anew_replaces_what_is_published(root: Path) -> None:
     assert astra.gap is not None and astra.gap.horizons == [1, 10]
 
 
+def test_results_added_to_themselves_stay_as_they_are(root: Path) -> None:
+    found = assembled(root)
+    assert told(assembled(root, published=found)) == told(found)
+
+
 def test_published_results_alone_are_enough(root: Path) -> None:
     published = assembled(root)
     shutil.rmtree(root)
@@ -131,6 +136,7 @@ def test_results_that_are_not_alike_are_not_added(
 
 def test_results_of_other_data_are_not_added(root: Path) -> None:
     published = assembled(root)
+    remove(root, "astra", 0)
     edit_json(root / "pair/seed_1/meta/astra/dataset.json", content_hash="other")
     with pytest.raises(BadInputError, match="pair seed 1 with content hash1 and other"):
         assembled(root, published=published)
