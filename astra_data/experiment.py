@@ -119,6 +119,11 @@ class Experiment:
         """The folder that its results are published in."""
         return self.path.parent / "results"
 
+    @property
+    def published_in(self) -> Path:
+        """The file of published results that hold its points: the base's, where its evaluations are those."""
+        return self.results / f"{self.maker('evaluate').path.stem}.json"
+
     def published(self) -> set[Point]:
         """Return the points that its published results have.
 
@@ -127,7 +132,7 @@ class Experiment:
             RecipeError: they were made with other settings.
         """
         points = set()
-        for percent, found in by_size(read_published(self.results, self.path.stem)).items():
+        for percent, found in by_size(read_published(self.published_in)).items():
             changed = _differences(found.settings, self.recipe) - ALWAYS_NEW
             if changed:
                 raise RecipeError(

@@ -65,7 +65,7 @@ def plan(
         part: what to make and to report of it; by default all.
         device: torch device of the networks.
         publish: a folder that the report copies its results to, if any.
-        add_to: a folder with published results that the report adds to, if any.
+        add_to: a file of results that the report adds to, if any.
     """
     part = part or Part.of(recipe)
     bases = tuple(dict.fromkeys(base_method(row) for row in part.methods))

@@ -104,7 +104,7 @@ def run_stage(
         part,
         device=device,
         publish=experiment.results if publish else None,
-        add_to=experiment.results if add else None,
+        add_to=experiment.published_in if add else None,
     )
     make(experiment, _selected(recipe, planned, stage, method), jobs=jobs, device=device)
     return folder / stage

@@ -39,6 +39,13 @@ def attempts(folder: Path) -> int:
     return sum(len(path.read_text()) for path in folder.rglob("attempts"))
 
 
+def test_the_base_has_published_what_is_borrowed_of_it(base: Path, longer: Path) -> None:
+    part = base.with_name("part.toml")
+    part.write_text('based_on = "base"\nmethods = ["astra"]\n')
+    for path, expected in ((base, "base"), (longer, "longer"), (part, "base")):
+        assert load_experiment(path, base.parent).published_in == base.parent / f"results/{expected}.json"
+
+
 @pytest.mark.parametrize(
     ("text", "borrowed"),
     [

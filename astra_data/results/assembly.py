@@ -68,7 +68,9 @@ def assemble(
     sources = [*([published] if published else []), *here]
     merged = merge(sources, methods=methods, seeds=asked, replicates=replicates)
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
-    return merged.model_copy(update={"command": command, "paper_success": printed})
+    # Published ones may be those of the recipe that this one is based on.
+    own = {"recipe": recipe, "command": command, "settings": dict(settings or {})}
+    return merged.model_copy(update=own | {"paper_success": printed})
 
 
 def _read(read: Runs, task: str, command: str, settings: Mapping[str, JsonValue]) -> Results:

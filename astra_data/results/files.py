@@ -18,13 +18,12 @@ Page = Callable[[Mapping[str, str]], str]
 """Returns the page with the figures of these names and files."""
 
 
-def read_published(folder: Path, recipe: str) -> Found:
-    """Return the results of a recipe that are in `folder`.
+def read_published(path: Path) -> Found:
+    """Return the results in a JSON file.
 
     Raises:
         BadInputError: there are none, or they are not as they are written now.
     """
-    path = folder / f"{recipe}.json"
     if not path.is_file():
         raise BadInputError(f"expected published results in {path}, found none: leave out what asks for them")
     try:

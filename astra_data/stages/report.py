@@ -98,7 +98,7 @@ def report(
         command: the command line to print as the results' origin.
         publish: a folder for copies named after the recipe, or None.
         progress: told the share done and what was written.
-        add_to: a folder with published results to which those at `root` are added, or None.
+        add_to: a file of results to which those at `root` are added, or None.
         config: how to draw.
 
     Raises:
@@ -108,7 +108,7 @@ def report(
     """
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
-    known = {} if add_to is None else by_size(read_published(add_to, recipe.name))
+    known = {} if add_to is None else by_size(read_published(add_to))
     sizes = _with_common_rows(
         assemble(
             recipe.name,
@@ -152,7 +152,7 @@ def report(
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
     if publish is not None:
-        kept = {} if add_to is None else published_figures(add_to, recipe.name)
+        kept = {} if add_to is None else published_figures(publish, recipe.name)
         publish_results(found, page, kept | images, publish)
     progress(1.0, _headline(sizes[-1]))
 

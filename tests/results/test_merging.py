@@ -101,7 +101,9 @@ def test_published_results_alone_are_enough(root: Path) -> None:
     published = assembled(root)
     shutil.rmtree(root)
     assert told(assembled(root, published=published)) == told(published)
-    fewer = assembled(root, ("astra", "nas"), (0, 2), published)
+    based_on_it = published.model_copy(update={"recipe": "base"})
+    fewer = assembled(root, ("astra", "nas"), (0, 2), based_on_it)
+    assert fewer.recipe == "antmaze_u"
     assert fewer.methods["astra"].success == [0.5, 0.75]
     assert (list(fewer.methods), fewer.seeds, fewer.unfinished) == (["astra"], [0, 2], ["NAS"])
     with pytest.raises(MissingStageError):

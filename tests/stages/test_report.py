@@ -280,7 +280,7 @@ def test_results_are_added_to_published_ones(root: Path, tmp_path: Path) -> None
         for seed in (0, 1):
             shutil.rmtree(root / f"evaluate/{row}/seed_{seed}")
     shutil.rmtree(root / "evaluate/astra_plus")
-    make(root, published, add_to=published)
+    make(root, published, add_to=published / "antmaze_u.json")
     page = (published / "antmaze_u.md").read_text()
     assert "| ASTRA | 3 | 0.50 ± 0.25 |" in page
     assert "| ASTRA+ | 2 | **0.88 ± 0.18** |" in page
@@ -293,10 +293,10 @@ def test_results_are_added_to_published_ones(root: Path, tmp_path: Path) -> None
 
 def test_there_must_be_results_to_add_to(root: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected published results in .*antmaze_u.json, found none"):
-        make(root, add_to=tmp_path)
+        make(root, add_to=tmp_path / "antmaze_u.json")
     (tmp_path / "antmaze_u.json").write_text("{}")
     with pytest.raises(BadInputError, match=r"antmaze_u.json does not hold results as they are written now"):
-        make(root, add_to=tmp_path)
+        make(root, add_to=tmp_path / "antmaze_u.json")
 
 
 def test_one_seed_of_rows_without_training_is_enough(root: Path) -> None:
