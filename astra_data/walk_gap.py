@@ -26,8 +26,8 @@ def is_gap_recipe(path: Path) -> bool:
     return {"mapping", "models"} <= load_tables(path).keys()
 
 
-def check_gap(recipe_path: Path) -> None:
-    """Validate a `GapRecipe` and that its mapping is there.
+def load_gap_recipe(recipe_path: Path) -> GapRecipe:
+    """Read a `GapRecipe` whose mapping is there.
 
     Raises:
         RecipeError: it has faults.
@@ -36,6 +36,7 @@ def check_gap(recipe_path: Path) -> None:
     mapping = recipe_path.parent / recipe.mapping
     if not mapping.is_file():
         raise RecipeError(f"{recipe_path}: mapping: expected a file of `astra-data import`, got {mapping}")
+    return recipe
 
 
 def measure_gap(
@@ -61,8 +62,7 @@ def measure_gap(
         RecipeError: the recipe has faults.
         BadInputError: there are no usable recordings, or the folder holds what other settings gave.
     """
-    check_gap(recipe_path)
-    recipe = load_recipe(recipe_path, GapRecipe)
+    recipe = load_gap_recipe(recipe_path)
     unknown = sorted(set(seeds) - set(recipe.seeds))
     if unknown:
         raise BadInputError(f"the recipe has no seed {', '.join(map(str, unknown))}; it has {recipe.seeds}")

@@ -58,13 +58,13 @@ def run(
 def check(recipes: RecipePaths, root: Root = RUNS) -> None:
     """Check recipes without running them, and list what is finished and what is to do."""
     from astra_data.run import check as check_recipe
-    from astra_data.walk_gap import check_gap, is_gap_recipe
+    from astra_data.walk_gap import is_gap_recipe, load_gap_recipe
 
     faults: list[str] = []
     for recipe in recipes:
         try:
             if is_gap_recipe(recipe):
-                check_gap(recipe)
+                load_gap_recipe(recipe)
                 typer.echo(f"{recipe}: for `astra-data gap`, without faults")
                 continue
             finished = check_recipe(recipe, root=root)

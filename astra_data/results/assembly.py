@@ -64,16 +64,20 @@ def assemble(
         BadInputError: an artefact is malformed, or rows were evaluated or made of data differently.
     """
     read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
-    here = [] if published and not read.any_finished else [_read(read, task, command, settings or {})]
-    sources = [*([published] if published else []), *here]
+    settings = dict(settings or {})
+    sources = []
+    if published:
+        # It may be that of the recipe that this one is based on.
+        own = {"recipe": recipe, "command": command, "settings": settings}
+        sources.append(published.model_copy(update=own))
+    if read.any_finished or not published:
+        sources.append(_read(read, task, command, settings))
     merged = merge(sources, methods=methods, seeds=asked, replicates=replicates)
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
-    # Published ones may be those of the recipe that this one is based on.
-    own = {"recipe": recipe, "command": command, "settings": dict(settings or {})}
-    return merged.model_copy(update=own | {"paper_success": printed})
+    return merged.model_copy(update={"paper_success": printed})
 
 
-def _read(read: Runs, task: str, command: str, settings: Mapping[str, JsonValue]) -> Results:
+def _read(read: Runs, task: str, command: str, settings: dict[str, JsonValue]) -> Results:
     """Return what the artefacts say, before rows are summarised and compared."""
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
@@ -119,7 +123,7 @@ def _read(read: Runs, task: str, command: str, settings: Mapping[str, JsonValue]
         recipe=read.recipe,
         task=task,
         command=command,
-        settings=dict(settings),
+        settings=settings,
         origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
         wall_seconds=seconds(files, "wall_seconds"),
         cpu_seconds=seconds(files, "cpu_seconds"),

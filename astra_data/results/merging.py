@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Any
 
+import numpy as np
+
 from astra_data.errors import BadInputError
 from astra_data.figures import method_title
 from astra_data.results.comparing import improvement, summarised, validity
@@ -23,8 +25,7 @@ def merge(
     """Return one Results of those `methods` and `seeds` that any of the `sources` has, compared anew.
 
     A source of which later ones have all rows and seeds is left out. Times are summed, so what else was made
-    twice counts twice. A grounding's gap is that of the source that has
-    most seeds of it.
+    twice counts twice. A grounding's gap is that of the source that has most seeds of it.
 
     Raises:
         BadInputError: the sources differ in task, episodes, robot or data.
@@ -131,20 +132,16 @@ def _named(results: Results, method: str) -> list[Named]:
 
 def _mean_cost(rows: Sequence[MethodResults]) -> dict[str, Cost]:
     """Return the mean over the seeds of all, of what each gives as a mean over its own."""
-
-    def mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
-        known = [value for value in values if value is not None]
-        if len(known) < len(values):
-            return None
-        return sum(value * weight for value, weight in zip(known, weights, strict=True)) / sum(weights)
-
     merged = {}
     for stage in dict.fromkeys(stage for row in rows for stage in row.cost):
         timed = [row for row in rows if stage in row.cost]
         weights = [len(row.seeds) for row in timed]
-        wall = mean([row.cost[stage].wall_seconds for row in timed], weights)
-        cpu = mean([row.cost[stage].cpu_seconds for row in timed], weights)
-        merged[stage] = Cost(wall_seconds=wall or 0.0, cpu_seconds=cpu)
+        wall = [row.cost[stage].wall_seconds for row in timed]
+        cpu = [spent for row in timed if (spent := row.cost[stage].cpu_seconds) is not None]
+        merged[stage] = Cost(
+            wall_seconds=float(np.average(wall, weights=weights)),
+            cpu_seconds=float(np.average(cpu, weights=weights)) if len(cpu) == len(wall) else None,
+        )
     return merged
 
 

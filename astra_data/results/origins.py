@@ -12,11 +12,10 @@ def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
     """Return every code, machine and set of packages once, with all the stages that it made."""
     merged: dict[str, Origin] = {}
     for origin in origins:
-        key = origin.model_copy(update={"stages": []})
-        stages = merged.setdefault(key.model_dump_json(), key).stages
-        merged[key.model_dump_json()] = key.model_copy(
-            update={"stages": list(dict.fromkeys([*stages, *origin.stages]))}
-        )
+        key = origin.model_dump_json(exclude={"stages"})
+        known = merged.get(key, origin)
+        stages = list(dict.fromkeys([*known.stages, *origin.stages]))
+        merged[key] = known.model_copy(update={"stages": stages})
     return list(merged.values())
 
 
