@@ -6,9 +6,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from astra_data.models.actor_critic import ActorCritic
 from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
+from astra_data.models.policy import Policy
 from astra_data.task import Task
 from astra_data.world import policy_observation
 
@@ -39,7 +39,7 @@ class DeployedPolicy:
     """
 
     task: Task
-    policy: ActorCritic
+    policy: Policy
     model: GroundingModel | None = None
     target_encoder: TargetEncoder | None = None
     command_limit_m_s: float = 2.0
@@ -86,9 +86,8 @@ class DeployedPolicy:
     @torch.no_grad()
     def _act(self, observation: Tensor) -> Tensor:
         features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
-        output, std = self.policy.policy(features)
-        if self._generator is not None:
-            output = torch.normal(output, std, generator=self._generator).clamp(-1.0, 1.0)
-        self._previous_output = output
-        self._previous_action = self.task.objective.limit_command(output, self.command_limit_m_s)
+        self._previous_output = self.policy.act(features, self._generator)
+        self._previous_action = self.task.objective.limit_command(
+            self._previous_output, self.command_limit_m_s
+        )
         return self._previous_action

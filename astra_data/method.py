@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 from astra_data.fitting import Fit, HistoryFit
-from astra_data.target_training import TargetPpo
-from astra_data.training import Learn, SimulatorPpo
+from astra_data.target_training import InTarget
+from astra_data.training import InSimulator, Learn
 
-IN_RAW_SIMULATOR = SimulatorPpo()
+IN_RAW_SIMULATOR = InSimulator()
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,12 @@ class Method:
     @property
     def in_simulator(self) -> bool:
         """Whether its policy is trained in the abstract simulator, so that the cures of `[plus]` apply."""
-        return isinstance(self.learn, SimulatorPpo)
+        return isinstance(self.learn, InSimulator)
 
     @property
     def steps_target(self) -> bool:
         """Whether its policy is trained in the target itself."""
-        return isinstance(self.learn, TargetPpo)
+        return isinstance(self.learn, InTarget)
 
     @property
     def predicts_reward(self) -> bool:

@@ -13,9 +13,17 @@ from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.adaptation import AdaptiveShape, Student
 from astra_data.models.alignment import TargetEncoder
 from astra_data.models.grounding import GroundingModel
+from astra_data.models.policy import Policy, PolicyShape
+from astra_data.models.soft_actor import SoftActor
 from astra_data.task import Task
 from astra_data.training_world import WorldConfig
 from astra_data.variation import Variation
+
+_KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
+    "actor_critic": (ActorCritic, ActorCriticShape),
+    "adaptive": (Student, AdaptiveShape),
+    "soft_actor": (SoftActor, PolicyShape),
+}
 
 
 @dataclass(frozen=True)
@@ -46,7 +54,7 @@ class PolicyFile:
         observed: what it is shown of the target.
     """
 
-    policy: ActorCritic
+    policy: Policy
     simulation: Simulation | None
     dataset: str
     content_hash: str
@@ -56,7 +64,7 @@ class PolicyFile:
         """Write the policy to `path`."""
         tensors = {f"policy.{name}": tensor for name, tensor in self.policy.state_dict().items()}
         told: dict[str, Any] = {
-            "kind": "adaptive" if isinstance(self.policy, Student) else "actor_critic",
+            "kind": next(kind for kind, (made, _) in _KINDS.items() if type(self.policy) is made),
             "shape": asdict(self.policy.shape),
             "dataset": self.dataset,
             "hash": self.content_hash,
@@ -80,12 +88,10 @@ class PolicyFile:
         Raises:
             BadInputError: it is something else, or from an older version.
         """
-        with understood(path, "a policy", ("actor_critic", "adaptive"), device) as (tensors, told):
+        with understood(path, "a policy", _KINDS, device) as (tensors, told):
             shape = told["shape"] | {"hidden_sizes": tuple(told["shape"]["hidden_sizes"])}
-            if told["kind"] == "adaptive":
-                policy: ActorCritic = Student(AdaptiveShape(**shape))
-            else:
-                policy = ActorCritic(ActorCriticShape(**shape))
+            made, shaped = _KINDS[told["kind"]]
+            policy = made(shaped(**shape))
             prefix = "policy."
             policy.load_state_dict(
                 {

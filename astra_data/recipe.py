@@ -6,9 +6,9 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
 from astra_data.errors import RecipeError
@@ -17,6 +17,18 @@ Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+
+
+_UNNAMED = ""
+
+
+def choice(name: str) -> str:
+    """Return the tag of a model among those that a table may be; messages leave it out of a key's name."""
+    return f"<{name}>"
+
+
+def _is_choice(part: int | str) -> bool:
+    return str(part).startswith("<")
 
 
 class Config(BaseModel):
@@ -101,7 +113,7 @@ _EXPECTED = {
 
 def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     location = error["loc"]
-    key = ".".join(str(part) for part in location) or "recipe"
+    key = ".".join(str(part) for part in location if not _is_choice(part)) or "recipe"
     kind, message = error["type"], error["msg"]
     if kind == "extra_forbidden":
         return f"{key}: unknown key{_key_hint(str(location[-1]), _section(model, location[:-1]), model)}"
@@ -127,24 +139,30 @@ def _key_hint(key: str, section: type[BaseModel] | None, model: type[BaseModel])
 def _section(model: type[BaseModel], location: Iterable[int | str]) -> type[BaseModel] | None:
     """Follow `location` through the nested models; None where it leaves them."""
     section: type[BaseModel] | None = model
+    choices: dict[str, type[BaseModel]] = {}
     for part in location:
-        field = section.model_fields.get(str(part)) if section else None
-        section = _nested_model(field.annotation) if field else None
+        if part not in choices:
+            field = section.model_fields.get(str(part)) if section else None
+            choices = _nested_models(field.annotation) if field else {}
+            part = _UNNAMED
+        section = choices.get(str(part))
     return section
 
 
-def _nested_model(annotation: Any) -> type[BaseModel] | None:  # noqa: ANN401 - an annotation is any object
+def _nested_models(annotation: Any) -> dict[str, type[BaseModel]]:  # noqa: ANN401 - an annotation is any object
+    """Return the models that `annotation` allows, by the names of the choices where there are several."""
+    found: dict[str, type[BaseModel]] = {}
     for candidate in (annotation, *get_args(annotation)):
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return candidate
-    return None
+        kind, *told = get_args(candidate) if get_origin(candidate) is Annotated else (candidate,)
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            found[next((mark.tag for mark in told if isinstance(mark, Tag)), _UNNAMED)] = kind
+    return found
 
 
 def _dotted_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     for name, field in model.model_fields.items():
         yield prefix + name
-        nested = _nested_model(field.annotation)
-        if nested:
+        for nested in _nested_models(field.annotation).values():
             yield from _dotted_keys(nested, f"{prefix}{name}.")
 
 

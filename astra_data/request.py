@@ -24,7 +24,7 @@ from astra_data.stages.pair import PairConfig
 from astra_data.stages.report import ReportConfig
 from astra_data.target_training import TargetConfig
 from astra_data.tasks import TASKS
-from astra_data.training import TrainConfig
+from astra_data.training import AnyTrainConfig
 from astra_data.variation import RANDOMIZED_ACTIONS, Variation
 
 STAGES: dict[str, tuple[str, ...]] = {
@@ -81,14 +81,14 @@ class Recipe(Config):
     """How each collected dataset is augmented before it is paired; by default not at all."""
     pair: PairConfig
     ground: GroundConfig
-    train: TrainConfig
+    train: AnyTrainConfig
     align: AlignConfig
     evaluate: EvaluateConfig
     report: ReportConfig
     based_on: str | None = None
     """The recipe that all that is not said here, and every artefact it leaves unchanged, is taken from."""
     sweep: SweepConfig = SweepConfig()
-    plus: TrainConfig
+    plus: AnyTrainConfig
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
     domain_randomization: Variation = RANDOMIZED_ACTIONS
     """What domain randomization varies; by default as the paper prints it for navigation."""

@@ -7,7 +7,7 @@ from astra_data.deployment import Observed
 from astra_data.policy_file import PolicyFile
 from astra_data.recipe import Config, Count
 from astra_data.target_world import TargetStarts, TargetWorld
-from astra_data.training import Training, train_by_ppo
+from astra_data.training import Training, train_in
 
 
 class TargetConfig(Config):
@@ -20,8 +20,8 @@ class TargetConfig(Config):
 
 
 @dataclass(frozen=True)
-class TargetPpo:
-    """Train by PPO in the target, from its own rewards.
+class InTarget:
+    """Train in the target, from its own rewards.
 
     Attributes:
         observed: whether the policy sees φ of the state, which leaves it a memory to need, or all of it.
@@ -43,5 +43,5 @@ class TargetPpo:
             num_threads=training.num_threads,
         )
         memory_size = config.memory_size if self.observed == "abstract" else 0
-        policy, curve = train_by_ppo(env, config, memory_size, training)
+        policy, curve = train_in(env, config, memory_size, training)
         return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve

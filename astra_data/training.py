@@ -1,16 +1,18 @@
 """Training: what a method is given to learn a policy from, and the way that most methods take.
 
-That way is PPO in the abstract simulator, raw, varied, or as the method's grounding makes it (Algorithm 2).
+That way is PPO, or SAC, in the abstract simulator: raw, varied, or as the method's grounding makes it
+(Algorithm 2).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
+from pydantic import Discriminator, Tag
 from torch import Tensor
 
 from astra_data.batched import BatchedEnv
@@ -18,10 +20,13 @@ from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.learners.ppo import Ppo, PpoConfig
+from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.policy import Policy, PolicyShape
+from astra_data.models.soft_actor import SoftActor
 from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count
+from astra_data.recipe import Config, Count, choice
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
@@ -32,8 +37,8 @@ from astra_data.world import RewardSource, SimulatorWorld
 _CHECKPOINT_EVERY = 20
 
 
-class TrainConfig(WorldConfig, PpoConfig):
-    """How policies are trained: PPO's settings, the world's switches, and the sizes below."""
+class TrainConfig(WorldConfig):
+    """How policies are trained, but for the learner's own settings."""
 
     num_envs: Count = 256
     """Worlds stepped side by side."""
@@ -41,6 +46,38 @@ class TrainConfig(WorldConfig, PpoConfig):
     """Of actor and critic."""
     memory_size: int = 64
     """Of the policy's own GRU, where no grounding provides a latent."""
+
+
+class PpoTrainConfig(TrainConfig, PpoConfig):
+    """Training by PPO."""
+
+    learner: Literal["ppo"] = "ppo"
+    """Proximal policy optimisation."""
+
+
+class SacTrainConfig(TrainConfig, SacConfig):
+    """Training by SAC."""
+
+    learner: Literal["sac"]
+    """Soft actor-critic."""
+    num_envs: Count = 32
+    """Worlds stepped side by side."""
+
+
+def _learner_of(settings: object) -> str:
+    asked = settings.get("learner", "ppo") if isinstance(settings, Mapping) else None
+    return choice(str(asked or getattr(settings, "learner", "ppo")))
+
+
+AnyTrainConfig = Annotated[
+    Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
+    Discriminator(
+        _learner_of,
+        custom_error_type="learner",
+        custom_error_message='expected learner "ppo" or "sac"',
+    ),
+]
+"""Training as its `learner` says, by default by PPO."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +96,7 @@ class Training:
     """
 
     task: Task
-    config: TrainConfig
+    config: PpoTrainConfig | SacTrainConfig
     settings: Config | None
     episodes: PairedEpisodes
     grounding: Grounding | None
@@ -117,8 +154,8 @@ class Learner(Protocol):
 
 
 @dataclass(frozen=True)
-class SimulatorPpo:
-    """Train by PPO in the abstract simulator.
+class InSimulator:
+    """Train in the abstract simulator.
 
     Attributes:
         reward: where the reward comes from, unless the recipe says.
@@ -133,7 +170,7 @@ class SimulatorPpo:
         """Return the policy and its learning curve."""
         env, simulation = self.world(training)
         memory_size = 0 if env.latent_size else training.config.memory_size
-        policy, curve = train_by_ppo(env, training.config, memory_size, training)
+        policy, curve = train_in(env, training.config, memory_size, training)
         episodes = training.episodes
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
@@ -158,21 +195,21 @@ class SimulatorPpo:
         return env, Simulation(parts.thinness, parts.scatter, switches, parts.variation)
 
 
-def train_by_ppo(
-    env: ResumableEnv, config: TrainConfig, memory_size: int, training: Training
-) -> tuple[ActorCritic, dict[str, Any]]:
+def train_in(
+    env: ResumableEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training
+) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`, with a memory of `memory_size`; return it and its learning curve."""
     torch.manual_seed(derive(training.seed, "policy"))
-    policy = ActorCritic(
-        ActorCriticShape(
-            observation_size=env.observation_size,
-            action_size=env.action_size,
-            memory_size=memory_size,
-            hidden_sizes=config.hidden_sizes,
-        )
-    ).to(training.device)
-    ppo = Ppo(env, policy, config, horizon=training.task.objective.horizon, seed=training.seed)
-    return policy, optimise(ppo, env, config.ramp, training)
+    sizes = env.observation_size, env.action_size, memory_size
+    horizon, seed = training.task.objective.horizon, training.seed
+    learner: Ppo | Sac
+    if isinstance(config, SacTrainConfig):
+        actor = SoftActor(PolicyShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)
+        learner = Sac(env, actor, config, horizon=horizon, seed=seed)
+    else:
+        policy = ActorCritic(ActorCriticShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)
+        learner = Ppo(env, policy, config, horizon=horizon, seed=seed)
+    return learner.policy, optimise(learner, env, config.ramp, training)
 
 
 def optimise(
@@ -208,9 +245,8 @@ def optimise(
             known["success"] = None
         points.append({"steps": learner.steps, **known})
         rate = learner.steps / stopwatch.seconds
-        recent = [point["success"] for point in points[-10:] if point["success"] is not None]
-        success = f"{fmean(recent):.2f}" if recent else "unknown yet"
-        note = f"{rate:,.0f} steps/s  success of training episodes {success}"
+        lately = _lately(points, "episode_steps" if training.task.objective.is_lasting else "success")
+        note = f"{rate:,.0f} steps/s  {lately}"
         training.progress(learner.steps / learner.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0 or learner.done:
             state = {"learner": learner.state_dict(), "world": env.state_dict()}
@@ -221,3 +257,11 @@ def optimise(
         **stopwatch.spent(),
         "points": points,
     }
+
+
+def _lately(points: Sequence[Mapping[str, float | None]], figure: str) -> str:
+    """Tell the mean of a `figure`, "success" or "episode_steps", over the last of the `points`."""
+    recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
+    if figure == "success":
+        return f"success of training episodes {f'{fmean(recent):.2f}' if recent else 'unknown yet'}"
+    return f"steps of training episodes {f'{fmean(recent):,.0f}' if recent else 'unknown yet'}"

@@ -9,7 +9,7 @@ from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.collect import CollectConfig
 from astra_data.tasks import TASKS
-from astra_data.training import TrainConfig
+from astra_data.training import PpoTrainConfig
 
 TASK = "antmaze-short"
 _LONG = TASKS["antmaze-umaze"]
@@ -18,7 +18,7 @@ _SHORT = replace(_LONG, name=TASK, objective=replace(_LONG.objective, horizon=25
 COLLECT = CollectConfig(episodes=8, max_steps=60)
 GROUND = GroundConfig(updates=30, batch_windows=4, window=20, latent_size=16, held_out_share=0.25)
 GOLEMO = GolemoConfig(epochs=3, hidden_size=8, layers=2)
-TRAIN = TrainConfig(num_envs=8, rollout_steps=8, total_steps=8 * 8 * 6, hidden_sizes=(16,), memory_size=8)
+TRAIN = PpoTrainConfig(num_envs=8, rollout_steps=8, total_steps=8 * 8 * 6, hidden_sizes=(16,), memory_size=8)
 ALIGN = AlignConfig(updates=100, batch_windows=4, window=20, held_out_share=0.25)
 
 

@@ -22,7 +22,7 @@ from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.train import train
 from astra_data.task import Task
 from astra_data.tasks import TASKS
-from astra_data.training import TrainConfig
+from astra_data.training import PpoTrainConfig
 
 RECIPE = """
 task = "humanoid-walker2d"
@@ -118,7 +118,7 @@ def test_who_lasts_to_the_horizon_succeeds_everywhere(tmp_path: Path) -> None:
     for episode in late.episodes():
         np.testing.assert_array_equal(episode.columns[SUCCESS], np.arange(HORIZON) == HORIZON - 1)
     paired = pair(LASTING, PairConfig(), dataset=tmp_path / "late", out=tmp_path / "paired", progress=silent)
-    config = TrainConfig(num_envs=4, rollout_steps=8, total_steps=64, hidden_sizes=(8,), memory_size=8)
+    config = PpoTrainConfig(num_envs=4, rollout_steps=8, total_steps=64, hidden_sizes=(8,), memory_size=8)
     train(
         *(LASTING, "direct_transfer", config),
         dataset=paired,

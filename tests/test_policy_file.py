@@ -37,6 +37,7 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
         assert torch.equal(one, other)
     features = torch.randn(4, 11)
     assert torch.equal(loaded.policy.policy(features)[0], policy.policy(features)[0])
+    assert isinstance(loaded.policy, ActorCritic)
     assert torch.equal(loaded.policy.value(features), policy.value(features))
 
 
@@ -60,7 +61,7 @@ def test_a_grounding_is_no_policy(grounding: Grounding, kind: str, tmp_path: Pat
     save_grounding(path, grounding, no_episodes())
     with pytest.raises(
         BadInputError,
-        match=r"policy.safetensors: expected a policy \(kind actor_critic or adaptive\), "
+        match=r"policy.safetensors: expected a policy \(kind actor_critic or adaptive or soft_actor\), "
         f"found kind {kind}: run that stage again$",
     ):
         PolicyFile.load(path)

@@ -46,6 +46,7 @@ from astra_data.recipe import load_recipe
 from astra_data.request import Recipe
 from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
+from astra_data.training import PpoTrainConfig
 from astra_data.world import SimulatorWorld
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
@@ -153,6 +154,7 @@ def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, 
 def ppo_stretch(model: GroundingModel | None, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
     config = SETTINGS.train
+    assert isinstance(config, PpoTrainConfig)
     env = SimulatorWorld(TASK.objective, simulator_of(TASK, model, config.num_envs, "cpu"))
     shape = ActorCriticShape(
         observation_size=env.observation_size,

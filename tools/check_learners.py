@@ -30,8 +30,10 @@ from torch import Tensor
 from astra_data.batched import Step
 from astra_data.learners.iql import Experience, Iql, IqlConfig
 from astra_data.learners.ppo import Ppo, PpoConfig
-from astra_data.learners.sac import SacConfig, train_sac
+from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.policy import Policy, PolicyShape
+from astra_data.models.soft_actor import SoftActor
 
 ENV = "Pendulum-v1"
 HORIZON = 200
@@ -160,14 +162,14 @@ def play(act: Callable[[Tensor, Tensor], Tensor], seed: int, *, hide_velocity: b
     return returns
 
 
-def play_actor_critic(policy: ActorCritic, seed: int, *, hide_velocity: bool = False) -> Returns:
+def play_policy(policy: Policy, seed: int, *, hide_velocity: bool = False) -> Returns:
     """Play the mean action."""
     hidden = policy.initial_hidden(EPISODES)
 
     def act(observation: Tensor, previous_action: Tensor) -> Tensor:
         nonlocal hidden
         features, hidden = policy.remember(observation, previous_action, hidden)
-        return policy.policy(features)[0]
+        return policy.act(features)
 
     return play(act, seed, hide_velocity=hide_velocity)
 
@@ -192,27 +194,31 @@ def ppo(seed: int, *, memory_size: int = 0) -> Returns:
     learner = Ppo(env, policy, config, horizon=HORIZON, seed=seed)
     while not learner.done:
         learner.iterate()
-    return play_actor_critic(policy, seed, hide_velocity=memory_size > 0)
+    return play_policy(policy, seed, hide_velocity=memory_size > 0)
 
 
 @cache
-def train_by_sac(seed: int) -> tuple[torch.nn.Sequential, dict[str, Tensor]]:
+def train_by_sac(seed: int) -> tuple[Policy, dict[str, Tensor]]:
     """Train for 20 k steps, in four pendulums at once; return the actor and the early episodes."""
     env = Recorder(4, seed=seed)
     config = SacConfig(
-        env_steps=20_000,
+        total_steps=20_000,
+        rollout_steps=200,
         updates_per_step=env.num_envs,
-        hidden_sizes=(256, 256),
         discount=0.99,
-        episode_steps=HORIZON,
     )
-    return train_sac(env, config, seed=seed), env.early_episodes()
+    torch.manual_seed(seed)
+    actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
+    learner = Sac(env, actor, config, horizon=HORIZON, seed=seed)
+    while not learner.done:
+        learner.iterate()
+    return actor, env.early_episodes()
 
 
 def sac(seed: int) -> Returns:
     """Play the mean action of SAC's actor."""
-    network, _ = train_by_sac(seed)
-    return play(lambda observation, _: network(observation)[:, :1].tanh(), seed)
+    actor, _ = train_by_sac(seed)
+    return play_policy(actor, seed)
 
 
 IQL = IqlConfig(
@@ -253,7 +259,7 @@ def iql(seed: int) -> Returns:
     learner = Iql(policy, experience, IQL, seed=seed)
     while not learner.done:
         learner.iterate()
-    return play_actor_critic(policy, seed)
+    return play_policy(policy, seed)
 
 
 def iql_by_d3rlpy(seed: int) -> str:

@@ -7,8 +7,6 @@ Training takes about 30 minutes on one core.
 """
 
 import json
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,10 +19,14 @@ from torch import nn
 
 from astra_data.ant import VelocityController
 from astra_data.envs.ant_velocity import AntVelocityConfig, AntVelocityEnv
-from astra_data.learners.sac import SacConfig, train_sac
+from astra_data.learners.sac import Sac, SacConfig
+from astra_data.models.policy import PolicyShape
+from astra_data.models.soft_actor import SoftActor
 
 SETTLED_STEPS = 20
 """One second after a command change, tracking counts as settled."""
+LONGEST_STEPS = 1000
+"""After so many, ants are set up anew."""
 
 app = typer.Typer(add_completion=False, help=__doc__)
 
@@ -40,39 +42,29 @@ def train(
     torch.set_num_threads(1)
     out.mkdir(parents=True, exist_ok=True)
     curve: list[dict[str, float]] = []
-    network: nn.Sequential | None = None
+    torch.manual_seed(seed)
+    shape = PolicyShape(AntVelocityEnv.observation_size, AntVelocityEnv.action_size, hidden_sizes=(128, 128))
+    actor = SoftActor(shape)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, TimeRemainingColumn()) as progress:
         for torque_scale, count in ((0.7, steps), (1.0, full_torque_steps)):
             env = AntVelocityEnv(AntVelocityConfig(torque_scale=torque_scale, num_threads=1), seed=seed)
             bar = progress.add_task(f"torque {torque_scale}", total=count, note="")
-            watch = partial(_watch, env, curve, out, lambda **told: progress.update(bar, **told))  # noqa: B023
-            network = train_sac(env, SacConfig(env_steps=count), seed=seed, network=network, on_step=watch)
-            save(network, torque_scale, out / "controller.safetensors")
+            config = SacConfig(total_steps=count, rollout_steps=500)
+            sac = Sac(env, actor, config, horizon=LONGEST_STEPS, seed=seed)
+            while not sac.done:
+                sac.iterate()
+                settled = env.steps_since_change > SETTLED_STEPS
+                error = float(env.tracking_error()[settled].mean())
+                curve.append({"torque_scale": torque_scale, "steps": sac.steps, "error_m_s": error})
+                progress.update(bar, completed=sac.steps, note=f"{error:.3f} m/s")
+                save(actor, torque_scale, out / "controller.safetensors")
+                (out / "curve.json").write_text(json.dumps(curve, indent=1))
 
 
-def _watch(
-    env: AntVelocityEnv,
-    curve: list[dict[str, float]],
-    out: Path,
-    tell: Callable[..., None],
-    done: int,
-    network: nn.Sequential,
-) -> None:
-    """Every 32 k steps, note the present tracking error and save the network."""
-    if done % (env.num_envs * 500):
-        return
-    settled = env.steps_since_change > SETTLED_STEPS
-    error = float(env.tracking_error()[settled].mean())
-    curve.append({"torque_scale": env.config.torque_scale, "steps": done, "error_m_s": error})
-    tell(completed=done, note=f"{error:.3f} m/s")
-    save(network, env.config.torque_scale, out / "controller.safetensors")
-    (out / "curve.json").write_text(json.dumps(curve, indent=1))
-
-
-def save(network: nn.Sequential, torque_scale: float, path: Path) -> None:
-    """Write the mean part of a SAC actor as a controller checkpoint."""
-    linears = [layer for layer in network if isinstance(layer, nn.Linear)]
+def save(actor: SoftActor, torque_scale: float, path: Path) -> None:
+    """Write the part of a SAC actor that its mean comes from as a controller checkpoint."""
+    linears = [layer for layer in actor.actor if isinstance(layer, nn.Linear)]
     tensors = {"torque_scale": np.array(torque_scale, dtype=np.float32)}
     for index, layer in enumerate(linears):
         rows = layer.out_features // 2 if layer is linears[-1] else layer.out_features

@@ -18,13 +18,13 @@ from pydantic import Field, model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from astra_data.dataset.pairs import draw_steps
 from astra_data.errors import BadInputError
-from astra_data.models.actor_critic import ActorCritic
 from astra_data.models.history import mlp
+from astra_data.models.policy import Policy
 from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.seeding import derive
 
@@ -110,7 +110,7 @@ class Iql:
         policy: the networks being trained. updates: gradient updates done, of critics and policy.
     """
 
-    def __init__(self, policy: ActorCritic, experience: Experience, config: IqlConfig, *, seed: int) -> None:
+    def __init__(self, policy: Policy, experience: Experience, config: IqlConfig, *, seed: int) -> None:
         """Prepare to train `policy` in place on `experience`, with all randomness from `seed`."""
         self.policy, self.config, self.seed = policy, config, seed
         self.updates = 0
@@ -175,7 +175,7 @@ class Iql:
         loss.backward()
         nn.utils.clip_grad_norm_(self._actor, config.gradient_norm)
         self._optimizer.step()
-        return {"policy": float(loss.detach()), "std": float(self.policy.log_std.detach().exp().mean())}
+        return {"policy": float(loss.detach())}
 
     @torch.no_grad()
     def values(self, observation: Tensor) -> Tensor:
@@ -236,14 +236,14 @@ def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
     return TensorDict(table, batch_size=reward.shape)[whole]
 
 
-def _iql_loss(policy: ActorCritic, experience: Experience, config: IqlConfig) -> IQLLoss:
+def _iql_loss(policy: Policy, experience: Experience, config: IqlConfig) -> IQLLoss:
     observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
     actor = ProbabilisticActor(
         TensorDictModule(
             _Policy(policy), in_keys=["observation", "previous_action"], out_keys=["loc", "scale"]
         ),
         in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
+        distribution_class=TanhNormal if policy.squashes else IndependentNormal,
         distribution_kwargs={"tanh_loc": False},
     )
     loss = IQLLoss(
@@ -272,7 +272,7 @@ class _ActionValue(nn.Module):
 class _Policy(nn.Module):
     """The policy over whole windows (B, T, ...), from an empty memory."""
 
-    def __init__(self, policy: ActorCritic) -> None:
+    def __init__(self, policy: Policy) -> None:
         super().__init__()
         self.policy = policy
 

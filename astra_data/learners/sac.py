@@ -1,167 +1,283 @@
-"""Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss."""
+"""Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
 
-from collections.abc import Callable
+Actor and critics each have a memory of their own, where the policy has one, and learn from windows of recent
+steps, whose first steps only fill the memories; otherwise they learn from single steps. Every iteration seeds
+torch from (seed, iteration), as in `ppo`.
+"""
+
+import copy
+import math
+import time
 from itertools import pairwise
+from typing import Annotated, Any, Self
 
 import torch
+from pydantic import Field, model_validator
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from astra_data.batched import BatchedEnv
-from astra_data.recipe import Config
+from astra_data.learners.replay import Replay
+from astra_data.models.policy import window_features
+from astra_data.models.soft_actor import SoftActor, gaussian
+from astra_data.recipe import Config, Count, Positive, Share
+from astra_data.seeding import derive
 
 
 class SacConfig(Config):
     """Settings of soft actor-critic."""
 
-    env_steps: int = 1_000_000
+    total_steps: Count = 1_000_000
     """Environment steps in all."""
-    updates_per_step: int = 8
+    rollout_steps: Count = 64
+    """Batched steps per iteration."""
+    updates_per_step: Count = 8
     """Gradient updates per batched step."""
-    batch_size: int = 256
-    """Transitions per update."""
-    buffer_size: int = 1_000_000
-    """The most recent transitions that are kept."""
-    hidden_sizes: tuple[int, ...] = (128, 128)
-    """Of actor and critics."""
-    learning_rate: float = 1e-3
+    batch_size: Count = 256
+    """Steps per update."""
+    window: Count = 32
+    """Steps in a row that the steps of an update come in, where the policy has a memory."""
+    burn_in: Annotated[int, Field(ge=0)] = 8
+    """Steps at the start of a window that only fill the memory; none where the episode begins there."""
+    buffer_size: Count = 1_000_000
+    """The most recent steps that are kept."""
+    learning_rate: Positive = 1e-3
     """Of actor, critics and temperature."""
-    discount: float = 0.97
+    discount: Share = 0.97
     """Of the reward, per step."""
-    target_rate: float = 0.005
+    reward_scale: Positive = 1.0
+    """Factor on the reward that the critics learn from."""
+    initial_temperature: Positive = 0.2
+    """Of the entropy in the reward, at the start."""
+    target_rate: Share = 0.005
     """Share by which the target critics follow, per update."""
-    episode_steps: int = 1000
-    """Rows are restarted after so many steps, without ending the task."""
+
+    @model_validator(mode="after")
+    def _leaves_steps_to_learn_from(self) -> Self:
+        if self.burn_in >= self.window:
+            raise ValueError(f"burn_in: expected less than the window of {self.window}, got {self.burn_in}")
+        if self.window > self.batch_size:
+            raise ValueError(f"batch_size: expected a window of {self.window} or more, got {self.batch_size}")
+        return self
 
 
-def actor_network(observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> nn.Sequential:
-    """Build the actor's network: observation (B, O) to location and scale parameters (B, 2A)."""
-    sizes = (observation_size, *hidden_sizes)
-    layers: list[nn.Module] = []
-    for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), nn.ReLU()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * action_size))
+class Sac:
+    """A training in progress.
+
+    Attributes:
+        policy: the actor. steps: environment steps done.
+        world_seconds: the part of the time since the start, or since resuming, that the world took.
+    """
+
+    def __init__(
+        self, env: BatchedEnv, policy: SoftActor, config: SacConfig, *, horizon: int, seed: int
+    ) -> None:
+        """Prepare to train `policy` in `env`.
+
+        Args:
+            env: the world.
+            policy: the actor.
+            config: settings.
+            horizon: rows are restarted after so many steps, without ending the task.
+            seed: of all randomness.
+        """
+        self.env, self.policy, self.config = env, policy, config
+        self.horizon, self.seed = horizon, seed
+        self.steps = 0
+        self.world_seconds = 0.0
+        self._iteration = 0
+        torch.manual_seed(derive(seed, "critics"))
+        device = next(policy.parameters()).device
+        self._loss = _sac_loss(policy, config).to(device)
+        self._memory = policy.shape.new_memory()
+        self._late_memory = copy.deepcopy(self._memory)
+        self._memories = nn.ModuleList(filter(None, (self._memory, self._late_memory))).to(device)
+        self._target = SoftUpdate(self._loss, tau=config.target_rate)
+        learned = [*policy.parameters(), *self._loss.qvalue_network_params.parameters(), self._loss.log_alpha]
+        learned += [] if self._memory is None else self._memory.parameters()
+        self._optimizer = torch.optim.Adam(learned, lr=config.learning_rate)
+        self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
+        self._replay = Replay(config.buffer_size, env, device)
+        torch.manual_seed(derive(seed, "first reset"))
+        self._observation = env.reset()
+        self._previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
+        self._hidden = policy.initial_hidden(env.num_envs)
+        self._first = torch.ones(env.num_envs, dtype=torch.bool, device=device)
+        self._age = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps in all."""
+        return self.config.total_steps
+
+    @property
+    def done(self) -> bool:
+        """Whether all steps are done."""
+        return self.steps >= self.total_steps
+
+    def iterate(self) -> dict[str, float]:
+        """Act for a stretch of steps, and learn after each.
+
+        Returns:
+            "success" of the "episodes" that ended and their mean "episode_steps", NaN where none did; the mean
+            "reward" of a step; the "temperature" of the entropy.
+        """
+        torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
+        finished = succeeded = rewarded = lasted = 0.0
+        for _ in range(self.config.rollout_steps):
+            done, success, reward = self._act()
+            finished += len(done)
+            lasted += float(done.sum())
+            succeeded += float(success.sum())
+            rewarded += float(reward.mean())
+            if len(self._replay) > self._window:
+                for _ in range(self.config.updates_per_step):
+                    self._learn()
+        self.steps += self.env.num_envs * self.config.rollout_steps
+        self._iteration += 1
+        return {
+            "success": succeeded / finished if finished else math.nan,
+            "episodes": finished,
+            "episode_steps": lasted / finished if finished else math.nan,
+            "reward": rewarded / self.config.rollout_steps,
+            "temperature": float(self._loss.log_alpha.detach().exp()),
+        }
+
+    @torch.no_grad()
+    def _act(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Take one step; return the ages of the episodes that ended, successes and rewards (B,)."""
+        features, hidden = self.policy.remember(self._observation, self._previous_action, self._hidden)
+        loc, scale = self.policy.policy(features)
+        action = torch.tanh(torch.normal(loc, scale))
+        began = time.perf_counter()
+        step = self.env.step(action)
+        self.world_seconds += time.perf_counter() - began
+        self._age += 1
+        expired = (self._age >= self.horizon) & ~step.terminated
+        done = step.terminated | expired
+        self._replay.add(
+            observation=self._observation,
+            previous_action=self._previous_action,
+            action=action,
+            reward=step.reward * self.config.reward_scale,
+            terminated=step.terminated,
+            expired=expired,
+            first=self._first,
+        )
+        lasted, going = self._age[done], (~done).float().unsqueeze(-1)
+        self._age = torch.where(done, 0, self._age)
+        self._observation = self.env.reset(done) if bool(done.any()) else step.observation
+        self._previous_action, self._hidden, self._first = action * going, hidden * going, done
+        return lasted, step.success, step.reward
+
+    def _learn(self) -> None:
+        """Update actor, critics and temperature once."""
+        config = self.config
+        steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
+        if not bool(learned.any()):
+            return
+        seen = steps["observation"], steps["previous_action"]
+        acting = window_features(self.policy.memory, *seen)
+        judging = window_features(self._memory, *seen)
+        with torch.no_grad():
+            following = window_features(self._late_memory, *seen)[:, 1:][learned]
+        terminated = steps["terminated"][:, :-1][learned].unsqueeze(-1)
+        table = {
+            "acting": acting[:, :-1][learned],
+            "judging": judging[:, :-1][learned],
+            "action": steps["action"][:, :-1][learned],
+            "next": {
+                "acting": acting[:, 1:][learned].detach(),
+                "judging": following,
+                "reward": steps["reward"][:, :-1][learned].unsqueeze(-1),
+                "terminated": terminated,
+                "done": terminated,
+            },
+        }
+        batch = TensorDict(table, batch_size=[int(learned.sum())])
+        wrong, _ = self._loss.qvalue_v2_loss(batch)
+        # The actor is not to make the critics' memory forget what is bad.
+        costs, told = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
+        total = wrong + costs + self._loss.alpha_loss(told["log_prob"]).mean()
+        self._optimizer.zero_grad()
+        total.backward()
+        self._optimizer.step()
+        self._target.step()
+        if self._memory is not None and self._late_memory is not None:
+            for late, now in zip(self._late_memory.parameters(), self._memory.parameters(), strict=True):
+                late.data.lerp_(now.data, config.target_rate)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything but the environment's own state; see `load_state_dict`."""
+        return {
+            "policy": self.policy.state_dict(),
+            "critics": self._loss.state_dict(),
+            "memories": self._memories.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "replay": self._replay.state_dict(),
+            "steps": self.steps,
+            "iteration": self._iteration,
+            "previous_action": self._previous_action,
+            "hidden": self._hidden,
+            "first": self._first,
+            "age": self._age,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
+        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        self.policy.load_state_dict(state["policy"])
+        self._loss.load_state_dict(state["critics"])
+        self._memories.load_state_dict(state["memories"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._replay.load_state_dict(state["replay"])
+        self.steps, self._iteration = state["steps"], state["iteration"]
+        device = observation.device
+        self._previous_action, self._hidden = state["previous_action"].to(device), state["hidden"].to(device)
+        self._first, self._age = state["first"].to(device), state["age"].to(device)
+        self._observation = observation
+
+
+def _sac_loss(policy: SoftActor, config: SacConfig) -> SACLoss:
+    actor = ProbabilisticActor(
+        TensorDictModule(_Policy(policy), in_keys=["acting"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+    loss = SACLoss(
+        actor,
+        ValueOperator(_Critic(policy), in_keys=["judging", "action"]),
+        num_qvalue_nets=2,
+        loss_function="l2",
+        target_entropy=-float(policy.shape.action_size),
+        alpha_init=config.initial_temperature,
+    )
+    loss.make_value_estimator(gamma=config.discount)
+    return loss
+
+
+class _Policy(nn.Module):
+    def __init__(self, policy: SoftActor) -> None:
+        super().__init__()
+        self.actor = policy.actor
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        return gaussian(self.actor(features))
 
 
 class _Critic(nn.Module):
     """Action values; layer-normalised, which keeps them from diverging at this learning rate."""
 
-    def __init__(self, observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> None:
+    def __init__(self, policy: SoftActor) -> None:
         super().__init__()
-        sizes = (observation_size + action_size, *hidden_sizes)
+        shape = policy.shape
+        sizes = (shape.feature_size + shape.action_size, *shape.hidden_sizes)
         layers: list[nn.Module] = []
         for size_in, size_out in pairwise(sizes):
             layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU()]
         self.network = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
 
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        return torch.as_tensor(self.network(torch.cat([observation, action], dim=-1)))
-
-
-def train_sac(
-    env: BatchedEnv,
-    config: SacConfig,
-    *,
-    seed: int,
-    network: nn.Sequential | None = None,
-    on_step: Callable[[int, nn.Sequential], None] = lambda steps, network: None,
-) -> nn.Sequential:
-    """Train a tanh-Gaussian policy and return its network.
-
-    Args:
-        env: the world to train in.
-        config: settings.
-        seed: of the networks, the noise and the batches.
-        network: an actor to go on from; a new one by default.
-        on_step: called after each batched step with the environment steps done and the actor's network.
-    """
-    torch.manual_seed(seed)
-    network = network or actor_network(env.observation_size, env.action_size, config.hidden_sizes)
-    parameters = NormalParamExtractor(scale_lb=1e-3)
-    actor = ProbabilisticActor(
-        TensorDictModule(
-            nn.Sequential(network, parameters),
-            in_keys=["observation"],
-            out_keys=["loc", "scale"],
-        ),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-        return_log_prob=False,
-    )
-    critic = ValueOperator(
-        _Critic(env.observation_size, env.action_size, config.hidden_sizes),
-        in_keys=["observation", "action"],
-    )
-    loss = SACLoss(
-        actor,
-        critic,
-        num_qvalue_nets=2,
-        loss_function="l2",
-        target_entropy=-float(env.action_size),
-        alpha_init=0.2,
-    )
-    loss.make_value_estimator(gamma=config.discount)
-    target = SoftUpdate(loss, tau=config.target_rate)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
-    buffer = _Buffer(config.buffer_size, env)
-    observation = env.reset()
-    age = torch.zeros(env.num_envs)
-    steps = 0
-    while steps < config.env_steps:
-        with torch.no_grad():
-            action = TanhNormal(*parameters(network(observation))).sample()
-        step = env.step(action)
-        buffer.add(observation, action, step.reward, step.observation, step.terminated)
-        age += 1
-        restart = step.terminated | (age >= config.episode_steps)
-        age[restart] = 0
-        observation = env.reset(restart) if bool(restart.any()) else step.observation
-        steps += env.num_envs
-        for _ in range(config.updates_per_step):
-            losses = loss(buffer.sample(config.batch_size))
-            total = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
-            optimizer.zero_grad()
-            total.backward()
-            optimizer.step()
-            target.step()
-        on_step(steps, network)
-    return network
-
-
-class _Buffer:
-    """The most recent transitions, in contiguous tensors."""
-
-    def __init__(self, capacity: int, env: BatchedEnv) -> None:
-        self._capacity = capacity - capacity % env.num_envs
-        self._columns = {
-            "observation": torch.empty(self._capacity, env.observation_size),
-            "action": torch.empty(self._capacity, env.action_size),
-            "reward": torch.empty(self._capacity, 1),
-            "next_observation": torch.empty(self._capacity, env.observation_size),
-            "terminated": torch.empty(self._capacity, 1, dtype=torch.bool),
-        }
-        self._added = 0
-
-    def add(
-        self, observation: Tensor, action: Tensor, reward: Tensor, following: Tensor, terminated: Tensor
-    ) -> None:
-        start = self._added % self._capacity
-        rows = slice(start, start + len(observation))
-        values = (observation, action, reward[:, None], following, terminated[:, None])
-        for column, value in zip(self._columns.values(), values, strict=True):
-            column[rows] = value
-        self._added += len(observation)
-
-    def sample(self, count: int) -> TensorDict:
-        rows = torch.randint(min(self._added, self._capacity), (count,))
-        batch = {name: column[rows] for name, column in self._columns.items()}
-        following = {
-            "observation": batch.pop("next_observation"),
-            "reward": batch.pop("reward"),
-            "terminated": batch["terminated"],
-            "done": batch.pop("terminated"),
-        }
-        return TensorDict({**batch, "next": following}, batch_size=[count])
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        return torch.as_tensor(self.network(torch.cat([features, action], dim=-1)))

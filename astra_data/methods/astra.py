@@ -9,13 +9,13 @@ from dataclasses import replace
 from astra_data.fitting import HistoryFit
 from astra_data.method import Method
 from astra_data.models.grounding import LossWeights
-from astra_data.training import SimulatorPpo
+from astra_data.training import InSimulator
 
 ASTRA = Method(
     name="astra",
     title="ASTRA",
     fit=HistoryFit(LossWeights(latent=0.1, reward=1.0, state=1.0)),
-    learn=SimulatorPpo(reward="predicted"),
+    learn=InSimulator(reward="predicted"),
     aligns=True,
 )
 
@@ -33,7 +33,7 @@ ASTRA_WITHOUT_REWARD = replace(
     name="astra_without_reward",
     title="ASTRA w/o L_rew",
     fit=HistoryFit(LossWeights(latent=0.1, reward=0.0, state=1.0)),
-    learn=SimulatorPpo(),
+    learn=InSimulator(),
 )
 """Table II, "w/o reward". Without R_pred the policy learns from the task's own reward."""
 
@@ -41,7 +41,7 @@ ASTRA_TASK_REWARD = replace(
     ASTRA,
     name="astra_task_reward",
     title="ASTRA, task reward",
-    learn=SimulatorPpo(reward="abstract"),
+    learn=InSimulator(reward="abstract"),
     grounded_as="astra",
 )
 """The grounding of ASTRA; the policy learns from the task's own reward on corrected states."""

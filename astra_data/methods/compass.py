@@ -25,7 +25,7 @@ from astra_data.replays import Recorded, beginnings, trajectory_gaps
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
-from astra_data.training import SimulatorPpo
+from astra_data.training import InSimulator
 from astra_data.variation import WIDE_RANGES, BallVariation, FactorRange, NoiseRange, Range, Variation
 
 STEERING = (
@@ -239,7 +239,7 @@ COMPASS = Method(name="compass", title="COMPASS", fit=identify, planar=True)
 COMPASS_UNIFORM = Method(
     name="compass_uniform",
     title="COMPASS, uniform",
-    learn=SimulatorPpo(variation=WIDE_RANGES),
+    learn=InSimulator(variation=WIDE_RANGES),
     planar=True,
 )
 """COMPASS as the paper describes it: every episode draws its parameters from the ranges."""

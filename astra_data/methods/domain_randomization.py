@@ -4,12 +4,12 @@ The paper's N(0, 0.05) is read as a standard deviation of 0.05 m/s; δ is drawn 
 """
 
 from astra_data.method import Method
-from astra_data.training import SimulatorPpo
+from astra_data.training import InSimulator
 from astra_data.variation import RANDOMIZED_ACTIONS
 
 DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",
     title="Domain randomization",
-    learn=SimulatorPpo(variation=RANDOMIZED_ACTIONS),
+    learn=InSimulator(variation=RANDOMIZED_ACTIONS),
     planar=True,
 )

@@ -18,6 +18,7 @@ from astra_data.learners.iql import FINE_TUNING, Experience, Iql, IqlConfig
 from astra_data.method import Method
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.history import PositionFeatures
+from astra_data.models.policy import Policy
 from astra_data.policy_file import PolicyFile
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
@@ -51,7 +52,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
             memory_size=training.config.memory_size,
             hidden_sizes=training.config.hidden_sizes,
         )
-        policy = ActorCritic(shape).to(training.device)
+        policy: Policy = ActorCritic(shape).to(training.device)
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
     curve = _optimise(Iql(policy, experience, config, seed=training.seed), training)

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from astra_data.errors import BadInputError
 from astra_data.learners.ppo import Ppo
 from astra_data.learners.rma import Adaptation, RmaConfig
 from astra_data.method import Method
@@ -19,16 +20,18 @@ from astra_data.models.adaptation import AdaptiveShape, Teacher
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import part
 from astra_data.seeding import derive
-from astra_data.training import SimulatorPpo, Training, optimise
+from astra_data.training import InSimulator, PpoTrainConfig, Training, optimise
 
 
 @dataclass(frozen=True)
-class TeacherThenStudent(SimulatorPpo):
+class TeacherThenStudent(InSimulator):
     """Train a teacher by PPO, told the parameters of its simulator, then a student that estimates them."""
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the student, and the teacher's learning curve with the student's as "adaptation"."""
         config, seed = training.config, training.seed
+        if not isinstance(config, PpoTrainConfig):
+            raise BadInputError(f'rma: expected train.learner "ppo", got "{config.learner}"')
         settings = training.settings if isinstance(training.settings, RmaConfig) else RmaConfig()
         told = replace(self, variation=training.task.planar.ranges)
         env, simulation = told.world(training, tells_parameters=True)

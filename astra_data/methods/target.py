@@ -1,8 +1,8 @@
 """Target and Full Obs: policies trained in the target on φ(s), or on the complete state (Section V-A)."""
 
 from astra_data.method import Method
-from astra_data.target_training import TargetPpo
+from astra_data.target_training import InTarget
 
-TARGET = Method(name="target", title="Target", learn=TargetPpo("abstract"))
+TARGET = Method(name="target", title="Target", learn=InTarget("abstract"))
 
-FULL_OBS = Method(name="full_obs", title="Full Obs", learn=TargetPpo("full"), table="target")
+FULL_OBS = Method(name="full_obs", title="Full Obs", learn=InTarget("full"), table="target")

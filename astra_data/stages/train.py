@@ -14,13 +14,13 @@ from astra_data.recipe import Config, as_json
 from astra_data.results.provenance import origin
 from astra_data.stopwatch import Stopwatch
 from astra_data.tasks import task_named
-from astra_data.training import TrainConfig, Training
+from astra_data.training import PpoTrainConfig, SacTrainConfig, Training
 
 
 def train(
     task: str,
     method: str,
-    config: TrainConfig,
+    config: PpoTrainConfig | SacTrainConfig,
     *,
     settings: Config | None = None,
     dataset: Path,

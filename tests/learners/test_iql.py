@@ -9,6 +9,7 @@ from astra_data.checkpoint import flatten, unflatten
 from astra_data.errors import BadInputError
 from astra_data.learners.iql import Experience, Iql, IqlConfig, transitions
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.policy import Policy
 
 QUICK = IqlConfig(
     critic_updates=300,
@@ -68,12 +69,12 @@ def trained(iql: Iql) -> Iql:
     return iql
 
 
-def mean_action(policy: ActorCritic) -> Tensor:
+def mean_action(policy: Policy) -> Tensor:
     """Return what the policy does at 0.1 to 0.7, with nothing remembered."""
     place = torch.linspace(0.1, 0.7, 7).unsqueeze(-1)
     with torch.no_grad():
         features, _ = policy.remember(place, torch.zeros(7, 1), policy.initial_hidden(7))
-        return policy.policy(features)[0][:, 0]
+        return policy.act(features)[:, 0]
 
 
 @pytest.mark.parametrize("memory", [0, 8])
@@ -166,7 +167,7 @@ def test_the_policy_rests_while_the_critics_learn() -> None:
     for _ in range(5):
         assert iql.iterate().keys() == {"value", "action_value"}
     assert all(map(torch.equal, before, iql.policy.parameters()))
-    assert iql.iterate().keys() == {"policy", "std"}
+    assert iql.iterate().keys() == {"policy"}
     assert not all(map(torch.equal, before, iql.policy.parameters()))
 
 

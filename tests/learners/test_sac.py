@@ -1,46 +1,124 @@
+from typing import Any
+
+import pytest
 import torch
-from torch import nn
-from toy_worlds import GoToZero
+from tensordict import TensorDict
+from toy_worlds import ConstantReward, GoToZero, Recall
 
-from astra_data.learners.sac import SacConfig, _Buffer, actor_network, train_sac
+from astra_data.batched import BatchedEnv
+from astra_data.checkpoint import flatten, unflatten
+from astra_data.learners.sac import Sac, SacConfig
+from astra_data.models.policy import PolicyShape
+from astra_data.models.soft_actor import SoftActor
 
-CONFIG = SacConfig(
-    env_steps=2400, updates_per_step=3, batch_size=64, hidden_sizes=(32, 32), episode_steps=20, discount=0.9
-)
+
+def sac(
+    env: BatchedEnv,
+    steps: int,
+    *,
+    horizon: int,
+    memory: int = 0,
+    **settings: Any,  # noqa: ANN401
+) -> Sac:
+    usual = {"rollout_steps": 10, "updates_per_step": 3, "batch_size": 64, "discount": 0.9}
+    config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
+    torch.manual_seed(0)
+    shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32, 32))
+    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1)
 
 
-def distance_after(network: nn.Sequential, steps: int) -> float:
-    """Return how far from 0 the policy's mean action leaves points that start at ±1."""
-    place = torch.tensor([[-1.0], [1.0]])
+def train(learner: Sac) -> list[dict[str, float]]:
+    metrics = []
+    while not learner.done:
+        metrics.append(learner.iterate())
+    return metrics
+
+
+def distance_after(policy: SoftActor, steps: int) -> float:
+    """Return how far from 0 the policy's likeliest action leaves points that start at ±1."""
+    place, hidden = torch.tensor([[-1.0], [1.0]]), policy.initial_hidden(2)
+    action = torch.zeros(2, 1)
     with torch.no_grad():
         for _ in range(steps):
-            action = torch.tanh(network(place)[:, :1])
+            features, hidden = policy.remember(place, action, hidden)
+            action = policy.act(features)
             place = (place + 0.2 * action).clamp(-1.0, 1.0)
     return float(place.abs().max())
 
 
-def test_learns_to_go_to_a_target() -> None:
-    torch.manual_seed(0)
-    start = actor_network(1, 1, (32, 32))
-    assert distance_after(start, 10) > 0.5
-    told: list[int] = []
-    network = train_sac(
-        GoToZero(16), CONFIG, seed=0, network=start, on_step=lambda steps, _: told.append(steps)
+@pytest.mark.parametrize("memory", [0, 8])
+def test_learns_to_go_to_a_target(memory: int) -> None:
+    learner = sac(GoToZero(16), 150, horizon=20, memory=memory, window=8, burn_in=2, batch_size=128)
+    assert distance_after(learner.policy, 10) > 0.5
+    metrics = train(learner)
+    assert distance_after(learner.policy, 10) < 0.15
+    assert learner.steps == 150 * 16
+    assert metrics[-1]["reward"] > metrics[0]["reward"]
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
+    # The replay has wrapped around by then.
+    settings = {"horizon": 7, "memory": memory, "window": 6, "burn_in": 2, "buffer_size": 8 * 25}
+    whole = sac(GoToZero(8), 60, **settings)
+    train(whole)
+    world, other_world = GoToZero(8), GoToZero(8)
+    begun = sac(world, 60, **settings)
+    for _ in range(3):
+        begun.iterate()
+    saved = _cloned({"sac": begun.state_dict(), "world": world.state_dict()})
+    begun.iterate()  # goes on elsewhere; must not reach into what was saved
+    resumed = sac(other_world, 60, **settings)
+    resumed.load_state_dict(saved["sac"], other_world.load_state_dict(saved["world"]))
+    assert resumed.steps == whole.steps / 2
+    train(resumed)
+    for name, value in whole.policy.state_dict().items():
+        assert torch.equal(value, resumed.policy.state_dict()[name]), name
+
+
+def _cloned(state: dict[str, Any]) -> dict[str, Any]:
+    return unflatten({name: tensor.clone() for name, tensor in flatten(state).items()})
+
+
+@pytest.mark.parametrize(("terminates_after", "expected"), [(float("inf"), 10.0), (10.0, 5.26)])
+def test_running_out_of_time_bootstraps_and_ending_does_not(terminates_after: float, expected: float) -> None:
+    """One unit each step is worth 1 / (1 - 0.9) = 10; where a tenth of like steps are the last, 1 / 0.19."""
+    horizon = 10 if terminates_after > 10 else 1000
+    env = ConstantReward(16, terminates_after)
+    learner = sac(
+        *(env, 400),
+        horizon=horizon,
+        target_rate=0.05,
+        initial_temperature=1e-6,
+        learning_rate=3e-3,
     )
-    assert network is start
-    assert distance_after(network, 10) < 0.15
-    assert told == list(range(16, 2400 + 16, 16))
+    train(learner)
+    loss = learner._loss
+    state = TensorDict({"judging": torch.ones(1, 1), "action": torch.zeros(1, 1)}, batch_size=[1])
+    with torch.no_grad(), loss.qvalue_network_params[0].to_module(loss.qvalue_network):
+        value = float(loss.qvalue_network(state)["state_action_value"])
+    assert value == pytest.approx(expected, rel=0.12)
 
 
-def test_the_buffer_keeps_the_most_recent() -> None:
-    buffer = _Buffer(70, GoToZero(16))
-    for batch in range(9):
-        values = torch.full((16,), float(batch))
-        buffer.add(values[:, None], -values[:, None], 10 * values, values[:, None] + 1, values > 6)
-    drawn = buffer.sample(2000)
-    observation = drawn["observation"]
-    assert sorted(set(observation.flatten().tolist())) == [5.0, 6.0, 7.0, 8.0]
-    assert torch.equal(drawn["action"], -observation)
-    assert torch.equal(drawn["next", "reward"], 10 * observation)
-    assert torch.equal(drawn["next", "observation"], observation + 1)
-    assert torch.equal(drawn["next", "terminated"], observation > 6)
+def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
+    settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 192}
+    with_memory = train(sac(Recall(32), 300, memory=8, **settings))
+    without = train(sac(Recall(32), 300, **settings))
+    # An episode of three steps is worth at most 1.
+    assert 3 * with_memory[-1]["reward"] > 0.7
+    assert 3 * without[-1]["reward"] < 0.3
+
+
+def test_metrics_count_finished_episodes() -> None:
+    metrics = sac(ConstantReward(4, 8.0), 16, rollout_steps=16, horizon=10**6).iterate()
+    assert metrics["episodes"] == 4 * 16 / 8
+    assert metrics["episode_steps"] == 8
+    assert metrics["success"] == 1.0
+    assert metrics["reward"] == pytest.approx(1.0)
+
+
+def test_a_window_has_to_hold_steps_to_learn_from() -> None:
+    with pytest.raises(ValueError, match=r"burn_in: expected less than the window of 8, got 8"):
+        SacConfig(window=8, burn_in=8)
+    with pytest.raises(ValueError, match=r"batch_size: expected a window of 32 or more, got 16"):
+        SacConfig(batch_size=16)

@@ -16,7 +16,7 @@ from astra_data.models.grounding import Windows
 from astra_data.policy_file import PolicyFile, deploy
 from astra_data.progress import Progress, silent
 from astra_data.tasks import TASKS
-from astra_data.training import TrainConfig, Training
+from astra_data.training import PpoTrainConfig, Training
 
 TASK = TASKS["antmaze-umaze"]
 STEPS = 30
@@ -79,7 +79,7 @@ def learn(episodes: PairedEpisodes, tmp_path: Path) -> Learn:
         return learn_from_episodes(
             Training(
                 task=TASK,
-                config=TrainConfig(memory_size=8, hidden_sizes=(16,)),
+                config=PpoTrainConfig(memory_size=8, hidden_sizes=(16,)),
                 settings=CONFIG.model_copy(update=settings),
                 episodes=episodes,
                 grounding=None,

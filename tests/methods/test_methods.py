@@ -6,7 +6,7 @@ from astra_data.figures.style import SPARE_COLOURS
 from astra_data.fitting import HistoryFit
 from astra_data.methods import METHODS, method_named
 from astra_data.models.grounding import LossWeights
-from astra_data.training import SimulatorPpo
+from astra_data.training import InSimulator
 
 
 def weights(name: str) -> LossWeights | None:
@@ -16,7 +16,7 @@ def weights(name: str) -> LossWeights | None:
 
 def reward(name: str) -> str:
     learn = METHODS[name].learn
-    assert isinstance(learn, SimulatorPpo)
+    assert isinstance(learn, InSimulator)
     return learn.reward
 
 

@@ -13,7 +13,7 @@ from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress, silent
 from astra_data.stages.train import train
 from astra_data.tasks import TASKS
-from astra_data.training import TrainConfig
+from astra_data.training import PpoTrainConfig
 
 SWITCHES = {
     "topple": True,
@@ -31,7 +31,7 @@ def make(
     dataset: Path,
     grounding: Path | None,
     out: Path,
-    config: TrainConfig = TRAIN,
+    config: PpoTrainConfig = TRAIN,
     progress: Progress = silent,
 ) -> bytes:
     inputs = {"dataset": dataset, "grounding": grounding, "settings": RMA if method == "rma" else None}

@@ -24,6 +24,7 @@ from astra_data.recipe import load_recipe
 from astra_data.request import Recipe
 from astra_data.simulators import simulator_of
 from astra_data.tasks import TASKS
+from astra_data.training import PpoTrainConfig
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "antmaze_long.toml"
 SINGLE_WORLDS = 16
@@ -48,6 +49,7 @@ def main(algorithm: Algorithm, face: Face) -> None:
     torch.set_num_threads(1)
     settings = load_recipe(RECIPE, Recipe)
     task, config = TASKS[settings.task], settings.train
+    assert isinstance(config, PpoTrainConfig)
     shape = GroundingShape(state_size=4, action_size=2, goal_size=2)
     model = GroundingModel(shape).requires_grad_(False) if algorithm is Algorithm.ppo else None
     horizon = task.objective.horizon
