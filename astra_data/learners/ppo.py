@@ -88,6 +88,7 @@ class Ppo:
         self._start = torch.ones(env.num_envs, device=device)
         # Staggered ages: restarts by the horizon do not all fall into one iteration.
         self._age = torch.randint(horizon, (env.num_envs,), device=device)
+        self._lasted = torch.zeros_like(self._age)
 
     @property
     def total_steps(self) -> int:
@@ -103,8 +104,8 @@ class Ppo:
         """Collect one stretch and learn from it.
 
         Returns:
-            "success" of the "episodes" that ended, wherever in the task they began, NaN where none did; the
-            mean "reward" of a step; the mean "std" of the actions.
+            "success" of the "episodes" that ended, wherever in the task they began, and their mean
+            "episode_steps", NaN where none did; the mean "reward" of a step; the mean "std" of the actions.
         """
         torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
         share_left = 1.0 - self.steps / self.total_steps
@@ -121,7 +122,7 @@ class Ppo:
     def _collect(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         env, policy = self.env, self.policy
         columns: dict[str, list[Tensor]] = {}
-        finished = succeeded = rewarded = 0.0
+        finished = succeeded = lasted = rewarded = 0.0
         first_hidden = self._hidden.clone()
         for _ in range(self.config.rollout_steps):
             row = {
@@ -137,6 +138,7 @@ class Ppo:
             step = env.step(action)
             self.world_seconds += time.perf_counter() - began
             self._age += 1
+            self._lasted += 1
             expired = (self._age >= self.horizon) & ~step.terminated
             done = step.terminated | expired
             value = policy.value(features)
@@ -157,8 +159,9 @@ class Ppo:
                 columns.setdefault(name, []).append(values)
             finished += float(done.sum())
             succeeded += float(step.success.sum())
+            lasted += float(self._lasted[done].sum())
             rewarded += float(step.reward.mean())
-            self._age = torch.where(done, 0, self._age)
+            self._age, self._lasted = (torch.where(done, 0, steps) for steps in (self._age, self._lasted))
             self._observation = env.reset(done) if bool(done.any()) else step.observation
             self._previous_action = executed * (~done).unsqueeze(-1)
             self._hidden = hidden
@@ -179,6 +182,7 @@ class Ppo:
         rollout |= {"advantage": advantage, "value_target": target, "hidden": first_hidden}
         return rollout, {
             "success": succeeded / finished if finished else math.nan,
+            "episode_steps": lasted / finished if finished else math.nan,
             "episodes": finished,
             "reward": rewarded / self.config.rollout_steps,
         }
@@ -215,6 +219,7 @@ class Ppo:
             "hidden": self._hidden,
             "start": self._start,
             "age": self._age,
+            "lasted": self._lasted,
         }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
@@ -225,6 +230,7 @@ class Ppo:
         device = observation.device
         self._previous_action, self._hidden = state["previous_action"].to(device), state["hidden"].to(device)
         self._start, self._age = state["start"].to(device), state["age"].to(device)
+        self._lasted = state["lasted"].to(device)
         self._observation = observation
 
 

@@ -98,14 +98,23 @@ def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
 def test_metrics_count_finished_episodes() -> None:
     metrics = ppo(ConstantReward(4, 8.0), 1, horizon=10**6).iterate()
     assert metrics["episodes"] == 4 * 16 / 8
-    assert metrics["success"] == 1.0
+    assert (metrics["success"], metrics["episode_steps"]) == (1.0, 8.0)
     assert metrics["reward"] == pytest.approx(1.0)
+
+
+def test_who_is_restarted_early_at_first_lasted_as_long_as_it_did() -> None:
+    learner = ppo(ConstantReward(64, math.inf), 2, horizon=8)
+    first, second = learner.iterate(), learner.iterate()
+    # Of ages from 0 to 7, all end once by the eighth step, and then every eight.
+    assert first["episodes"] == pytest.approx(128, abs=32)
+    assert second["episodes"] == 128
+    assert 4 < first["episode_steps"] < 8 == second["episode_steps"]
 
 
 def test_without_finished_episodes_success_is_unknown() -> None:
     metrics = ppo(ConstantReward(4, math.inf), 1, horizon=10**6).iterate()
     assert metrics["episodes"] == 0
-    assert math.isnan(metrics["success"])
+    assert math.isnan(metrics["success"]) and math.isnan(metrics["episode_steps"])
     assert metrics["reward"] == pytest.approx(1.0)
 
 

@@ -55,7 +55,7 @@ def test_the_artefact_is_complete(trained: Path) -> None:
     curve = json.loads((trained / "curve.json").read_text())
     assert {"git_commit", "packages", "machine"} <= curve.keys()
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
-    assert curve["points"][0].keys() == {"steps", "success", "episodes", "reward", "std"}
+    assert curve["points"][0].keys() == {*("steps", "success", "episode_steps", "episodes", "reward", "std")}
     policy = PolicyFile.load(trained / "policy.safetensors")
     assert policy.dataset == "antmaze-short-random-seed0@data-2.0.0"
     assert policy.policy.memory is None
