@@ -3,7 +3,7 @@
 The house, from the ground up; a file uses only what is below it or beside it, never what is above:
 
 words       errors  extras  columns  layouts  seeding  recipe  rows  batched  simulator  progress  statistics
-            digest  lock  cores  stopwatch
+            digest  lock  cores  stopwatch  score
 knowledge   geometry  mazes  free_space  objective  navigation  ant  physics  abstraction  checkpoint  models/
             recording  import_mapping  conversion  variation  planar  free_states  ball  kicking  nao/
             humanoid/

@@ -9,6 +9,7 @@ from rich.table import Table
 from astra_data.figures import method_title
 from astra_data.request import Point
 from astra_data.schedule import Item
+from astra_data.score import Score
 
 DOING = {
     "collect": "collecting",
@@ -28,7 +29,8 @@ class Board:
     Args:
         points: in the order of the table.
         items: every artefact that they need, finished or not.
-        success: of the points that are finished.
+        score: what is told of a point that is finished.
+        means: over the episodes of those that are.
         to_do: keys of the items that are not finished.
     """
 
@@ -36,14 +38,15 @@ class Board:
         self,
         points: Collection[Point],
         items: Collection[Item],
-        success: Mapping[Point, float],
+        score: Score,
+        means: Mapping[Point, float],
         to_do: Collection[str],
     ) -> None:
         """Begin with nothing running."""
         by_key = {item.key: item for item in items}
         self._points = tuple(points)
         self._needs = {point: frozenset(needed(point.key, by_key)) for point in points}
-        self._success = dict(success)
+        self._score, self._means = score, dict(means)
         self._to_do = set(to_do) - {"report"}
         self._running: dict[str, tuple[float, float]] = {}
         self._failed: set[str] = set()
@@ -69,14 +72,14 @@ class Board:
         self._running.pop(key, None)
         self._failed.add(key)
 
-    def done(self, point: Point, success: float) -> None:
-        """Note the success of a point whose evaluation is finished."""
-        self._success[point] = success
+    def done(self, point: Point, mean: float) -> None:
+        """Note the score of a point whose evaluation is finished."""
+        self._means[point] = mean
 
     def state(self, point: Point) -> str:
         """Say what the point is at, such as "training 43 %" or "done 0.72"."""
-        if point in self._success:
-            return f"done {self._success[point]:.2f}"
+        if point in self._means:
+            return f"done {self._score.text(self._means[point])}"
         if not self._failed.isdisjoint(self._needs[point]):
             return "failed"
         running = [key for key in self._running if key in self._needs[point]]
@@ -91,7 +94,7 @@ class Board:
         """Say how many points are done, and how long the others may take."""
         left = self._seconds_left()
         when = "" if left is None else f", {_duration(left)} left"
-        return f"{len(self._success)} of {len(self._points)} points{when}"
+        return f"{len(self._means)} of {len(self._points)} points{when}"
 
     def __rich__(self) -> Table:
         """Draw methods by sizes, or by seeds where there are no sizes."""
@@ -114,10 +117,10 @@ class Board:
         states = [self.state(point) for point in points]
         if len(points) == 1:
             return states[0]
-        success = [self._success[point] for point in points if point in self._success]
-        lines = [f"{len(success)} of {len(points)} done"]
-        if success:
-            lines[0] += f" {sum(success) / len(success):.2f}"
+        means = [self._means[point] for point in points if point in self._means]
+        lines = [f"{len(means)} of {len(points)} done"]
+        if means:
+            lines[0] += f" {self._score.text(sum(means) / len(means))}"
         lines += [state for state in states if not state.startswith(("done", "waiting"))][:1]
         return "\n".join(lines)
 

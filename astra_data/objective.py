@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.mazes import Maze
+from astra_data.score import RETURN, SUCCESS, SURVIVED_STEPS, Score
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,11 @@ class Objective(ABC):
     horizon: int = field(kw_only=True)
     success_reward: float = field(default=10.0, kw_only=True)
     failure_reward: float = field(default=-10.0, kw_only=True)
+
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """What rows are compared by, as in the paper, the headline first."""
+        return (SURVIVED_STEPS, RETURN) if self.is_lasting else (SUCCESS,)
 
     @abstractmethod
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from astra_data.methods.compass import CompassConfig
 from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.recipe import Config, Count, did_you_mean
 from astra_data.rows import PLUS, base_method, is_plus, place
+from astra_data.score import Score
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.augment import AugmentConfig
 from astra_data.stages.collect import CollectConfig
@@ -111,6 +112,11 @@ class Recipe(Config):
         return self.model_dump(mode="json")
 
     @property
+    def headline(self) -> Score:
+        """What its rows are compared by above all."""
+        return TASKS[self.task].objective.scores[0]
+
+    @property
     def compass_uniform(self) -> Variation:
         """What `compass_uniform` varies."""
         return self.compass.ranges_for(TASKS[self.task])
@@ -160,6 +166,7 @@ class Recipe(Config):
             "collect.clearance_m": self.collect.clearance_m > 0,
             "train.support_penalty": self.train.support_penalty > 0,
             "plus.support_penalty": self.plus.support_penalty > 0,
+            "report.paper_success": bool(self.report.paper_success),
         }
         faults += [setting for setting, is_asked in asked.items() if is_asked]
         if faults:

@@ -1,7 +1,8 @@
 """How a few seeds are summarised: mean and spread, interquartile mean, intervals, comparisons, correlations.
 
 Follows "Deep reinforcement learning at the edge of the statistical precipice" (Agarwal et al., 2021) by means
-of its own library, rliable. One score per seed and task; resampling is over seeds, within each task.
+of its own library, rliable. One score per seed and task, in any unit that all tasks share; resampling is over
+seeds, within each task.
 """
 
 from collections.abc import Callable, Iterator, Sequence

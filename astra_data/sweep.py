@@ -35,7 +35,7 @@ TIMED = {
 """Stages that work for few points, and the file that tells how long they took."""
 
 COLUMNS = (
-    *("method", "percent", "seed", "success", "return", "failed", "simulated_success"),
+    *("method", "percent", "seed", "success", "steps", "return", "failed", "simulated_success"),
     *("dataset_version", "dataset_hash", "commit", "wall_seconds"),
 )
 
@@ -113,6 +113,7 @@ class Table:
     def __init__(self, experiment: Experiment) -> None:
         """Look at all points of the recipe, whichever are made now."""
         recipe, self.experiment, self.folder = experiment.recipe, experiment, experiment.folder
+        self.headline = recipe.headline
         self._points = Part.of(recipe).points()
         self._items = {item.key: item for item in plan(recipe, experiment.path, self.folder)}
         self._lines: dict[Point, dict[str, Any]] = {}
@@ -147,6 +148,7 @@ class Table:
             "percent": WHOLE if point.percent is None else point.percent,
             "seed": point.seed,
             "success": means["success"],
+            "steps": means["steps"],
             "return": means["return"],
             "failed": means["failed"],
             "simulated_success": None if simulated is None else simulated.means()["success"],
@@ -167,9 +169,10 @@ def _shown(
     console: Console,
 ) -> Iterator[Watcher]:
     """Show the points above the running items, and keep the table."""
-    success = {point: line["success"] for point, line in table.write().items() if point in set(points)}
+    lines = table.write().items()
+    means = {point: line[table.headline.measure] for point, line in lines if point in set(points)}
     to_do = [item.key for item in items if not finished(item, table.experiment)]
-    board = Board(points, items, success, to_do)
+    board = Board(points, items, table.headline, means, to_do)
     with display(total, console, above=board) as watch:
         yield _PointWatcher(watch, board, {point.key: point for point in points}, table, log, console)
 
@@ -203,7 +206,7 @@ class _PointWatcher:
         if key in self._points:
             point = self._points[key]
             line = self._table.write()[point]
-            self._board.done(point, line["success"])
+            self._board.done(point, line[self._table.headline.measure])
             told = f"{key}  {self._board.state(point)}  ({self._board.whole()})"
             self._console.print(told, markup=False, highlight=False, soft_wrap=True)
             if self._log:

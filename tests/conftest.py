@@ -6,6 +6,8 @@ import fake_stages
 import pytest
 from pydantic import create_model
 
+from astra_data.score import SUCCESS
+
 if TYPE_CHECKING:
     from astra_data.request import Recipe
 
@@ -26,7 +28,8 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     experiment = importlib.import_module("astra_data.experiment")
     for module in (plan, request, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
-    monkeypatch.setattr(request, "TASKS", {"maze": SimpleNamespace(plane=object())})
+    task = SimpleNamespace(plane=object(), objective=SimpleNamespace(scores=(SUCCESS,)))
+    monkeypatch.setattr(request, "TASKS", {"maze": task})
     monkeypatch.setattr("astra_data.experiment.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)

@@ -6,6 +6,7 @@ from rich.console import Console
 from astra_data.board import Board
 from astra_data.request import Point
 from astra_data.schedule import Item
+from astra_data.score import SUCCESS, SURVIVED_STEPS
 
 
 def items(*points: Point) -> list[Item]:
@@ -25,7 +26,7 @@ def drawn(board: Board) -> str:
 def test_a_point_is_at_the_last_stage_that_works_for_it() -> None:
     nas, astra = Point("nas", 0), Point("astra", 0)
     planned = items(nas, astra)
-    board = Board([nas, astra], planned, {}, [item.key for item in planned])
+    board = Board([nas, astra], planned, SUCCESS, {}, [item.key for item in planned])
     assert board.state(nas) == "waiting"
     board.started("pair/seed_0")
     board.progressed("pair/seed_0", 0.5)
@@ -46,12 +47,15 @@ def test_with_sizes_a_cell_tells_of_all_seeds() -> None:
     points = [Point("nas", seed, percent) for percent in (25, 50) for seed in (0, 1, 2)]
     planned = items(*points)
     success = {points[0]: 0.5, points[1]: 0.7}
-    board = Board(points, planned, success, [point.key for point in points[2:]])
+    board = Board(points, planned, SUCCESS, success, [point.key for point in points[2:]])
     board.started("evaluate/nas/percent_025/seed_2")
     shown = drawn(board)
     assert "2 of 6 points" in shown
     assert "2 of 3 done 0.60" in shown and "evaluating 0 %" in shown
     assert "0 of 3 done" in shown
+    steps = Board(points, planned, SURVIVED_STEPS, {points[0]: 62.6, points[1]: 70.0}, [])
+    assert steps.state(points[0]) == "done 63"
+    assert "2 of 3 done 66" in drawn(steps)
 
 
 def test_the_time_left_follows_from_the_work_done_and_its_speed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,7 +63,9 @@ def test_the_time_left_follows_from_the_work_done_and_its_speed(monkeypatch: pyt
     monkeypatch.setattr("astra_data.board.time.monotonic", lambda: now)
     points = [Point("nas", seed) for seed in range(4)]
     planned = items(*points)[1:]
-    board = Board(points, [Item("pair/seed_0", (), print), *planned], {}, [item.key for item in planned])
+    board = Board(
+        points, [Item("pair/seed_0", (), print), *planned], SUCCESS, {}, [item.key for item in planned]
+    )
     assert board.whole() == "0 of 4 points"
     # Two at a time: 4 trainings of 1000 s and 4 evaluations of 200 s take 40 min; a quarter is done.
     for seed in (0, 1):
@@ -85,6 +91,6 @@ def test_the_time_left_follows_from_the_work_done_and_its_speed(monkeypatch: pyt
 def test_an_item_may_fail_before_it_has_begun() -> None:
     nas = Point("nas", 0)
     planned = items(nas)
-    board = Board([nas], planned, {}, [item.key for item in planned])
+    board = Board([nas], planned, SUCCESS, {}, [item.key for item in planned])
     board.failed("pair/seed_0")
     assert board.state(nas) == "failed"

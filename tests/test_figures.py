@@ -21,11 +21,12 @@ from astra_data.figures import (
     open_loop_error,
     png,
     predictive_validity,
-    success_bars,
+    score_bars,
     trajectories,
 )
 from astra_data.figures.style import COLOURS, DEPLOYED, SIMULATED
 from astra_data.mazes import U_MAZE
+from astra_data.score import SUCCESS, SURVIVED_STEPS
 
 ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "astra_plus", "follower")
 
@@ -80,7 +81,7 @@ def test_success_bars_show_bars_seeds_and_intervals() -> None:
         "astra_plus": (0.8, np.nan, np.nan),
         "follower": (1.0, np.nan, np.nan),
     }
-    figure = success_bars(scores, intervals, {"nas": 0.9, "astra_plus": 0.95})
+    figure = score_bars(SUCCESS, scores, intervals, {"nas": 0.9, "astra_plus": 0.95})
     axes = figure.axes[0]
     assert [bar.get_width() for bar in axes.patches] == [0.3, 0.8, 1.0]  # type: ignore[attr-defined]
     assert [bool(bar.get_hatch()) for bar in axes.patches] == [False, True, False]
@@ -97,6 +98,21 @@ def test_success_bars_show_bars_seeds_and_intervals() -> None:
     assert "in its own simulator" in legend(figure)
 
 
+def test_survived_steps_have_no_limit_and_no_decimals() -> None:
+    steps = {"nas": np.array([63.0, 61.4]), "astra": np.array([310.0])}
+    intervals = {"nas": (62.2, 61.4, 63.0), "astra": (310.0, np.nan, np.nan)}
+    axes = score_bars(SURVIVED_STEPS, steps, intervals, {"astra": 1000.0}).axes[0]
+    left, right = axes.get_xlim()
+    assert left == 0 and 1000 < right < 1100
+    assert axes.get_xlabel() == "number of survived steps in the target"
+    assert [text.get_text() for text in axes.texts] == ["62", "310"]
+    curve = Curve(np.array([0.0, 100.0]), np.array([20.0, 400.0]))
+    figure = learning_curves(SURVIVED_STEPS, {"nas": [curve]})
+    low, high = figure.axes[0].get_ylim()
+    assert low == 0 and 400 < high < 450
+    assert figure.get_supylabel() == "survived steps of training episodes, from all starts"
+
+
 def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
     curves = {
         "nas": [
@@ -106,7 +122,7 @@ def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
         "nas_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
         "astra_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
     }
-    figure = learning_curves(curves)
+    figure = learning_curves(SUCCESS, curves)
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["NAS", "ASTRA"]
     first, second = figure.axes
     assert legend(figure) == ["without the [plus] settings", "with them"]
@@ -122,11 +138,11 @@ def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
 def test_many_rows_get_a_panel_each_and_readable_bars() -> None:
     rows = [f"method_{number}" for number in range(14)]
     curve = Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))
-    figure = learning_curves({row: [curve] for row in rows})
+    figure = learning_curves(SUCCESS, {row: [curve] for row in rows})
     drawn = [axes for axes in figure.axes if axes.axison]
     assert [axes.get_title(loc="left") for axes in drawn] == [f"Method {number}" for number in range(14)]
     assert not figure.legends
-    bars = success_bars(dict.fromkeys(rows, np.ones(10)), dict.fromkeys(rows, (1.0, 0.9, 1.0)), {})
+    bars = score_bars(SUCCESS, dict.fromkeys(rows, np.ones(10)), dict.fromkeys(rows, (1.0, 0.9, 1.0)), {})
     bars.draw_without_rendering()
     labels = [label.get_window_extent() for label in bars.axes[0].get_yticklabels()]
     assert all(upper.y0 > lower.y1 for upper, lower in pairwise(labels))
@@ -203,7 +219,7 @@ def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     before = dict(matplotlib.rcParams)
-    image = png(success_bars({"nas": np.array([0.5])}, {"nas": (0.5, np.nan, np.nan)}, {}))
+    image = png(score_bars(SUCCESS, {"nas": np.array([0.5])}, {"nas": (0.5, np.nan, np.nan)}, {}))
     assert image.startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
 
@@ -227,7 +243,7 @@ def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
     # One size has a seed less than the others.
     scores = {"nas": [np.array([0.6, 0.8]), np.array([0.2]), np.array([0.7, 0.9])]}
     intervals = {"nas": np.array([[0.7, 0.1, 0.8], [0.6, 0.0, 0.7], [0.8, 0.3, 0.9]])}
-    figure = data_efficiency([100, 25, 150], scores, intervals, {"position (m)": visits})
+    figure = data_efficiency(SUCCESS, [100, 25, 150], scores, intervals, {"position (m)": visits})
     *maps, success = figure.axes
     # Sizes are in order, however they are given.
     assert [axes.get_title() for axes in maps] == ["25 %", "100 %", "150 %"]
@@ -237,5 +253,8 @@ def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
     assert np.array(line.get_ydata()).tolist() == [0.1, 0.7, 0.8]
     assert len(success.collections) == 1
     alone = {"nas": np.full((3, 3), np.nan)}
-    assert not data_efficiency([100, 25, 150], scores, alone, {}).axes[0].collections
+    assert not data_efficiency(SUCCESS, [100, 25, 150], scores, alone, {}).axes[0].collections
+    other = data_efficiency(SURVIVED_STEPS, [100, 25, 150], scores, alone, {}).axes[0]
+    assert (success.get_ylim(), other.get_ylim()[0]) == ((-0.02, 1.02), 0.0)
+    assert success.get_ylabel() == "success rate in the target" != other.get_ylabel()
     assert png(figure)

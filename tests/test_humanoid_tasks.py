@@ -1,7 +1,10 @@
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
+from statistics import fmean, stdev
 
 import numpy as np
 import pytest
@@ -27,7 +30,7 @@ from astra_data.training import PpoTrainConfig
 RECIPE = """
 task = "humanoid-walker2d"
 methods = ["direct_transfer", "nas", "astra"]
-seeds = [0]
+seeds = [0, 1]
 
 [collect]
 episodes = 8
@@ -95,6 +98,45 @@ def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     for world in ("target", "simulated", "raw"):
         assert all(1 < steps < 1000 for steps in evaluation[world]["steps"])
         assert evaluation[world]["failed"] == [1.0] * 3
+    check_page(folder)
+
+
+def check_page(folder: Path) -> None:
+    """Work out the page's figures from the evaluations."""
+    page = (folder / "report" / "results.md").read_text().replace("**", "")
+    steps: dict[str, list[float]] = {}
+    for method, title in {
+        "direct_transfer": "Direct transfer (floor)",
+        "nas": "NAS",
+        "astra": "ASTRA",
+    }.items():
+        files = [folder / "evaluate" / method / f"seed_{seed}" / "evaluation.json" for seed in (0, 1)]
+        told = [json.loads(file.read_text()) for file in files]
+        steps[method] = [fmean(seed["target"]["steps"]) for seed in told]
+        returns = [fmean(seed["target"]["return"]) for seed in told]
+        simulated = [fmean(seed["simulated"]["steps"]) for seed in told]
+        (line,) = re.findall(rf"^\| {re.escape(title)} \| 2 \| (.*) \|$", page, re.MULTILINE)
+        survived, survived_iqm, paid, paid_iqm, failed, in_simulator = line.split(" | ")
+        assert survived == f"{fmean(steps[method]):.0f} ± {stdev(steps[method]):.0f}"
+        assert paid == f"{fmean(returns):.1f} ± {stdev(returns):.1f}"
+        # Of two seeds the interquartile mean is the mean, and resamples go from the one to the other.
+        assert (
+            survived_iqm == f"{fmean(steps[method]):.0f} [{min(steps[method]):.0f}, {max(steps[method]):.0f}]"
+        )
+        assert paid_iqm == f"{fmean(returns):.1f} [{min(returns):.1f}, {max(returns):.1f}]"
+        assert failed == "1.00 ± 0.00"
+        assert in_simulator == f"{fmean(simulated):.0f} ± {stdev(simulated):.0f}"
+        if method == "astra":
+            for encoder in ("source", "target"):
+                means = [seed["encoders"][encoder]["steps"] for seed in told]
+                assert f"| ASTRA | {encoder} | {fmean(means):.0f} ± {stdev(means):.0f} | " in page
+    for other, title in {"direct_transfer": "Direct transfer", "nas": "NAS"}.items():
+        pairs = list(product(steps["astra"], steps[other]))
+        probability = fmean((ours > theirs) + (ours == theirs) / 2 for ours, theirs in pairs)
+        assert f"| ASTRA | {title} | {probability:.2f} [" in page
+    for figure in ("steps", "return", "learning_steps"):
+        assert (folder / "report" / f"{figure}.png").exists()
+    assert "success" not in page
 
 
 @pytest.fixture
@@ -130,6 +172,7 @@ def test_who_lasts_to_the_horizon_succeeds_everywhere(tmp_path: Path) -> None:
     )
     curve = json.loads((tmp_path / "policy" / "curve.json").read_text())
     assert {point["success"] for point in curve["points"]} == {None}
+    assert 0 < curve["points"][0]["episode_steps"] <= HORIZON
     evaluate(
         *(LASTING, "direct_transfer", EvaluateConfig(episodes=2)),
         policy=tmp_path / "policy",

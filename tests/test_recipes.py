@@ -62,6 +62,7 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
         (', "rma", "follower"', "", "methods: rma, methods: follower"),
         ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
         ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
+        ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),
     ],
 )
 def test_what_needs_a_maze_is_refused_where_there_is_none(

@@ -46,6 +46,7 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
             "percent": "50",
             "seed": "1",
             "success": "1.0",
+            "steps": "0.5",
             "return": "0.5",
             "failed": "0.5",
             "simulated_success": "0.5",

@@ -1,11 +1,11 @@
 """Figures: pure functions from arrays to a matplotlib Figure, in one style.
 
 style         colours, titles and roles of the methods; fonts and lines
-scores        success_bars, learning_curves
+scores        score_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
 coverage      coverage: which positions or velocities a dataset holds
 validity      predictive_validity: returns in the simulators against those in the target
-sizes         data_efficiency: success over the size of the dataset, and what each size covers
+sizes         data_efficiency: a score over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
 walks         walk_prediction: how well models predict a recorded walk, by horizon and size of the data
 """
@@ -13,7 +13,7 @@ walks         walk_prediction: how well models predict a recorded walk, by horiz
 from astra_data.figures.coverage import coverage
 from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
-from astra_data.figures.scores import Curve, learning_curves, success_bars
+from astra_data.figures.scores import Curve, learning_curves, score_bars
 from astra_data.figures.sizes import Visits, data_efficiency
 from astra_data.figures.style import ROLES, method_colour, method_title, png
 from astra_data.figures.validity import Foretold, predictive_validity
@@ -35,7 +35,7 @@ __all__ = [
     "open_loop_error",
     "png",
     "predictive_validity",
-    "success_bars",
+    "score_bars",
     "trajectories",
     "walk_prediction",
 ]

@@ -1,4 +1,4 @@
-"""Success of each row: at the end, and while it learns."""
+"""Scores of each row: at the end, and while it learns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +11,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from astra_data.figures.style import FAINT, INK, ROLES, method_colour, method_title, style
+from astra_data.figures.style import FAINT, INK, ROLES, method_colour, method_title, score_axis, style
 from astra_data.rows import base_method, is_plus
+from astra_data.score import Score
 
 Floats = NDArray[np.float64]
 
@@ -29,14 +30,15 @@ class Curve:
 
     Attributes:
         steps: simulator steps so far, (K,), increasing.
-        success: share of the training episodes that ended in success, (K,); NaN where none had ended.
+        score: of the training episodes that ended, (K,); NaN where none had ended.
     """
 
     steps: Floats
-    success: Floats
+    score: Floats
 
 
-def success_bars(
+def score_bars(
+    score: Score,
     scores: Mapping[str, Floats],
     intervals: Mapping[str, tuple[float, float, float]],
     simulated: Mapping[str, float],
@@ -44,24 +46,26 @@ def success_bars(
     """Draw one bar per row, with a dot per seed.
 
     Args:
-        scores: success of each row's seeds, (seeds,), in [0, 1].
+        score: what is drawn.
+        scores: those of each row's seeds, (seeds,).
         intervals: (interquartile mean, low, high) of each row; low and high are NaN for a single seed.
-        simulated: mean success of a row in the simulator it was trained in, where there is one.
+        simulated: mean score of a row in the simulator it was trained in, where there is one.
     """
     with style():
         figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(scores)), layout="constrained")
         axes = figure.add_subplot()
         for place, (method, seeds) in enumerate(scores.items()):
-            _bar(axes, place, method, seeds, intervals[method])
+            _bar(axes, place, method, score, seeds, intervals[method])
             if method in simulated:
                 (diamond,) = axes.plot(simulated[method], place, "D", mfc="white", mec=INK, ms=5, zorder=5)
                 diamond.set_clip_on(False)
         axes.set_yticks(range(len(scores)), [_tick_label(method) for method in scores])
         axes.tick_params(axis="y", length=0)
         axes.set_ylim(len(scores) - 0.4, -0.6)
-        axes.set_xlim(0, 1)
-        axes.set_xticks(np.linspace(0, 1, 6))
-        axes.set_xlabel("success rate in the target")
+        if score.limit is not None:
+            axes.set_xlim(0, score.limit)
+            axes.set_xticks(np.linspace(0, score.limit, 6))
+        axes.set_xlabel(f"{score.quantity} in the target")
         axes.grid(visible=False, axis="y")
         axes.grid(visible=True, axis="x")
         handles = [
@@ -77,12 +81,13 @@ def success_bars(
         return figure
 
 
-def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
-    """Draw success of the training episodes over steps: mean over seeds, band from the worst to the best.
+def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figure:
+    """Draw a score of the training episodes over steps: mean over seeds, band from the worst to the best.
 
     Each method has a panel; with the [plus] settings it is dashed.
 
     Args:
+        score: what is drawn.
         curves: each row's seeds, at least one.
     """
     with style():
@@ -99,18 +104,18 @@ def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
             axes.tick_params(labelbottom=True)
         for method, seeds in curves.items():
             axes = every[panels.index(base_method(method))]
-            steps, success = _on_one_grid(seeds)
+            steps, scores = _on_one_grid(seeds)
             colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
             if len(seeds) > 1:
-                low, high = success.min(axis=0), success.max(axis=0)
+                low, high = scores.min(axis=0), scores.max(axis=0)
                 axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
-            axes.plot(steps, success.mean(axis=0), dashes, color=colour)
-        every[0].set_ylim(-0.02, 1.02)
+            axes.plot(steps, scores.mean(axis=0), dashes, color=colour)
+        score_axis(every[0], score)
         every[0].set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
         every[0].xaxis.set_major_formatter(_steps_label)
         every[0].xaxis.set_major_locator(MaxNLocator(4))
         figure.supxlabel("steps of training")
-        figure.supylabel("success of training episodes, from all starts")
+        figure.supylabel(f"{score.title} of training episodes, from all starts")
         if any(map(is_plus, curves)):
             handles = [
                 Line2D([], [], color=INK, label="without the [plus] settings"),
@@ -120,7 +125,14 @@ def learning_curves(curves: Mapping[str, Sequence[Curve]]) -> Figure:
         return figure
 
 
-def _bar(axes: Axes, place: int, method: str, seeds: Floats, interval: tuple[float, float, float]) -> None:
+def _bar(
+    axes: Axes,
+    place: int,
+    method: str,
+    score: Score,
+    seeds: Floats,
+    interval: tuple[float, float, float],
+) -> None:
     iqm, low, high = interval
     hatch = "////" if is_plus(method) else None
     axes.barh(
@@ -134,8 +146,9 @@ def _bar(axes: Axes, place: int, method: str, seeds: Floats, interval: tuple[flo
     dots.set_clip_on(False)
     # Beyond the axis, where neither dots nor diamonds can cover the number.
     axes.annotate(
-        f"{iqm:.2f}",
+        score.text(iqm),
         (1, place),
+        xycoords=axes.get_yaxis_transform(),
         xytext=(10, 0),
         textcoords="offset points",
         ha="left",
@@ -152,12 +165,12 @@ def _tick_label(method: str) -> str:
 
 
 def _on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:
-    """Return steps (K,) that all seeds cover, and their success there, (seeds, K)."""
-    known = [np.isfinite(seed.success) for seed in seeds]
-    parts = [(seed.steps[keep], seed.success[keep]) for seed, keep in zip(seeds, known, strict=True)]
+    """Return steps (K,) that all seeds cover, and their scores there, (seeds, K)."""
+    known = [np.isfinite(seed.score) for seed in seeds]
+    parts = [(seed.steps[keep], seed.score[keep]) for seed, keep in zip(seeds, known, strict=True)]
     first, last = max(steps[0] for steps, _ in parts), min(steps[-1] for steps, _ in parts)
     grid = np.linspace(first, last, CURVE_POINTS)
-    return grid, np.stack([np.interp(grid, steps, success) for steps, success in parts])
+    return grid, np.stack([np.interp(grid, steps, scores) for steps, scores in parts])
 
 
 def _steps_label(steps: float, _: float) -> str:

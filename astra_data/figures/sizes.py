@@ -1,4 +1,4 @@
-"""Success over the size of the dataset, under what each size covers (the paper's data-efficiency figure)."""
+"""A score over the size of the dataset, under what each size covers (the paper's data-efficiency figure)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,8 +9,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from astra_data.figures.style import method_colour, method_title, style
+from astra_data.figures.style import method_colour, method_title, score_axis, style
 from astra_data.rows import is_plus
+from astra_data.score import Score
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -30,16 +31,18 @@ class Visits:
 
 
 def data_efficiency(
+    score: Score,
     percents: Sequence[int],
     scores: Mapping[str, Sequence[Floats]],
     intervals: Mapping[str, Floats],
     covered: Mapping[str, Sequence[Visits]],
 ) -> Figure:
-    """Draw a map per size for each of `covered`, and below them success with a band per row.
+    """Draw a map per size for each of `covered`, and below them a score with a band per row.
 
     Args:
+        score: what is drawn over the size.
         percents: the K sizes.
-        scores: success of each row's seeds, K times (seeds,), in [0, 1].
+        scores: those of each row's seeds, K times (seeds,).
         intervals: interquartile mean, low and high of each row, (3, K); low and high NaN for a single seed.
         covered: what is mapped, such as "position (m)" → the visits of each size.
     """
@@ -70,8 +73,8 @@ def data_efficiency(
             )
         axes.set_xticks(sizes, [f"{percent:g} %" for percent in sizes])
         axes.set_xlabel("size of the dataset")
-        axes.set_ylim(-0.02, 1.02)
-        axes.set_ylabel("success rate in the target")
+        score_axis(axes, score)
+        axes.set_ylabel(f"{score.quantity} in the target")
         axes.legend(loc="lower right", ncols=2)
         return figure
 

@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 
+from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from astra_data.rows import base_method, is_plus
+from astra_data.score import Score
 
 TITLES = {
     "direct_transfer": "Direct transfer",
@@ -129,6 +131,14 @@ def method_colour(method: str) -> str:
         red, green, blue = to_rgb(colour)
         return to_hex((0.68 * red, 0.68 * green, 0.68 * blue))
     return colour.lower()
+
+
+def score_axis(axes: Axes, score: Score) -> None:
+    """Let the vertical axis begin at no score, and end at the limit if there is one."""
+    if score.limit is None:
+        axes.set_ylim(bottom=0)
+    else:
+        axes.set_ylim(-0.02 * score.limit, 1.02 * score.limit)
 
 
 def png(figure: Figure) -> bytes:

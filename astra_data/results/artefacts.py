@@ -97,6 +97,8 @@ class Point(BaseModel):
     steps: float
     success: float | None
     """Of the training episodes that ended; None where none had."""
+    episode_steps: float | None = None
+    """Their mean length; None where none had, or where it was not recorded."""
 
 
 class CurveFile(Artefact):

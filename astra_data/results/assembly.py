@@ -36,6 +36,7 @@ from astra_data.results.model import (
 from astra_data.results.origins import dataset_uses, merged_origins
 from astra_data.results.provenance import origin
 from astra_data.results.runs import Runs
+from astra_data.score import SUCCESS, Score
 
 
 def assemble(
@@ -47,6 +48,7 @@ def assemble(
     root: Path,
     command: str,
     replicates: int,
+    scores: tuple[Score, ...] = (SUCCESS,),
     settings: Mapping[str, JsonValue] | None = None,
     groundings: Mapping[str, str] | None = None,
     percent: int | None = None,
@@ -71,13 +73,15 @@ def assemble(
         own = {"recipe": recipe, "command": command, "settings": settings}
         sources.append(published.model_copy(update=own))
     if read.any_finished or not published:
-        sources.append(_read(read, task, command, settings))
+        sources.append(_read(read, task, command, scores, settings))
     merged = merge(sources, methods=methods, seeds=asked, replicates=replicates)
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
     return merged.model_copy(update={"paper_success": printed})
 
 
-def _read(read: Runs, task: str, command: str, settings: dict[str, JsonValue]) -> Results:
+def _read(
+    read: Runs, task: str, command: str, scores: tuple[Score, ...], settings: dict[str, JsonValue]
+) -> Results:
     """Return what the artefacts say, before rows are summarised and compared."""
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
@@ -106,7 +110,7 @@ def _read(read: Runs, task: str, command: str, settings: dict[str, JsonValue]) -
                 for seed, file in of_seeds.items()
             ],
             gap_means.get(grounding),
-            list(curves.get(method, {}).values()),
+            [_learning(curve, scores[0]) for curve in curves.get(method, {}).values()],
             row_cost(
                 {stage: [found[seed] for seed in of_seeds if seed in found] for stage, found in made.items()}
             ),
@@ -123,6 +127,7 @@ def _read(read: Runs, task: str, command: str, settings: dict[str, JsonValue]) -
         recipe=read.recipe,
         task=task,
         command=command,
+        scores=scores,
         settings=settings,
         origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
         wall_seconds=seconds(files, "wall_seconds"),
@@ -157,13 +162,12 @@ def _row(
     grounding: str,
     distances: Sequence[float],
     gap: GapMeans | None,
-    curves: Sequence[CurveFile],
+    learning: list[Learning],
     cost: dict[str, Cost],
 ) -> MethodResults:
     evaluations = list(of_seeds.values())
     means = [file.target.means() for file in evaluations]
     measures = {name: [seed[name] for seed in means] for name in means[0]}
-    simulated = _in_world(evaluations, "simulated", "success")
     returns = {world: _in_world(evaluations, world, "return") for world in SHARED_WORLDS}
     measured = [{name: sorted(of) for name, of in file.encoders.items()} for file in evaluations]
     _require_alike(measured, "encoders")
@@ -181,19 +185,22 @@ def _row(
         steps=measures["steps"],
         returns=measures["return"],
         distance=list(distances),
-        simulated_success=simulated,
+        simulated_success=_in_world(evaluations, "simulated", "success"),
+        simulated_steps=_in_world(evaluations, "simulated", "steps"),
         simulator_returns={world: values for world, values in returns.items() if values is not None},
         encoders=encoders,
         grounding=grounding if gap else None,
         gap=gap,
-        learning=[
-            Learning(
-                steps=[point.steps for point in curve.points],
-                success=[float("nan") if point.success is None else point.success for point in curve.points],
-            )
-            for curve in curves
-        ],
+        learning=learning,
         cost=cost,
+    )
+
+
+def _learning(curve: CurveFile, score: Score) -> Learning:
+    reached = [point.success if score == SUCCESS else point.episode_steps for point in curve.points]
+    return Learning(
+        steps=[point.steps for point in curve.points],
+        score=[float("nan") if value is None else value for value in reached],
     )
 
 

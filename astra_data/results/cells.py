@@ -18,18 +18,20 @@ def spread(summary: Summary, digits: int) -> str:
     return _mean_std(summary.mean, summary.std, digits)
 
 
-def mean_std(values: list[float]) -> str:
+def mean_std(values: list[float], digits: int) -> str:
     """Return mean ± standard deviation of one value per seed."""
-    return _mean_std(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None, 2)
+    std = float(np.std(values, ddof=1)) if len(values) > 1 else None
+    return _mean_std(float(np.mean(values)), std, digits)
 
 
 def _mean_std(mean: float, std: float | None, digits: int) -> str:
     return f"{mean:.{digits}f}" + ("" if std is None else f" ± {std:.{digits}f}")
 
 
-def interval(value: float, low: float | None, high: float | None) -> str:
+def interval(value: float, low: float | None, high: float | None, digits: int = 2) -> str:
     """Return a value with its interval, where it has one."""
-    return f"{value:.2f}" + ("" if low is None or high is None else f" [{low:.2f}, {high:.2f}]")
+    ends = "" if low is None or high is None else f" [{low:.{digits}f}, {high:.{digits}f}]"
+    return f"{value:.{digits}f}{ends}"
 
 
 def short(rate: float) -> str:

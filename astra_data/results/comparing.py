@@ -6,6 +6,7 @@ import numpy as np
 
 from astra_data.results.model import MethodResults, Validity
 from astra_data.rows import PLUS, is_plus
+from astra_data.score import Score
 from astra_data.statistics import Comparison, correlation, probability_of_improvement, summarise
 
 SHARED_WORLDS = ("raw", "grounded")
@@ -22,17 +23,18 @@ def summarised(row: MethodResults, replicates: int) -> MethodResults:
     return row.model_copy(update={"summary": summary})
 
 
-def improvement(rows: Mapping[str, MethodResults], replicates: int) -> dict[str, dict[str, Comparison]]:
+def improvement(
+    rows: Mapping[str, MethodResults], score: Score, replicates: int
+) -> dict[str, dict[str, Comparison]]:
     """Compare ASTRA with every other row that is trained as it is, with the [plus] settings or without.
 
     Rows that were in no simulator are compared with both, for the settings are none of theirs.
     """
+    scores = {method: np.array(row.measures()[score.measure]) for method, row in rows.items()}
     compared = {method: row for method, row in rows.items() if row.role != "ceiling"}
     return {
         ours: {
-            other: probability_of_improvement(
-                np.array(rows[ours].success), np.array(row.success), replicates=replicates
-            )
+            other: probability_of_improvement(scores[ours], scores[other], replicates=replicates)
             for other, row in compared.items()
             if other != ours and (is_plus(other) == is_plus(ours) or row.simulated_success is None)
         }

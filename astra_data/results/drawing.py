@@ -18,7 +18,7 @@ from astra_data.figures import (
     learning_curves,
     open_loop_error,
     predictive_validity,
-    success_bars,
+    score_bars,
     trajectories,
 )
 from astra_data.inspection import visited
@@ -27,6 +27,7 @@ from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, r
 from astra_data.results.model import BandMeans, Results
 from astra_data.results.sizes import SizesResults
 from astra_data.rows import place
+from astra_data.score import SUCCESS, Score
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ def figures_of(
         trajectory_methods: rows whose trajectories are drawn; all where none of them is in the results.
         trajectory_episodes: how many of each row.
     """
-    figures = {"success": _success(results)}
+    figures = {score.measure: _bars(results, score) for score in results.scores}
     drawn = [row for row in trajectory_methods if row in results.methods] or list(results.methods)
     folders = [_with_trajectories(root, results, row) for row in drawn]
     if maze is not None and None not in folders:
@@ -61,7 +62,8 @@ def figures_of(
         figures["trajectories"] = trajectories(maze, panels)
     curves = _curves(results)
     if curves:
-        figures["learning"] = learning_curves(curves)
+        name = "learning" if results.headline == SUCCESS else f"learning_{results.headline.measure}"
+        figures[name] = learning_curves(results.headline, curves)
     gaps = _gaps(results)
     if gaps:
         figures["gap"] = open_loop_error(gaps)
@@ -70,21 +72,18 @@ def figures_of(
     return figures
 
 
-def _success(results: Results) -> Figure:
-    rows = results.methods
+def _bars(results: Results, score: Score) -> Figure:
+    rows, simulated = results.methods, f"simulated_{score.measure}"
     intervals = {}
     for method, row in rows.items():
-        summary = row.summary["success"]
+        summary = row.summary[score.measure]
         low, high = (np.nan if end is None else end for end in (summary.low, summary.high))
         intervals[method] = (summary.iqm, low, high)
-    return success_bars(
-        {method: np.array(row.success) for method, row in rows.items()},
+    return score_bars(
+        score,
+        {method: np.array(row.measures()[score.measure]) for method, row in rows.items()},
         intervals,
-        {
-            method: row.summary["simulated_success"].mean
-            for method, row in rows.items()
-            if row.simulated_success is not None
-        },
+        {method: row.summary[simulated].mean for method, row in rows.items() if simulated in row.summary},
     )
 
 
@@ -111,13 +110,13 @@ def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
 
 def _curves(results: Results) -> dict[str, list[Curve]]:
     curves = {
-        method: [Curve(np.array(seed.steps), np.array(seed.success)) for seed in row.learning]
+        method: [Curve(np.array(seed.steps), np.array(seed.score)) for seed in row.learning]
         for method, row in results.methods.items()
     }
     return {
         method: seeds
         for method, seeds in curves.items()
-        if seeds and all(np.isfinite(seed.success).any() for seed in seeds)
+        if seeds and all(np.isfinite(seed.score).any() for seed in seeds)
     }
 
 
@@ -150,10 +149,11 @@ def _gaps(results: Results) -> dict[str, OpenLoop]:
 
 
 def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
-    """Return success over sizes, and what they cover where the datasets of a seed are all at `root`."""
+    """Return the headline over sizes, and what they cover where the datasets of a seed are all at `root`."""
     first = found.sizes[0].results
+    score = first.headline
     rows = {method: [size.results.methods[method] for size in found.sizes] for method in first.methods}
-    summaries = {method: [row.summary["success"] for row in of] for method, of in rows.items()}
+    summaries = {method: [row.summary[score.measure] for row in of] for method, of in rows.items()}
     covered: dict[str, list[Visits]] = {}
     for folder in _subsets(found, root):
         dataset = Dataset.open(folder)
@@ -162,8 +162,9 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
             if planar is not None:
                 covered.setdefault(label, []).append(Visits(planar.counts, planar.extent))
     return data_efficiency(
+        score,
         [size.percent for size in found.sizes],
-        {method: [np.array(row.success) for row in of] for method, of in rows.items()},
+        {method: [np.array(row.measures()[score.measure]) for row in of] for method, of in rows.items()},
         # Where there is a single seed, None becomes NaN.
         {
             method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T

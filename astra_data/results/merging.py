@@ -14,7 +14,7 @@ from astra_data.results.origins import Named, dataset_uses, merged_origins
 
 PER_SEED = (
     *("success", "failed", "wall_contact", "steps", "returns", "distance"),
-    *("simulated_success", "simulator_returns", "encoders", "learning"),
+    *("simulated_success", "simulated_steps", "simulator_returns", "encoders", "learning"),
 )
 """Fields of a row that are lists over its seeds, or mappings to such."""
 
@@ -53,7 +53,7 @@ def merge(
             "seeds": [seed for seed in seeds if seed in reported],
             "methods": rows,
             "unfinished": [method_title(method) for method in methods if method not in rows],
-            "probability_of_improvement": improvement(rows, replicates),
+            "probability_of_improvement": improvement(rows, sources[-1].headline, replicates),
             "predictive_validity": validity(rows, replicates),
             "throughput": reduce(_sum, (source.throughput for source in sources)),
         }

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
+from astra_data.score import SUCCESS, Score
 from astra_data.statistics import Comparison, Correlation, Summary
 
 
@@ -64,8 +65,8 @@ class Learning(Part):
     """One seed's training."""
 
     steps: list[float]
-    success: list[Number]
-    """Of the training episodes that ended, wherever in the task they began."""
+    score: list[Number] = Field(validation_alias=AliasChoices("score", "success"))
+    """The headline of the training episodes that ended, wherever in the task they began."""
 
 
 class BandMeans(Part):
@@ -124,6 +125,8 @@ class MethodResults(Part):
     """Way of the robot in an episode that succeeds, in m; NaN for a seed where none does."""
     simulated_success: list[float] | None
     """Success in the simulator that the policy was trained in; None for a row that was in none."""
+    simulated_steps: list[float] | None = None
+    """Length of an episode there, likewise."""
     simulator_returns: dict[str, list[float]]
     """Return in the simulators that all rows are tested in, "raw" and "grounded", where the row was."""
     encoders: dict[str, dict[str, list[float]]]
@@ -147,6 +150,7 @@ class MethodResults(Part):
             "steps": self.steps,
             "return": self.returns,
             "simulated_success": self.simulated_success,
+            "simulated_steps": self.simulated_steps,
             "distance": self.distance,
         }
 
@@ -159,6 +163,8 @@ class Results(Part):
     task: str
     command: str
     """The command that produced these results."""
+    scores: tuple[Score, ...] = (SUCCESS,)
+    """What the rows are compared by, the headline first."""
     settings: dict[str, JsonValue]
     """Of the recipe, with its defaults."""
     origins: list[Origin]
@@ -179,7 +185,7 @@ class Results(Part):
     """What stands in for a physical robot in the target, where something does."""
     methods: dict[str, MethodResults]
     paper_success: dict[str, float] = Field(default_factory=dict)
-    """Row → what the paper prints for it."""
+    """Row → the success rate that the paper prints for it."""
     unfinished: list[str] = Field(default_factory=list)
     """Titles of the recipe's rows that no seed of is finished yet."""
     probability_of_improvement: dict[str, dict[str, Comparison]] = Field(default_factory=dict)
@@ -188,6 +194,11 @@ class Results(Part):
     """Of the simulators that all rows are tested in: "raw", and "grounded" where there is one."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
     """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
+
+    @property
+    def headline(self) -> Score:
+        """The first of the scores."""
+        return self.scores[0]
 
     def gaps(self) -> dict[str, GapMeans]:
         """Return each grounding's gap once, though rows share it."""

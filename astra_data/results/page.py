@@ -7,13 +7,18 @@ from astra_data.results.cells import duration, interval, mean_std, spread, table
 from astra_data.results.making import cost, machine, origin
 from astra_data.results.model import BandMeans, Results
 from astra_data.rows import is_plus, reference_of
+from astra_data.score import SUCCESS
+
+_BARS = "Bars are interquartile means over seeds, dots single seeds, lines 95 % bootstrap intervals."
+_DIAMONDS = (
+    " A diamond is the same policy in the simulator that it was trained in: the drop from diamond to bar "
+    "is what the transfer costs."
+)
 
 HOW_TO_READ = {
-    "success": (
-        "Bars are interquartile means over seeds, dots single seeds, lines 95 % bootstrap intervals. A "
-        "diamond is the same policy in the simulator that it was trained in: the drop from diamond to bar "
-        "is what the transfer costs."
-    ),
+    "success": _BARS + _DIAMONDS,
+    "steps": _BARS + _DIAMONDS,
+    "return": _BARS,
     "trajectories": (
         "Orange, dashed: the policy in the simulator that it was trained in. Blue: the same policy in the "
         "target. An episode that fails ends with a cross, one that succeeds at the star, its goal. Starts "
@@ -31,6 +36,13 @@ HOW_TO_READ = {
         "trajectory, often nearer to the goal, so these figures are no success rates of the task; those are "
         "in the table. High here and low there means that the policy learned what the target does not do."
     ),
+    "learning_steps": (
+        "Steps that the training episodes survive, in the simulator that the policy is trained in: mean over "
+        "seeds, band from the worst seed to the best; dashed with the `[plus]` settings. With "
+        "`data_start_share` in the recipe that share of the episodes starts in the midst of a recorded "
+        "trajectory, so these figures are not the task's; those are in the table. High here and low there "
+        "means that the policy learned what the target does not do."
+    ),
     "validity": (
         "A dot is one policy: a row's seed, with its mean return over the episodes. On the dashed line the "
         "simulator foretells the target's return exactly; what counts for choosing between policies is that "
@@ -44,24 +56,37 @@ HOW_TO_READ = {
 }
 """The text under each figure, in the order of the page."""
 
-COLUMNS = (
-    "method",
-    "seeds",
-    "success",
-    "IQM [95 %]",
-    "failed",
-    "wall contact",
-    "steps",
-    "way to success in m",
-    "return",
-    "success in its simulator",
-)
+BESIDE = {
+    "success": ("failed", "wall_contact", "steps", "distance", "return", "simulated_success"),
+    "steps": ("failed", "simulated_steps"),
+}
+"""Headline → the measures that the table tells beside the scores."""
+
+EXPLAINED = {
+    "success": "Wall contact: share of steps.",
+    "steps": "Survived steps: until an episode fails or its time is up.",
+}
+"""Headline → what else its table needs said."""
+
+COLUMNS = {
+    "failed": ("failed", 2),
+    "wall_contact": ("wall contact", 2),
+    "steps": ("steps", 0),
+    "distance": ("way to success in m", 1),
+    "return": ("return", 1),
+    "simulated_success": ("success in its simulator", 2),
+    "simulated_steps": ("survived steps in its simulator", 0),
+}
+"""Head and digits of such a measure."""
 
 CAPTIONS = {
     "success": "Success in the target",
+    "steps": "Survived steps in the target",
+    "return": "Return in the target",
     "trajectories": "Trajectories",
     "mismatch": "The same commands in simulator and target",
     "learning": "Learning curves",
+    "learning_steps": "Learning curves",
     "validity": "Return in the simulators and in the target",
     "gap": "Open-loop error by horizon",
 }
@@ -75,7 +100,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         figures: name → file name of each figure that was drawn; names as in `HOW_TO_READ`.
     """
     sections = [_head(results), _table(results), _comparison(results), _encoders(results)]
-    for name in ("success", "trajectories", "mismatch", "learning"):
+    for name in ("success", "steps", "return", "trajectories", "mismatch", "learning", "learning_steps"):
         sections.append(_figure(name, figures))
     sections += [_gap(results), _figure("gap", figures), _validity(results), _figure("validity", figures)]
     sections += [cost(results), origin(results)]
@@ -107,39 +132,42 @@ def _head(results: Results) -> str:
 
 
 def _table(results: Results) -> str:
-    rows = results.methods
-    best = max((row.summary["success"].mean for row in rows.values() if not row.role), default=None)
+    rows, scores, beside = results.methods, results.scores, BESIDE[results.headline.measure]
+    best = {
+        score: max((row.summary[score.measure].mean for row in rows.values() if not row.role), default=None)
+        for score in scores
+    }
+    head = ["method", "seeds"]
+    for score in scores:
+        head += [score.title, "IQM [95 %]"]
+    head += [COLUMNS[measure][0] for measure in beside]
     lines = []
-    paper = results.paper_success
-    for method, row in rows.items():
-        summary = row.summary
-        success = spread(summary["success"], 2)
-        printed = f"{paper[method]:.2f}" if method in paper else "-"
-        lines.append(
-            [
-                f"{row.title} ({row.role})" if row.role else row.title,
-                str(len(row.seeds)),
-                f"**{success}**" if not row.role and summary["success"].mean == best else success,
-                *([printed] if paper else []),
-                interval(summary["success"].iqm, summary["success"].low, summary["success"].high),
-                spread(summary["failed"], 2),
-                spread(summary["wall_contact"], 2),
-                spread(summary["steps"], 0),
-                spread(summary["distance"], 1) if "distance" in summary else "-",
-                spread(summary["return"], 1),
-                spread(summary["simulated_success"], 2) if "simulated_success" in summary else "-",
-            ]
-        )
+    for row in rows.values():
+        cells = [f"{row.title} ({row.role})" if row.role else row.title, str(len(row.seeds))]
+        for score in scores:
+            summary = row.summary[score.measure]
+            mean = spread(summary, score.digits)
+            cells.append(f"**{mean}**" if not row.role and summary.mean == best[score] else mean)
+            cells.append(interval(summary.iqm, summary.low, summary.high, score.digits))
+        cells += [
+            spread(row.summary[measure], COLUMNS[measure][1]) if measure in row.summary else "-"
+            for measure in beside
+        ]
+        lines.append(cells)
     note = (
         "Mean ± standard deviation over seeds, in the target. IQM: interquartile mean over seeds with its "
-        "95 % stratified bootstrap interval. Failed: share of episodes that ended badly, as in a fall. Wall "
-        "contact: share of steps. Floor and ceiling bound the other rows; the best of those is bold."
+        "95 % stratified bootstrap interval. Failed: share of episodes that ended badly, as in a fall. "
+        f"{EXPLAINED[results.headline.measure]} Floor and ceiling bound the other rows; the best of those is "
+        "bold."
     )
     if any(map(is_plus, rows)):
         note += " A plus marks the same method trained with the recipe's `[plus]` settings."
-    head = list(COLUMNS)
+    paper = results.paper_success
     if paper:
-        head.insert(head.index("success") + 1, "the paper's")
+        place = head.index(SUCCESS.title) + 1
+        head.insert(place, "the paper's")
+        for method, cells in zip(rows, lines, strict=True):
+            cells.insert(place, f"{paper[method]:.2f}" if method in paper else "-")
         note += (
             " The paper's success rates are of its own robot, maze and tuning, which it does not print in "
             "full: their order can be compared, their heights cannot."
@@ -157,9 +185,9 @@ def _comparison(results: Results) -> str:
     if not lines:
         return ""
     note = (
-        "How likely a seed of the one has a higher success rate than a seed of the other; ties count half. "
-        "Only rows that are trained alike are compared: all with the `[plus]` settings, or all without; rows "
-        "that are trained in no simulator, which those settings are for, with both."
+        f"How likely a seed of the one has a higher {results.headline.quantity} than a seed of the other; "
+        "ties count half. Only rows that are trained alike are compared: all with the `[plus]` settings, or "
+        "all without; rows that are trained in no simulator, which those settings are for, with both."
     )
     head = ["row", "beats", "probability [95 %]"]
     return f"## Probability of improvement\n\n{table(head, lines, words=2)}\n\n{note}"
@@ -167,15 +195,16 @@ def _comparison(results: Results) -> str:
 
 def _encoders(results: Results) -> str:
     lines = [
-        [row.title, encoder, mean_std(values["success"])]
+        [row.title, encoder, *(mean_std(values[score.measure], score.digits) for score in results.scores)]
         for row in results.methods.values()
         for encoder, values in row.encoders.items()
-        if len(row.encoders) > 1 and "success" in values
+        if len(row.encoders) > 1
     ]
     if not lines:
         return ""
+    head = ["method", "encoder", *(score.title for score in results.scores)]
     note = "The same policy, fed by the simulator's encoder (source) or the one aligned to the target."
-    return f"## Encoders\n\n{table(['method', 'encoder', 'success'], lines, words=2)}\n\n{note}"
+    return f"## Encoders\n\n{table(head, lines, words=2)}\n\n{note}"
 
 
 def _validity(results: Results) -> str:

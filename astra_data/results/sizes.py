@@ -10,11 +10,11 @@ from astra_data.results.model import Part, Results
 HOW_TO_READ = {
     "data_efficiency": (
         "Above: where the robot was and how fast it went, in the dataset of the first seed at each size; the "
-        "brighter, the more often. Below: success in the target over the size; lines are interquartile means "
+        "brighter, the more often. Below: {score} in the target over the size; lines are interquartile means "
         "over seeds, bands their 95 % bootstrap intervals, dots single seeds."
     ),
 }
-"""The text under each figure."""
+"""The text under each figure, of a score."""
 
 SHARED = ("collect", "pair")
 """Stages that work once for all sizes."""
@@ -55,8 +55,10 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         figures: name → file name of each figure that was drawn; names as in `HOW_TO_READ`.
     """
     parts = [_head(found), _table(found)]
+    score = found.sizes[0].results.headline.title
     parts += [
-        f"## {name.replace('_', ' ').capitalize()}\n\n![{name}]({figures[name]})\n\n{text}"
+        f"## {name.replace('_', ' ').capitalize()}\n\n![{name}]({figures[name]})\n\n"
+        + text.format(score=score)
         for name, text in HOW_TO_READ.items()
         if name in figures
     ]
@@ -78,15 +80,18 @@ def _head(found: SizesResults) -> str:
 
 
 def _table(found: SizesResults) -> str:
+    score = found.sizes[0].results.headline
     head = ["method", *(f"{size.percent} %" for size in found.sizes)]
     means, intervals = [], []
     for method, row in found.sizes[0].results.methods.items():
-        summaries = [size.results.methods[method].summary["success"] for size in found.sizes]
-        means.append([row.title, *(spread(summary, 2) for summary in summaries)])
-        intervals.append([row.title, *(interval(one.iqm, one.low, one.high) for one in summaries)])
+        summaries = [size.results.methods[method].summary[score.measure] for size in found.sizes]
+        means.append([row.title, *(spread(summary, score.digits) for summary in summaries)])
+        intervals.append(
+            [row.title, *(interval(one.iqm, one.low, one.high, score.digits) for one in summaries)]
+        )
     return "\n\n".join(
         [
-            "## Success by size of the dataset",
+            f"## {score.title.capitalize()} by size of the dataset",
             table(head, means),
             "Mean ± standard deviation over seeds, in the target.",
             table(head, intervals),

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -87,6 +88,7 @@ def evaluate(
         BadInputError: an input is not there or not what was expected.
     """
     world, base = task_named(task), method_named(method)
+    scores = world.objective.scores
     if base.trains and policy is None:
         raise BadInputError(f"method '{method}' has a policy to test: run the stage `train` first")
     if base.grounds and grounding is None:
@@ -127,7 +129,8 @@ def evaluate(
         outcomes[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
     if policy is not None:
         told["encoders"] = {
-            kind: {"success": sum(outcome.success) / config.episodes} for kind, outcome in outcomes.items()
+            kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
+            for kind, outcome in outcomes.items()
         }
     told |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
     tensors = {"target.position": outcomes[headline].position}
@@ -142,8 +145,8 @@ def evaluate(
         told |= stopwatch.spent()
         (folder / "evaluation.json").write_text(json.dumps(told, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
-    success = sum(told["target"]["success"]) / config.episodes
-    progress(1.0, f"success in the target {success:.2f}")
+    first = scores[0]
+    progress(1.0, f"{first.title} in the target {first.text(fmean(told['target'][first.measure]))}")
 
 
 def _careful_in_target(task: Task, goal: Tensor) -> Act:

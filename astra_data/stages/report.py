@@ -39,7 +39,7 @@ class ReportConfig(Config):
     """Episodes drawn per row and world, the first ones of the row's first seed."""
 
     paper_success: dict[str, Share] = Field(default_factory=dict)
-    """Row → what the paper prints for it, shown beside ours."""
+    """Row → the success rate that the paper prints for it, shown beside ours."""
 
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
     """Resamples behind each interval."""
@@ -121,6 +121,7 @@ def report(
             settings=recipe.settings,
             groundings=recipe.groundings,
             percent=percent,
+            scores=TASKS[recipe.task].objective.scores,
             paper_success=config.paper_success,
             published=known.get(percent),
         )
@@ -180,5 +181,6 @@ def _sizes(recipe: Reported, command: str, sizes: Sequence[Results]) -> SizesRes
 
 
 def _headline(results: Results) -> str:
-    best = max(results.methods.values(), key=lambda row: row.summary["success"].mean)
-    return f"best: {best.title}  success {best.summary['success'].mean:.2f}"
+    score = results.headline
+    best = max(results.methods.values(), key=lambda row: row.summary[score.measure].mean)
+    return f"best: {best.title}  {score.title} {score.text(best.summary[score.measure].mean)}"

@@ -192,7 +192,7 @@ def test_a_row_that_was_in_no_simulator_has_no_success_there(root: Path) -> None
     write_iql(root)
     row = assembled(root, ("iql",)).methods["iql"]
     assert row.simulated_success is None and "simulated_success" not in row.summary
-    assert np.isnan(row.learning[0].success).all()
+    assert np.isnan(row.learning[0].score).all()
     assert row.simulator_returns["raw"] == [0.0, 1.0, 4.0]
 
 

@@ -24,9 +24,11 @@ from astra_data.errors import BadInputError, MissingStageError
 from astra_data.mazes import U_MAZE
 from astra_data.mismatch import CommandReplay
 from astra_data.results import assembly
-from astra_data.results.page import HOW_TO_READ
+from astra_data.results.model import Results
+from astra_data.results.page import HOW_TO_READ, render
 from astra_data.results.sizes import SizesResults
 from astra_data.rows import place
+from astra_data.score import RETURN, SUCCESS, SURVIVED_STEPS
 from astra_data.stages import report as stage
 from astra_data.stages.report import ReportConfig, report
 
@@ -34,15 +36,26 @@ REPLAY = CommandReplay(
     np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4))
 )
 
+LASTING_FIGURES = {"steps", "return", "learning_steps"}
+FIGURES = {*HOW_TO_READ} - LASTING_FIGURES
+
 CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
+
+
+def task(**changes: object) -> SimpleNamespace:
+    usual = {"maze": U_MAZE, "plane": object(), "facts": {}}
+    return SimpleNamespace(**usual | {"objective": SimpleNamespace(scores=(SUCCESS,))} | changes)
+
+
+def images(folder: Path) -> set[str]:
+    return {path.stem for path in folder.glob("*.png")}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def tasks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        task = SimpleNamespace(maze=U_MAZE, plane=object(), facts={})
-        patch.setattr(stage, "TASKS", {"antmaze-u": task})
-        patch.setattr(stage, "replay_commands", lambda task: REPLAY)
+        patch.setattr(stage, "TASKS", {"antmaze-u": task()})
+        patch.setattr(stage, "replay_commands", lambda _: REPLAY)
         yield
 
 
@@ -69,6 +82,7 @@ def make(
     publish: Path | None = None,
     recipe: FakeRecipe | None = None,
     add_to: Path | None = None,
+    note: str = "best: Careful follower  success 1.00",
 ) -> None:
     notes: list[tuple[float, str]] = []
     report(
@@ -80,7 +94,7 @@ def make(
         progress=lambda fraction, note: notes.append((fraction, note)),
         config=CONFIG,
     )
-    assert notes[-1] == (1.0, "best: Careful follower  success 1.00") or recipe
+    assert notes[-1] == (1.0, note) or recipe
 
 
 def test_a_list_of_numbers_takes_one_line(folder: Path) -> None:
@@ -98,9 +112,10 @@ def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN
         "return",
         "distance",
         "simulated_success",
+        "simulated_steps",
     }
     assert set(row["summary"]["success"]) == {"mean", "std", "iqm", "low", "high"}
-    learning = {"steps": [0.0, 1000.0, 2000.0], "success": [None, 0.5, 0.75]}
+    learning = {"steps": [0.0, 1000.0, 2000.0], "score": [None, 0.5, 0.75]}
     assert row["learning"] == [learning] * 3
 
 
@@ -222,8 +237,7 @@ def test_the_page_tells_of_longer_legs(root: Path) -> None:
 def test_the_page_says_that_a_robot_is_a_stand_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(root)
     assert "stand-in" not in (root / "report/results.md").read_text()
-    task = SimpleNamespace(maze=U_MAZE, plane=object(), facts={"stand_in": "mujoco"})
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task})
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(facts={"stand_in": "mujoco"})})
     make(root)
     assert (
         "**A simulated stand-in (`mujoco`) takes the physical robot's place"
@@ -252,22 +266,61 @@ def test_page_holds_the_table_and_only_figures_that_exist(folder: Path) -> None:
     assert "| No grounding | 1 [0.5, 2] | 2 [1, nan] |" in page
     assert "astra-data run recipes/antmaze_u.toml" in page
     assert "[plus]" in page
-    images = {path.name for path in folder.glob("*.png")}
-    assert images == {f"{name}.png" for name in HOW_TO_READ}
-    assert {image for image in images if f"]({image})" in page} == images
+    assert images(folder) == FIGURES
+    assert {name for name in FIGURES if f"]({name}.png)" in page} == FIGURES
 
 
 def test_without_a_maze_there_is_nothing_to_draw_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": SimpleNamespace(plane=None, facts={})})
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(plane=None)})
     make(root)
-    images = {path.stem for path in (root / "report").glob("*.png")}
-    assert images == {*HOW_TO_READ} - {"trajectories", "mismatch"}
+    assert images(root / "report") == FIGURES - {"trajectories", "mismatch"}
+
+
+def test_of_lasting_tasks_the_page_tells_survived_steps_and_return(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lasting = task(plane=None, objective=SimpleNamespace(scores=(SURVIVED_STEPS, RETURN)))
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": lasting})
+    points = [
+        {"steps": steps, "success": None, "episode_steps": lasted}
+        for steps, lasted in ((1000, 30.0), (2000, None), (3000, 90.0))
+    ]
+    for seed, steps in enumerate((60.0, 90.0, 600.0)):
+        means = {"steps": 40.0 + 10 * seed, "return": 200.0 + seed}
+        edit_json(
+            root / f"evaluate/astra/seed_{seed}/evaluation.json",
+            target=outcomes([0, 0, 0, 1], seed) | {"steps": [steps] * 4},
+            encoders={"source": means, "target": means},
+        )
+        edit_json(root / f"evaluate/astra_plus/seed_{seed}/evaluation.json", encoders={})
+        edit_json(root / f"train/astra/seed_{seed}/curve.json", points=points)
+    make(root, note="best: ASTRA  survived steps 250")
+    page = (root / "report/results.md").read_text()
+    scores = "survived steps | IQM [95 %] | return | IQM [95 %]"
+    assert f"| method | seeds | {scores} | failed | survived steps in its simulator |" in page
+    assert "| ASTRA | 3 | **250 ± 303** | " in page
+    assert "| **1.0 ± 1.0** | 1.0 [0.0, 2.0] | 0.75 ± 0.00 | 115 ± 0 |" in page
+    assert "has a higher number of survived steps than" in page
+    # Direct transfer lasts 115 steps with every seed.
+    assert "| ASTRA | Direct transfer | 0.33 [" in page
+    assert "| method | encoder | survived steps | return |" in page
+    assert "| ASTRA | source | 50 ± 10 | 201.0 ± 1.0 |" in page
+    assert "success" not in page
+    drawn = images(root / "report")
+    assert drawn == FIGURES - {"success", "trajectories", "mismatch", "learning"} | LASTING_FIGURES
+    stored = (root / "report/results.json").read_text()
+    curve = {"steps": [1000.0, 2000.0, 3000.0], "score": [30.0, None, 90.0]}
+    assert json.loads(stored)["methods"]["astra"]["learning"] == [curve] * 3
+    # What is stored tells the scores by itself.
+    found = Results.model_validate_json(stored)
+    assert found.scores == (SURVIVED_STEPS, RETURN)
+    assert render(found, {name: f"{name}.png" for name in drawn}) == page
 
 
 def test_publishing_copies_all_under_the_recipes_name(root: Path, tmp_path: Path) -> None:
     published = tmp_path / "results"
     make(root, published)
-    figures = {f"antmaze_u_{name}.png" for name in HOW_TO_READ}
+    figures = {f"antmaze_u_{name}.png" for name in FIGURES}
     assert {path.name for path in published.iterdir()} == figures | {"antmaze_u.json", "antmaze_u.md"}
     assert "](antmaze_u_mismatch.png)" in (published / "antmaze_u.md").read_text()
 
