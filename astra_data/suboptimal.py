@@ -1,25 +1,39 @@
-"""A policy that was stopped early: better than chance, far from good."""
+"""Policies that were stopped early: better than chance, far from good."""
 
+from collections import deque
+
+import numpy as np
 import torch
 
 from astra_data.deployment import DeployedPolicy
 from astra_data.learners.ppo import Ppo, PpoConfig
+from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.models.policy import PolicyShape
+from astra_data.models.soft_actor import SoftActor
 from astra_data.progress import Progress
 from astra_data.seeding import derive
 from astra_data.target_world import TargetWorld
 from astra_data.task import Task
 
-_ENVS = 128
-"""Targets that it is trained in."""
+_PPO_ENVS = 128
+_SAC_ENVS = 32
+"""Targets that they are trained in."""
+
+_RECENT = 50
+"""Episodes that tell how long they last at present."""
 
 
-def suboptimal_policy(
+def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, num_threads: int | None, progress: Progress
-) -> DeployedPolicy:
-    """Train a policy without memory by PPO in the target, and stop after `steps` environment steps."""
+) -> tuple[DeployedPolicy, int]:
+    """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
+
+    Returns:
+        the policy, and the environment steps that it was trained for.
+    """
     torch.manual_seed(derive(seed, "suboptimal policy"))
-    world = TargetWorld(task, _ENVS, num_threads=num_threads)
+    world = TargetWorld(task, _PPO_ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
     config = PpoConfig(total_steps=steps)
     ppo = Ppo(world, policy, config, horizon=task.objective.horizon, seed=seed)
@@ -27,4 +41,35 @@ def suboptimal_policy(
         metrics = ppo.iterate()
         note = f"training the behaviour: reward per step {metrics['reward']:.3f}"
         progress(min(1.0, ppo.steps / steps), note)
-    return DeployedPolicy(task, policy.requires_grad_(False))
+    return DeployedPolicy(task, policy.requires_grad_(False)), steps
+
+
+def suboptimal_by_sac(
+    task: Task, *, steps: int, episode_steps: int, seed: int, num_threads: int | None, progress: Progress
+) -> tuple[DeployedPolicy, int]:
+    """Train a policy without memory by SAC in the target, on its full state.
+
+    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest.
+
+    Returns:
+        the policy, and the environment steps that it was trained for.
+    """
+    torch.manual_seed(derive(seed, "suboptimal policy"))
+    world = TargetWorld(task, _SAC_ENVS, observed="full", num_threads=num_threads)
+    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=(256, 256)))
+    config = SacConfig(total_steps=steps, discount=0.99, reward_scale=0.1, learning_rate=3e-4)
+    sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
+    ended: deque[tuple[float, float]] = deque()
+    lasted = 0.0
+    while not sac.done and lasted < episode_steps:
+        metrics = sac.iterate()
+        if metrics["episodes"]:
+            ended.append((metrics["episodes"], metrics["episode_steps"]))
+        counts, means = zip(*ended, strict=True) if ended else ((0.0,), (0.0,))
+        if sum(counts) >= _RECENT:
+            lasted = float(np.average(means, weights=counts))
+        while sum(count for count, _ in list(ended)[1:]) >= _RECENT:
+            ended.popleft()
+        share = max(sac.steps / steps, lasted / episode_steps)
+        progress(min(1.0, share), f"training the behaviour: episodes last {lasted:.0f} steps")
+    return DeployedPolicy(task, actor.requires_grad_(False), observed="full"), sac.steps

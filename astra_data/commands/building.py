@@ -26,7 +26,7 @@ SeedOrSeeds = Annotated[
     ),
 ]
 Behavior = Annotated[
-    str | None, typer.Option(help="random, policy or suboptimal_ppo.", show_default="random")
+    str | None, typer.Option(help="random, policy, suboptimal_ppo or suboptimal_sac.", show_default="random")
 ]
 Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
 MaxSteps = Annotated[int | None, typer.Option(help="Longest episode.", show_default="500")]
@@ -35,6 +35,10 @@ Start = Annotated[
 ]
 PpoSteps = Annotated[
     int | None, typer.Option(help="Steps after which suboptimal_ppo stops learning.", show_default="300000")
+]
+SacEpisodeSteps = Annotated[
+    int | None,
+    typer.Option(help="How long episodes last when suboptimal_sac stops learning.", show_default="500"),
 ]
 Policy = Annotated[str | None, typer.Option(help="Folder of the trained policy.", show_default=False)]
 Grounding = Annotated[
@@ -61,6 +65,7 @@ def collect(
     max_steps: MaxSteps = None,
     start: Start = None,
     ppo_steps: PpoSteps = None,
+    sac_episode_steps: SacEpisodeSteps = None,
     policy: Policy = None,
     grounding: Grounding = None,
     target_encoder: Encoder = None,
@@ -75,6 +80,7 @@ def collect(
         "max_steps": max_steps,
         "start": start,
         "ppo_steps": ppo_steps,
+        "sac_episode_steps": sac_episode_steps,
         "policy": policy,
         "grounding": grounding,
         "target_encoder": target_encoder,

@@ -122,8 +122,8 @@ class Sac:
         """Act for a stretch of steps, and learn after each.
 
         Returns:
-            "success" of the "episodes" that ended and their mean "episode_steps", NaN where none did; the mean
-            "reward" of a step; the "temperature" of the entropy.
+            "success" of the "episodes" that ended and their mean "episode_steps", NaN where none did; the
+            mean "reward" of a step; the "temperature" of the entropy.
         """
         torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
         finished = succeeded = rewarded = lasted = 0.0

@@ -1,6 +1,7 @@
 """Collect: a behaviour in the target environment, stored as a LeRobot dataset."""
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -47,9 +48,10 @@ _TRAINING_SHARE = 0.8
 class CollectConfig(Config):
     """What to collect; 200 episodes of random behaviour of up to 500 steps are the paper's."""
 
-    behavior: Literal["random", "policy", "suboptimal_ppo"] = "random"
-    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "policy": a saved policy, and
-    "suboptimal_ppo": one trained by PPO in the target and stopped early; both draw actions as in training."""
+    behavior: Literal["random", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
+    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "policy": a saved policy;
+    "suboptimal_ppo" and "suboptimal_sac": one trained in the target and stopped early. Policies draw actions
+    as in training."""
     episodes: Count = 200
     """In all."""
     max_steps: Count = 500
@@ -64,7 +66,11 @@ class CollectConfig(Config):
     """A random command is given up once it would lead closer to a wall than this within a second, as
     somebody who steers a robot by hand would; 0: never."""
     ppo_steps: Count = 300_000
-    """Environment steps after which the suboptimal policy's training is stopped."""
+    """Environment steps after which the suboptimal policy's training by PPO is stopped."""
+    sac_steps: Count = 300_000
+    """Environment steps after which its training by SAC is stopped at the latest."""
+    sac_episode_steps: Count = 500
+    """Training by SAC is stopped as soon as its episodes last so many steps on average."""
     policy: str | None = None
     """Folder of the saved policy, as the stage `train` writes it."""
     grounding: str | None = None
@@ -136,7 +142,7 @@ def collect(
         resume=resume,
         fsync=False,
     ) as writer:
-        share = _TRAINING_SHARE if config.behavior == "suboptimal_ppo" else 0.0
+        share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         behavior, told = _behavior(world, config, seed, num_threads, part(progress, 0.0, share))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
@@ -167,13 +173,18 @@ def _behavior(
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
         return RandomCommands(task.objective.action_size, (fewest, most), watch), {}
-    if config.behavior == "suboptimal_ppo":
-        from astra_data.suboptimal import suboptimal_policy  # noqa: PLC0415 - TorchRL is slow to import
-
-        deployed = suboptimal_policy(
-            task, steps=config.ppo_steps, seed=seed, num_threads=num_threads, progress=progress
+    if config.behavior.startswith("suboptimal"):
+        from astra_data.suboptimal import (  # noqa: PLC0415 - TorchRL is slow to import
+            suboptimal_by_ppo,
+            suboptimal_by_sac,
         )
-        return PolicyBehavior(deployed), {"trained_steps": config.ppo_steps}
+
+        if config.behavior == "suboptimal_ppo":
+            by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
+        else:
+            by = partial(suboptimal_by_sac, steps=config.sac_steps, episode_steps=config.sac_episode_steps)
+        deployed, steps = by(task, seed=seed, num_threads=num_threads, progress=progress)
+        return PolicyBehavior(deployed), {"trained_steps": steps}
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
     model = load_grounding(files["grounding"]) if "grounding" in files else None

@@ -137,6 +137,24 @@ def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
     assert dataset.description["behavior"]["trained_steps"] == 1
 
 
+@pytest.mark.parametrize(("episode_steps", "iterations"), [(20, 1), (26, 2)])
+def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
+    task: str, tmp_path: Path, episode_steps: int, iterations: int
+) -> None:
+    """Episodes of this task last 25 steps, and an iteration 64 in each of 32 targets."""
+    config = CollectConfig(
+        behavior="suboptimal_sac",
+        sac_steps=2 * 64 * 32,
+        sac_episode_steps=episode_steps,
+        episodes=3,
+        max_steps=3,
+    )
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    dataset = Dataset.open(tmp_path / "out")
+    assert dataset.reference == f"{TASK}-suboptimal-sac-seed0@data-1.0.0"
+    assert dataset.description["behavior"]["trained_steps"] == iterations * 64 * 32
+
+
 def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
     latent = {"policy": str(trained), "grounding": str(grounded), "target_encoder": str(aligned)}
     config = TINY.model_copy(update={"behavior": "policy", "max_steps": 4, **latent})
