@@ -8,6 +8,7 @@ from torch import Tensor
 from astra_data.columns import ACTION, NEXT_STATE, STATE, Column
 from astra_data.envs.humanoid import HumanoidEnv
 from astra_data.humanoid.abstraction import beyond_extended_kinematics, beyond_kinematics, beyond_walker2d
+from astra_data.humanoid.camera import photograph
 from astra_data.humanoid.model import DAMPING, JOINTS, STATE_SIZE, STIFFNESS, TIMESTEP_S, CommandRanges
 from astra_data.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
 from astra_data.sims.humanoid_kinematics import HumanoidExtendedKinematics, HumanoidKinematics
@@ -82,6 +83,7 @@ def _task(
         timestep_s=TIMESTEP_S,
         action_limit=1.0,
         simulator_id=f"humanoid_{name}",
+        photograph=photograph,
         facts={"stiffness": STIFFNESS, "damping": DAMPING, **CommandRanges().parameters},
     )
 

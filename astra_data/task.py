@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.batched import TargetEnv
@@ -67,6 +69,7 @@ class Task:
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
         plane: what only a task in a maze has; None for others.
+        photograph: pictures (K, height, width, 3) of target states (K, S), where they are worth seeing.
     """
 
     name: str
@@ -84,6 +87,7 @@ class Task:
     simulator_id: str
     facts: Mapping[str, str | float]
     plane: Plane | None = None
+    photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
 
     @property
     def planar(self) -> Plane:

@@ -11,6 +11,7 @@ from astra_data.figures import (
     Foretold,
     OpenLoop,
     Panel,
+    Strip,
     Visits,
     coverage,
     data_efficiency,
@@ -22,6 +23,7 @@ from astra_data.figures import (
     png,
     predictive_validity,
     score_bars,
+    strips,
     trajectories,
 )
 from astra_data.figures.style import COLOURS, DEPLOYED, SIMULATED
@@ -178,6 +180,19 @@ def test_trajectories_draw_a_panel_per_row_with_crosses_where_episodes_fail() ->
     assert not [line for line in follower.lines if line.get_color() == SIMULATED]
     (walls,) = astra.collections
     assert len(walls.get_paths()) == len(U_MAZE.wall_cells())
+
+
+def test_strips_have_a_picture_for_each_moment_until_the_end() -> None:
+    pictures = np.zeros((3, 8, 6, 3), dtype=np.uint8)
+    figure = strips(
+        (0.0, 1.0, 5.0),
+        {"nas": Strip(pictures[:2], ended_s=1.34, failed=True), "astra": Strip(pictures, 5.0, failed=False)},
+    )
+    figure.canvas.draw()
+    assert [len(axes.images) for axes in figure.axes] == [1, 1, 0, 1, 1, 1]
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["0 s", "1 s", "5 s"]
+    told = [[text.get_text() for text in axes.texts] for axes in figure.axes[::3]]
+    assert told == [["NAS", "fell after 1.3 s"], ["ASTRA", "5 s"]]
 
 
 def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:

@@ -9,6 +9,7 @@ from statistics import fmean, stdev
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from astra_data.columns import GOAL, SUCCESS
 from astra_data.dataset import Dataset
@@ -98,6 +99,9 @@ def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     for world in ("target", "simulated", "raw"):
         assert all(1 < steps < 1000 for steps in evaluation[world]["steps"])
         assert evaluation[world]["failed"] == [1.0] * 3
+    states = load_file(folder / "evaluate" / "astra" / "seed_0" / "trajectories.safetensors")["target.state"]
+    assert states.shape == (evaluation["target"]["steps"][0] + 1, 47)
+    assert states[-2, 2] > 1.0 >= states[-1, 2]
     check_page(folder)
 
 

@@ -7,6 +7,7 @@ coverage      coverage: which positions or velocities a dataset holds
 validity      predictive_validity: returns in the simulators against those in the target
 sizes         data_efficiency: a score over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
+strips        strips: episodes in pictures, a strip per method
 walks         walk_prediction: how well models predict a recorded walk, by horizon and size of the data
 """
 
@@ -15,6 +16,7 @@ from astra_data.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.figures.scores import Curve, learning_curves, score_bars
 from astra_data.figures.sizes import Visits, data_efficiency
+from astra_data.figures.strips import Strip, strips
 from astra_data.figures.style import ROLES, method_colour, method_title, png
 from astra_data.figures.validity import Foretold, predictive_validity
 from astra_data.figures.walks import walk_prediction
@@ -25,6 +27,7 @@ __all__ = [
     "Foretold",
     "OpenLoop",
     "Panel",
+    "Strip",
     "Visits",
     "coverage",
     "data_efficiency",
@@ -36,6 +39,7 @@ __all__ = [
     "png",
     "predictive_validity",
     "score_bars",
+    "strips",
     "trajectories",
     "walk_prediction",
 ]

@@ -25,6 +25,10 @@ HOW_TO_READ = {
         "and goals are drawn apart in the two worlds, so the lines are no pairs: compare the ways that they "
         "take and where they end. The number is the success rate in the target over all episodes and seeds."
     ),
+    "strips": (
+        "Pictures of the target at the times above them, of the first evaluation episode of the first seed; "
+        "all rows begin alike. A row of pictures ends where its episode does."
+    ),
     "mismatch": (
         "The same commands in the ungrounded simulator (orange) and, repeatedly, in the target (blue: "
         "mean; bands: 25 to 75 % and 5 to 95 %). Where they part, the simulator lacks something."
@@ -84,6 +88,7 @@ CAPTIONS = {
     "steps": "Survived steps in the target",
     "return": "Return in the target",
     "trajectories": "Trajectories",
+    "strips": "The first episode of each row",
     "mismatch": "The same commands in simulator and target",
     "learning": "Learning curves",
     "learning_steps": "Learning curves",
@@ -100,7 +105,8 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         figures: name → file name of each figure that was drawn; names as in `HOW_TO_READ`.
     """
     sections = [_head(results), _table(results), _comparison(results), _encoders(results)]
-    for name in ("success", "steps", "return", "trajectories", "mismatch", "learning", "learning_steps"):
+    sections += [_figure(score.measure, figures) for score in results.scores]
+    for name in ("trajectories", "strips", "mismatch", "learning", "learning_steps"):
         sections.append(_figure(name, figures))
     sections += [_gap(results), _figure("gap", figures), _validity(results), _figure("validity", figures)]
     sections += [cost(results), origin(results)]

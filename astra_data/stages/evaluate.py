@@ -124,9 +124,9 @@ def evaluate(
             simulators["simulated"] = _own_world(world, trained.simulation, model, config)
     if shown_abstract:
         simulators |= _shared_worlds(world, reference, config)
-    outcomes = {}
+    outcomes, filmed = {}, {}
     for kind, robot in robots.items():
-        outcomes[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
+        outcomes[kind], filmed[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
     if policy is not None:
         told["encoders"] = {
             kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
@@ -134,6 +134,8 @@ def evaluate(
         }
     told |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
     tensors = {"target.position": outcomes[headline].position}
+    if world.photograph is not None:
+        tensors["target.state"] = filmed[headline]
     for name, simulated in simulators.items():
         outcome = _in_simulator(simulated, begin, world.objective.horizon, seed)
         told[name] = outcome.to_json()
@@ -166,8 +168,8 @@ def _in_target(
     seed: int,
     num_threads: int | None,
     progress: Progress,
-) -> tuple[Outcome, float]:
-    """Return what happened in the target, and target steps/s."""
+) -> tuple[Outcome, Tensor, float]:
+    """Return what happened in the target, the states (T + 1, S) of the first episode, and target steps/s."""
     env = task.target(
         config.episodes,
         seed=derive(seed, "evaluation"),
@@ -177,16 +179,20 @@ def _in_target(
     env.reset()
     act = begin(env.goal)
     record = EpisodeRecord(env.position)
+    filmed = [env.state[0]]
     began = time.perf_counter()
     for step in range(task.objective.horizon):
+        is_filmed = bool(record.active[0])
         outcome = env.step(act(env.state, env.goal), record.active)
         success = task.objective.succeeded(outcome.success, env.failed, step + 1)
         record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
+        if is_filmed:
+            filmed.append(env.state[0])
         rate = record.total_steps / (time.perf_counter() - began)
         progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
             break
-    return record.outcome(), rate
+    return record.outcome(), torch.stack(filmed), rate
 
 
 def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str, Tensor]:

@@ -139,7 +139,7 @@ def report(
         figures = figures_of(
             found,
             root,
-            maze=None if task.plane is None else task.maze,
+            task=task,
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
         )
