@@ -11,8 +11,8 @@ from astra_data.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.navigation import Navigation, RewardKind
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
-from astra_data.task import Plane, Task, roles
-from astra_data.variation import WIDE_RANGES
+from astra_data.task import Plane, Task, Varied, roles
+from astra_data.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
 _JOINTS = tuple(f"{joint}_{leg}" for leg in range(1, 5) for joint in ("hip", "ankle"))
 # Left and right swap: legs 1 (front left) and 4, legs 2 (back left) and 3. The hips' axes are vertical, so
@@ -78,13 +78,9 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         action_limit=1.0,
         simulator_id="point_mass",
         facts={"integrator": "RK4", "leg_scale": 1.0},
-        plane=Plane(
-            partial(VariedPointMass, maze, timestep_s=TIMESTEP_S),
-            WIDE_RANGES,
-            wall_reach_m=WALL_REACH_M,
-            # The body is its own mirror image, the learned low-level controller is not.
-            is_mirrorable=False,
-        ),
+        varied=Varied(partial(VariedPointMass, maze, timestep_s=TIMESTEP_S), RANDOMIZED_ACTIONS, WIDE_RANGES),
+        # The body is its own mirror image, the learned low-level controller is not.
+        plane=Plane(wall_reach_m=WALL_REACH_M, is_mirrorable=False),
     )
 
 

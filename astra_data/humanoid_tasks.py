@@ -1,6 +1,7 @@
 """The humanoid's tasks: Gymnasium's humanoid walks, and three simulators that know less and less of it."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -13,7 +14,9 @@ from astra_data.humanoid.model import DAMPING, JOINTS, STATE_SIZE, STIFFNESS, TI
 from astra_data.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
 from astra_data.sims.humanoid_kinematics import HumanoidExtendedKinematics, HumanoidKinematics
 from astra_data.sims.humanoid_walker2d import HumanoidWalker2d
-from astra_data.task import Task, roles
+from astra_data.sims.varied_humanoid import VariedHumanoid
+from astra_data.task import Task, Varied, roles
+from astra_data.variation import JointVariation
 
 _COUNT = len(JOINTS)
 _HORIZON = 1000
@@ -40,6 +43,20 @@ _COLUMNS = (
     Column(ACTION, size=4, meaning="commanded joint angles, ±1 over their ranges", **_COMMAND),
     Column(NEXT_STATE, size=STATE_SIZE, meaning="qpos and qvel one control step later", **_STATE),
 )
+
+RANDOMIZED_ACTIONS = JointVariation(action_noise=(0.05, 0.05), action_scale=(-0.05, 0.05))
+"""Of domain randomization, as printed (Section V-B)."""
+
+WIDE_RANGES = JointVariation(
+    friction=(0.8, 1.2),
+    action_scale=(-0.05, 0.05),
+    action_noise=(0.05, 0.05),
+    observation_scale=(0.9, 1.1),
+    timestep_scale=(1.0, 0.025 / TIMESTEP_S),
+)
+"""Of COMPASS, as printed (Section V-B): "additionally" to domain randomization. A control period of 0.015 to
+0.025 s begins at the simulator's own, so it only ever gets longer; in navigation, whose simulators have
+another, it is read as shares around theirs."""
 
 Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
 Quantities = Mapping[str, tuple[int, ...]]
@@ -85,6 +102,7 @@ def _task(
         simulator_id=f"humanoid_{name}",
         photograph=photograph,
         facts={"stiffness": STIFFNESS, "damping": DAMPING, **CommandRanges().parameters},
+        varied=Varied(partial(VariedHumanoid, kind), RANDOMIZED_ACTIONS, WIDE_RANGES),
     )
 
 

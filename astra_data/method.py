@@ -21,7 +21,7 @@ class Method:
         initial: the method whose policy its own goes on from, if any.
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
         table: the recipe's table with its settings, if it has any; that of its own name where empty.
-        planar: whether it is for tasks in a maze alone, whose simulators' parameters vary.
+        planar: whether it is for tasks in a maze alone.
     """
 
     name: str

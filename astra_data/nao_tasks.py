@@ -21,8 +21,8 @@ from astra_data.sims.ball_agent import BallAgent
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_ball_agent import VariedBallAgent
 from astra_data.sims.varied_point_mass import VariedPointMass
-from astra_data.task import MakeVariedSimulator, Plane, Task, roles
-from astra_data.variation import WIDE_RANGES, BallVariation, Variation
+from astra_data.task import Plane, Task, Varied, roles
+from astra_data.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 Level = Literal["mujoco", "surrogate"]
 
@@ -126,13 +126,10 @@ def _task(name: str, level: Level, *, ball: bool, **own: Any) -> Task:  # noqa: 
         timestep_s=CONTROL_STEP_S,
         action_limit=1.0,
         facts={"stand_in": level, "tick_s": TICK_S},
+        # A robot's joints are off by what is its own.
+        plane=Plane(wall_reach_m=0.3, is_mirrorable=False),
         **own,
     )
-
-
-def _plane(make_varied_simulator: MakeVariedSimulator, ranges: Variation) -> Plane:
-    # A robot's joints are off by what is its own.
-    return Plane(make_varied_simulator, ranges, wall_reach_m=0.3, is_mirrorable=False)
 
 
 def _navigation(level: Level) -> Task:
@@ -157,7 +154,7 @@ def _navigation(level: Level) -> Task:
             ends_at_walls=True,
         ),
         make_simulator=partial(PointMass, S_MAZE, **_BODY),
-        plane=_plane(partial(VariedPointMass, S_MAZE, **_BODY), WIDE_RANGES),
+        varied=Varied(partial(VariedPointMass, S_MAZE, **_BODY), RANDOMIZED_ACTIONS, WIDE_RANGES),
         abstraction=nao_to_point_mass,
         simulator_id="point_mass",
     )
@@ -171,7 +168,7 @@ def _kicking(level: Level) -> Task:
         instruction="kick the ball into the goal",
         objective=Kicking(FIELD, horizon=156),
         make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT),
-        plane=_plane(partial(VariedBallAgent, FIELD, **_BODY, **_CONTACT), KICK_RANGES),
+        varied=Varied(partial(VariedBallAgent, FIELD, **_BODY, **_CONTACT), RANDOMIZED_ACTIONS, KICK_RANGES),
         abstraction=nao_to_ball_agent,
         simulator_id="ball_agent",
     )

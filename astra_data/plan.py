@@ -266,8 +266,7 @@ def grounded_as(base: str) -> str:
 def _settings(recipe: Recipe, base: str, stage: str) -> Config | None:
     """Return the recipe's table for a method, where it has one for `stage`."""
     table = METHODS[base].table or base
-    settings: Config | None = getattr(recipe, table) if METHOD_TABLES.get(table) == stage else None
-    return settings
+    return recipe.settings_of(table) if METHOD_TABLES.get(table) == stage else None
 
 
 def _existing(*keys: str | None) -> tuple[str, ...]:

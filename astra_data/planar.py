@@ -71,11 +71,6 @@ class VariedStates(PlanarStates, ABC):
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return what is shown of the new state (B, X)."""
 
-    def redraw(self, rows: Tensor) -> None:
-        """Draw new parameters for the rows `rows` (n,)."""
-        drawn = self.variation.draw(len(rows), self.parameters.device)
-        self.parameters = self.parameters.index_copy(0, rows, drawn)
-
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
         super().reset_to(state, rows)

@@ -9,7 +9,6 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.gap import distances
 from astra_data.task import Task
-from astra_data.variation import Variation
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,13 @@ class Recorded:
         chosen = first % length == 0
         return cls.at(episodes, episode[chosen], first[chosen], length)
 
-    @property
-    def summary(self) -> Tensor:
-        """What the causal model knows of a window: first velocity and mean command, (W, 4)."""
-        return torch.cat([self.state[:, 2:], self.action.mean(1)], dim=-1)
+    def summary(self, task: Task) -> Tensor:
+        """Return what a causal model knows of windows: first state and mean command, (W, K), each about one.
+
+        Where in a maze a window begins does not matter.
+        """
+        known = self.state[:, 2:] if task.plane else task.objective.observe(self.state, self.state[:, :0])
+        return torch.cat([known, self.action.mean(1)], dim=-1)
 
 
 def beginnings(episodes: PairedEpisodes, length: int) -> tuple[Tensor, Tensor]:
@@ -60,7 +62,7 @@ def beginnings(episodes: PairedEpisodes, length: int) -> tuple[Tensor, Tensor]:
 def trajectory_gaps(task: Task, recorded: Recorded, parameters: Tensor, seed: int) -> Tensor:
     """Replay W windows with each of `parameters` (C, P) and the same noise; return their gaps (C, W, Q)."""
     count, length = recorded.action.shape[:2]
-    simulator = task.varied_simulator(count, Variation(), str(recorded.state.device))
+    simulator = task.varied_simulator(count, type(task.varied.wide)(), str(recorded.state.device))
     gaps = []
     for context in parameters:
         torch.manual_seed(seed)

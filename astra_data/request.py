@@ -4,7 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from pydantic import Field, JsonValue, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    Field,
+    JsonValue,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
 
 from astra_data.dataset.edit import share
 from astra_data.errors import BadInputError
@@ -26,7 +33,7 @@ from astra_data.stages.report import ReportConfig
 from astra_data.target_training import TargetConfig
 from astra_data.tasks import TASKS
 from astra_data.training import AnyTrainConfig
-from astra_data.variation import RANDOMIZED_ACTIONS, Variation
+from astra_data.variation import AnyVariation
 
 STAGES: dict[str, tuple[str, ...]] = {
     "collect": (),
@@ -91,16 +98,17 @@ class Recipe(Config):
     sweep: SweepConfig = SweepConfig()
     plus: AnyTrainConfig
     """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
-    domain_randomization: Variation = RANDOMIZED_ACTIONS
-    """What domain randomization varies; by default as the paper prints it for navigation."""
+    domain_randomization: AnyVariation
+    """What domain randomization varies, laid over the task's ranges for it."""
     nas_golemo: GolemoConfig = GolemoConfig()
     """How the residual model of Golemo et al. is fitted."""
     rma: RmaConfig = RmaConfig()
     """How the student of rapid motor adaptation learns."""
     target: TargetConfig = TargetConfig()
     """The training of `target` and `full_obs`, laid over `[train]`."""
-    compass: CompassConfig = CompassConfig()
-    """The ranges of `compass` and `compass_uniform`, and how the former identifies its parameters."""
+    compass: CompassConfig
+    """The ranges of `compass` and `compass_uniform`, laid over the task's, and how the former identifies its
+    parameters."""
     iql: IqlConfig = IqlConfig()
     """How IQL learns."""
     direct_transfer_iql: IqlConfig = FINE_TUNING
@@ -116,16 +124,21 @@ class Recipe(Config):
         """What its rows are compared by above all."""
         return TASKS[self.task].objective.scores[0]
 
-    @property
-    def compass_uniform(self) -> Variation:
-        """What `compass_uniform` varies."""
-        return self.compass.ranges_for(TASKS[self.task])
+    def settings_of(self, table: str) -> Config:
+        """Return the settings of a method; of ranges to train in, those that the task's simulator has."""
+        varied = TASKS[self.task].varied
+        if table == "compass_uniform":
+            return self.compass.of_kind(type(varied.wide))
+        if table == "domain_randomization":
+            return self.domain_randomization.of_kind(type(varied.randomized))
+        settings: Config = getattr(self, table)
+        return settings
 
     @model_validator(mode="before")
     @classmethod
     def _add_empty_sections(cls, tables: dict[str, Any]) -> dict[str, Any]:
         needed = {name for name, field in cls.model_fields.items() if field.is_required()}
-        return {table: {} for table in (*STAGES, "plus") if table in needed} | tables
+        return {table: {} for table in (*STAGES, "plus", *METHOD_TABLES) if table in needed} | tables
 
     @field_validator("plus", mode="before")
     @classmethod
@@ -134,6 +147,25 @@ class Recipe(Config):
         if train is None or not isinstance(overrides, dict):
             return overrides
         return train.model_dump() | overrides
+
+    @field_validator("domain_randomization", "compass", mode="wrap")
+    @classmethod
+    def _lay_over_ranges(
+        cls,
+        overrides: Any,  # noqa: ANN401 - `check` tells
+        check: ValidatorFunctionWrapHandler,
+        info: ValidationInfo,
+    ) -> Any:  # noqa: ANN401 - what `check` returns
+        if "task" not in info.data or not isinstance(overrides, dict):
+            return check(overrides)
+        varied = TASKS[info.data["task"]].varied
+        usual = varied.wide if info.field_name == "compass" else varied.randomized
+        ranges = check(usual.model_dump() | overrides)
+        try:
+            ranges.of_kind(type(usual))
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return ranges
 
     @field_validator("task")
     @classmethod

@@ -7,13 +7,12 @@ from torch.nn import functional
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, Windows
 from astra_data.models.residual import ResidualModel
-from astra_data.planar import VariedStates
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.randomized import RandomizedSimulator
 from astra_data.simulator import PlacedSimulator
 from astra_data.task import Task
-from astra_data.variation import Variation
+from astra_data.variation import Variation, VariedSimulator
 
 Simulator = PlacedSimulator | RandomizedSimulator | GroundedSimulator | AugmentedSimulator
 """As it is, or in one of the wrappers."""
@@ -100,10 +99,10 @@ def start_simulator(
         simulator.reset_to(state, rows)
     varied = varied_within(simulator)
     if varied is not None:
-        varied.redraw(rows)
+        varied.parameters = varied.variation.redraw(varied.parameters, rows)
 
 
-def varied_within(simulator: Simulator) -> VariedStates | None:
+def varied_within(simulator: Simulator) -> VariedSimulator | None:
     """Return the simulator with varying parameters inside `simulator`, if there is one."""
     inner = simulator.simulator if isinstance(simulator, RandomizedSimulator) else simulator
-    return inner if isinstance(inner, VariedStates) else None
+    return inner if isinstance(inner, VariedSimulator) else None

@@ -13,9 +13,8 @@ from astra_data.columns import Column
 from astra_data.errors import BadInputError
 from astra_data.mazes import Maze
 from astra_data.objective import Objective, PlanarObjective
-from astra_data.planar import VariedStates
 from astra_data.simulator import PairedSimulator
-from astra_data.variation import Variation
+from astra_data.variation import Variation, VariedSimulator
 
 
 class MakeSimulator(Protocol):
@@ -29,9 +28,25 @@ class MakeSimulator(Protocol):
 class MakeVariedSimulator(Protocol):
     """Builds B abstract simulators whose parameters vary."""
 
-    def __call__(self, num_envs: int, variation: Variation, *, device: str) -> VariedStates:
+    def __call__(self, num_envs: int, variation: Variation, *, device: str) -> VariedSimulator:
         """Build `num_envs` simulators."""
         ...
+
+
+@dataclass(frozen=True)
+class Varied:
+    """How the parameters of an abstract simulator vary from episode to episode.
+
+    Attributes:
+        make_simulator: builds simulators whose parameters vary.
+        randomized: what domain randomization varies, in which ranges.
+        wide: what COMPASS varies or identifies, and RMA adapts to; its kind is that of all parameters that
+            the simulator has.
+    """
+
+    make_simulator: MakeVariedSimulator
+    randomized: Variation
+    wide: Variation
 
 
 @dataclass(frozen=True)
@@ -39,14 +54,10 @@ class Plane:
     """What is known of a robot in a plane, among the walls of a maze.
 
     Attributes:
-        make_varied_simulator: builds abstract simulators whose parameters vary.
-        ranges: of these parameters, as the paper prints them for COMPASS.
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
         is_mirrorable: whether the robot, its controller included, is its own mirror image.
     """
 
-    make_varied_simulator: MakeVariedSimulator
-    ranges: Variation
     wall_reach_m: float
     is_mirrorable: bool
 
@@ -68,6 +79,7 @@ class Task:
         quantities: of abstract states that the gap report tells of, named with their unit: their indices.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
+        varied: the same simulator with parameters that vary.
         plane: what only a task in a maze has; None for others.
         photograph: pictures (K, height, width, 3) of target states (K, S), where they are worth seeing.
     """
@@ -86,6 +98,7 @@ class Task:
     quantities: Mapping[str, tuple[int, ...]]
     simulator_id: str
     facts: Mapping[str, str | float]
+    varied: Varied
     plane: Plane | None = None
     photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
 
@@ -115,7 +128,7 @@ class Task:
         """Return the error of who asks for something planar though there is no maze."""
         return BadInputError(
             f"expected a task in a maze, got '{self.name}', which has neither walls nor places: leave out "
-            "what needs them (augment, follower, varied parameters, support_penalty, command_limit_m_s, "
+            "what needs them (augment, follower, support_penalty, command_limit_m_s, "
             "clearance_m, start 'anywhere')"
         )
 
@@ -132,13 +145,9 @@ class Task:
         """Build `num_envs` abstract simulators."""
         return self.make_simulator(num_envs, device=device)
 
-    def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedStates:
-        """Build `num_envs` abstract simulators whose parameters vary.
-
-        Raises:
-            BadInputError: the task has no maze, and so none of these.
-        """
-        return self.planar.make_varied_simulator(num_envs, variation, device=device)
+    def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedSimulator:
+        """Build `num_envs` abstract simulators whose parameters vary."""
+        return self.varied.make_simulator(num_envs, variation, device=device)
 
 
 def roles(

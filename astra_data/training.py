@@ -159,12 +159,12 @@ class InSimulator:
 
     Attributes:
         reward: where the reward comes from, unless the recipe says.
-        variation: of the simulator's parameters from episode to episode, unless a grounding is a variation
-            or the method's own settings are one.
+        ranges: which of the task's ranges the simulator's parameters are drawn from, unless a grounding is a
+            variation or the method's own settings are one; None where they stay plain.
     """
 
     reward: RewardSource = "abstract"
-    variation: Variation | None = None
+    ranges: Literal["randomized", "wide"] | None = None
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
@@ -181,7 +181,8 @@ class InSimulator:
         config, settings = training.config, training.settings
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
         switches = switches.model_copy(update={"reward": switches.reward or self.reward})
-        variation = settings if isinstance(settings, Variation) else self.variation
+        usual: Variation | None = getattr(training.task.varied, self.ranges) if self.ranges else None
+        variation = settings if isinstance(settings, Variation) else usual
         parts = world_parts(training.task, switches, training.episodes, training.grounding, variation)
         env = training_world(
             training.task,

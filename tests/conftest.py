@@ -28,7 +28,8 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     experiment = importlib.import_module("astra_data.experiment")
     for module in (plan, request, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
-    task = SimpleNamespace(plane=object(), objective=SimpleNamespace(scores=(SUCCESS,)))
+    varied = request.TASKS["antmaze-umaze"].varied
+    task = SimpleNamespace(plane=object(), varied=varied, objective=SimpleNamespace(scores=(SUCCESS,)))
     monkeypatch.setattr(request, "TASKS", {"maze": task})
     monkeypatch.setattr("astra_data.experiment.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.

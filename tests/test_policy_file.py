@@ -12,14 +12,14 @@ from astra_data.models.adaptation import AdaptiveShape, Student
 from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.training_world import WorldConfig
-from astra_data.variation import Variation
+from astra_data.variation import PlanarVariation
 
 
 def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
     thinness, scatter = torch.rand(6, 5), torch.randn(4, 4)
     world = WorldConfig(reward="blend", topple=True, residual_noise=0.5)
-    variation = Variation(friction=(0.8, 1.2))
+    variation = PlanarVariation(friction=(0.8, 1.2))
     simulation = Simulation(thinness, scatter, world, variation)
     saved = PolicyFile(policy, simulation, "toy@data-1.0.0", "abc")
     saved.save(tmp_path / "policy.safetensors")
@@ -54,7 +54,7 @@ def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("grounding", "kind"),
-    [(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), "history"), (Variation(), "variation")],
+    [(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), "history"), (PlanarVariation(), "variation")],
 )
 def test_a_grounding_is_no_policy(grounding: Grounding, kind: str, tmp_path: Path) -> None:
     path = tmp_path / "policy.safetensors"

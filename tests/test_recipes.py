@@ -59,7 +59,7 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
 @pytest.mark.parametrize(
     ("more", "end", "asked"),
     [
-        (', "rma", "follower"', "", "methods: rma, methods: follower"),
+        (', "rma", "follower"', "", "methods: follower"),
         ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
         ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
         ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),

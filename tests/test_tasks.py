@@ -8,13 +8,11 @@ from astra_data.behaviors import WallWatch
 from astra_data.columns import ACTION, GOAL, STATE
 from astra_data.errors import BadInputError
 from astra_data.free_space import FreeSpace
-from astra_data.methods.compass import CompassConfig
 from astra_data.methods.follower import careful
 from astra_data.objective import PlanarObjective
-from astra_data.simulators import simulator_of
 from astra_data.task import Task
 from astra_data.tasks import TASKS, task_named
-from astra_data.variation import RANDOMIZED_ACTIONS
+from astra_data.variation import VariedSimulator
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -36,6 +34,20 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     assert simulator.parameters["timestep_s"] == task.timestep_s
     started = torch.from_numpy(task.objective.draw_starts(np.random.default_rng(0), 2))
     assert started.shape == abstract.shape
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_simulators_vary(task: Task) -> None:
+    state, action = task.simulator(3).state, torch.full((3, task.objective.action_size), 0.5)
+    landed = []
+    for variation in (task.varied.randomized, task.varied.wide, type(task.varied.wide)()):
+        torch.manual_seed(0)
+        simulator = task.varied_simulator(3, variation)
+        assert isinstance(simulator, VariedSimulator)
+        simulator.reset_to(state)
+        landed.append(simulator.step(action).clone())
+    assert len(landed[0].unique(dim=0)) == len(landed[1].unique(dim=0)) == 3
+    torch.testing.assert_close(landed[2], task.simulator(3).step(action))
 
 
 IN_A_MAZE = [task for task in TASKS.values() if task.plane is not None]
@@ -67,11 +79,8 @@ def test_who_asks_for_a_maze_where_there_is_none_is_told() -> None:
     nowhere = TASKS["humanoid-walker2d"]
     asked: list[Callable[[], object]] = [
         lambda: nowhere.maze,
-        lambda: nowhere.varied_simulator(1, RANDOMIZED_ACTIONS),
         lambda: WallWatch(nowhere, 0.2),
         lambda: careful(nowhere, torch.zeros(1, 0)),
-        lambda: simulator_of(nowhere, None, 1, "cpu", variation=RANDOMIZED_ACTIONS),
-        lambda: CompassConfig().ranges_for(nowhere),
     ]
     for ask in asked:
         with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):

@@ -2,15 +2,15 @@ import pytest
 import torch
 from pydantic import ValidationError, create_model
 
-from astra_data.errors import RecipeError
+from astra_data.errors import BadInputError, RecipeError
 from astra_data.methods.compass import CompassConfig
 from astra_data.recipe import Config, validated
-from astra_data.variation import Variation
+from astra_data.variation import AnyVariation, BallVariation, JointVariation, PlanarVariation, Variation
 
 
 def test_parameters_are_drawn_uniformly_from_their_ranges() -> None:
     torch.manual_seed(0)
-    variation = Variation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     drawn = dict(zip(variation.names, variation.draw(20_000).unbind(-1), strict=True))
     assert (drawn["timestep_scale"] == 1.0).all() and (drawn["action_noise"] == 0.0).all()
     for name, (low, high) in {"friction": (0.8, 1.2), "heading_bias_deg": (-5.0, 5.0)}.items():
@@ -22,20 +22,57 @@ def test_parameters_are_drawn_uniformly_from_their_ranges() -> None:
 
 
 def test_normal_parameters_are_between_minus_one_and_one() -> None:
-    variation = Variation(friction=(0.8, 1.2), action_scale=(0.1, 0.1))
+    variation = PlanarVariation(friction=(0.8, 1.2), action_scale=(0.1, 0.1))
     ends = variation.ranges().T
     torch.testing.assert_close(variation.normal(ends)[:, 0], torch.tensor([-1.0, 1.0]))
     assert variation.normal(ends)[:, 1:].abs().max() == 0.0
 
 
-def test_it_survives_json_and_refuses_an_upside_down_range() -> None:
-    variation = Variation(friction=(0.8, 1.2))
+KINDS = (PlanarVariation, BallVariation, JointVariation)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_survives_json_and_knows_its_parameters(kind: type[Variation]) -> None:
+    variation = kind(**{name: (0.8, 1.2) for name in kind.model_fields})
     assert Variation.of_json({name: list(ends) for name, ends in variation.model_dump().items()}) == variation
+    assert variation.names == tuple(kind.model_fields)
+    # What steers stays, noise and sensors become plain.
+    noiseless = variation.noiseless()
+    assert type(noiseless) is kind
+    changed = {name for name in kind.model_fields if getattr(noiseless, name) != (0.8, 1.2)}
+    assert changed == {name for name in kind.model_fields if "noise" in name or "observation" in name}
+    assert changed == set(variation.names) - set(kind.steering)
+    assert all(getattr(noiseless, name) == getattr(kind(), name) for name in changed)
+    replayed = variation.replayed()
+    sensed = {name for name in kind.model_fields if getattr(replayed, name) != (0.8, 1.2)}
+    assert sensed == set(kind.sensing) == {name for name in kind.model_fields if "observation" in name}
+
+
+def test_redrawing_leaves_the_other_rows_alone() -> None:
+    variation = PlanarVariation(friction=(0.8, 1.2))
+    before = variation.draw(4)
+    after = variation.redraw(before, torch.tensor([1, 3]))
+    assert (after != before).any(-1).tolist() == [False, True, False, True]
+
+
+def test_of_any_ranges_a_simulator_takes_its_own() -> None:
+    ranges = AnyVariation(friction=(0.8, 1.2), observation_scale=(0.9, 1.1))
+    assert ranges.of_kind(JointVariation) == JointVariation(
+        **ranges.model_dump(include={*JointVariation().names})
+    )
+    assert AnyVariation(**BallVariation().model_dump()).of_kind(PlanarVariation) == PlanarVariation()
+    with pytest.raises(
+        BadInputError, match=r"^expected ranges of friction, .*, got one of observation_scale$"
+    ):
+        ranges.of_kind(BallVariation)
+
+
+def test_an_upside_down_range_is_refused() -> None:
     with pytest.raises(ValidationError, match="expected the lower end first"):
-        Variation(friction=(1.2, 0.8))
+        PlanarVariation(friction=(1.2, 0.8))
 
 
-@pytest.mark.parametrize("model", [Variation, CompassConfig])
+@pytest.mark.parametrize("model", [PlanarVariation, CompassConfig])
 @pytest.mark.parametrize(
     ("name", "ends", "expected"),
     [

@@ -7,7 +7,7 @@ from astra_data.navigation import Navigation
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
-from astra_data.variation import Variation
+from astra_data.variation import PlanarVariation
 from astra_data.world import DataStarts, SimulatorWorld, policy_observation
 
 TASK = Navigation(U_MAZE, horizon=700)
@@ -127,7 +127,7 @@ def test_caution_scales_the_penalties() -> None:
 
 
 def test_parameters_of_the_episode_are_told_where_asked_for() -> None:
-    variation = Variation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPointMass(U_MAZE, 4, variation, timestep_s=0.05)
     assert SimulatorWorld(TASK, simulator).observation_size == 8
     telling = SimulatorWorld(TASK, simulator, tells_parameters=True)

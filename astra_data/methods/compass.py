@@ -24,43 +24,20 @@ from astra_data.recipe import Count
 from astra_data.replays import Recorded, beginnings, trajectory_gaps
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
-from astra_data.task import Task
 from astra_data.training import InSimulator
-from astra_data.variation import WIDE_RANGES, BallVariation, FactorRange, NoiseRange, Range, Variation
-
-STEERING = (
-    *("friction", "action_scale", "heading_bias_deg", "timestep_scale"),
-    *("ball_friction", "contact_direction_deg"),
-)
-"""What is identified. The others are noise, with which no replay comes closer to a recording, however noisy
-the target is: noise keeps its ranges, and is drawn from them while the policy is trained."""
+from astra_data.variation import AnyVariation, Variation
 
 Mask = dict[str, dict[str, float]]
 """How probably each parameter reaches each gap, by their names. Gaps, the effects, are means over a window of
 the distance between the simulator and the target in each of the task's quantities."""
 
 
-class CompassConfig(BallVariation, CausalConfig):
-    """Ranges of the parameters, as the paper prints them (Section V-A), and how they are identified.
+class CompassConfig(AnyVariation, CausalConfig):
+    """Ranges of the parameters, and how they are identified, of which the paper prints nothing.
 
-    The paper prints a control period of 0.015 to 0.025 s, which is read as shares of one of 0.02 s. It prints
-    nothing of what follows the ranges.
+    Only what steers is identified (see `Variation`). The rest keeps its ranges, and is drawn from them while
+    the policy is trained.
     """
-
-    friction: FactorRange = WIDE_RANGES.friction
-    """Factor on the speed that a command gives."""
-    action_scale: Range = WIDE_RANGES.action_scale
-    """Share by which commands are too long."""
-    action_noise: NoiseRange = WIDE_RANGES.action_noise
-    """Standard deviation of Gaussian noise on commands, in m/s."""
-    position_noise_m: NoiseRange = WIDE_RANGES.position_noise_m
-    """Half width of the uniform noise on shown positions."""
-    velocity_noise_m_s: NoiseRange = WIDE_RANGES.velocity_noise_m_s
-    """Half width of the uniform noise on shown velocities."""
-    heading_bias_deg: Range = WIDE_RANGES.heading_bias_deg
-    """Commands are turned by this angle."""
-    timestep_scale: FactorRange = WIDE_RANGES.timestep_scale
-    """Factor on the control period."""
 
     iterations: Count = 5
     """Replays, each followed by a fit of the causal model and a step of the parameters."""
@@ -79,13 +56,8 @@ class CompassConfig(BallVariation, CausalConfig):
     the plain simulator; or around it, with parameters from the last ranges, which are still the whole ranges
     of what was not identified."""
 
-    def ranges_for(self, task: Task) -> Variation:
-        """Return the ranges of the parameters that the simulator of `task` has."""
-        kind = type(task.planar.ranges)
-        return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
-
-def parameters_at(point: Mapping[str, float], kind: type[Variation] = Variation) -> Tensor:
+def parameters_at(point: Mapping[str, float], kind: type[Variation]) -> Tensor:
     """Return the parameters (P,) of a simulator without noise that is plain but for `point`."""
     return kind(**{name: (value, value) for name, value in point.items()}).ranges()[:, 0]
 
@@ -95,7 +67,7 @@ class Search:
     """How far the identification is.
 
     Attributes:
-        box: where the parameters are sought. point: the best so far, of `STEERING`.
+        box: where the parameters are sought. point: the best so far, of what steers.
         found: what each finished iteration tells. spent: the time that they took; None before the first.
     """
 
@@ -111,8 +83,7 @@ class Search:
             _, told = load_tensors(checkpoint)
             return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
         plain = type(ranges)()
-        steering = [name for name in ranges.names if name in STEERING]
-        point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in steering}
+        point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in ranges.steering}
         return cls(ranges, point, [], None)
 
     def save(self, checkpoint: Path) -> None:
@@ -144,13 +115,15 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
         plain simulator and at the point (without noise), and the same of every iteration.
 
     Raises:
-        BadInputError: no episode is as long as a window, or none of `STEERING` has a range.
+        BadInputError: no episode is as long as a window, or nothing that steers has a range.
     """
-    config = fitting.settings if isinstance(fitting.settings, CompassConfig) else CompassConfig()
+    config, wide = fitting.settings, fitting.task.varied.wide
+    if not isinstance(config, CompassConfig):
+        config = CompassConfig(**wide.model_dump())
     checkpoint = fitting.folder / "checkpoint.safetensors"
-    ranges = config.ranges_for(fitting.task)
-    if not set(STEERING).intersection(_varied(ranges)):
-        raise BadInputError(f"[compass]: expected a range for at least one of {', '.join(STEERING)}")
+    ranges = config.of_kind(type(wide))
+    if not set(ranges.steering).intersection(_varied(ranges)):
+        raise BadInputError(f"[compass]: expected a range for at least one of {', '.join(ranges.steering)}")
     held_out = Recorded.side_by_side(fitting.held_out, config.window)
 
     def held_out_gap(point: Mapping[str, float]) -> dict[str, float]:
@@ -158,8 +131,9 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
         gaps = trajectory_gaps(fitting.task, held_out, at, fitting.seed)
         return dict(zip(fitting.task.quantities, gaps.mean((0, 1)).tolist(), strict=True))
 
-    search, plain = Search.begin(ranges, checkpoint), held_out_gap({})
+    search, plain = Search.begin(ranges.replayed(), checkpoint), held_out_gap({})
     stopwatch, replays = Stopwatch(search.spent), config.contexts * config.windows
+    first = next(iter(plain))
     for iteration in range(len(search.found), config.iterations):
         mask = _iterate(search, config, fitting, f"compass {iteration}")
         gap = held_out_gap(search.point)
@@ -167,14 +141,13 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
         search.spent = stopwatch.spent()
         search.save(checkpoint)
         rate = (iteration + 1) * replays / stopwatch.seconds
-        closed = f"held-out gap {plain['position_m']:.3f} → {gap['position_m']:.3f} m"
+        closed = f"held-out gap {plain[first]:.3f} → {gap[first]:.3f} {first}"
         note = f"{rate:,.0f} replays/s  {closed}"
         fitting.progress((iteration + 1) / config.iterations, note)
-    grounding = search.box
+    found = {name: getattr(search.box, name) for name in ranges.steering}
     if config.policy_at == "point":
-        ends = {name: (value, value) for name, value in search.point.items()}
-        grounding = type(ranges)(**(search.box.model_dump() | ends))
-    return grounding, {
+        found = {name: (value, value) for name, value in search.point.items()}
+    return ranges.model_copy(update=found), {
         "replays_per_second": config.iterations * replays / stopwatch.seconds,
         **stopwatch.spent(),
         "mask": search.found[0]["mask"],
@@ -204,14 +177,14 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     scale = difference.std((0, 1)).clamp_min(1e-9)
     varied = _varied(box)
     columns = [box.names.index(parameter) for parameter in varied]
-    summary = recorded.summary[usual]
+    summary = recorded.summary(fitting.task)[usual]
     parameters = box.normal(contexts)[:, None, columns].expand(-1, len(summary), -1)
     cause = torch.cat([parameters, summary.expand(len(contexts), -1, -1)], dim=-1)
     effect = (difference / scale).flatten(0, 1)
     torch.manual_seed(derive(fitting.seed, f"{name} model"))
     model = fit_causes(cause.flatten(0, 1), effect, config, penalised=len(varied))
     mask = (model.probability > config.mask_threshold).float()
-    steers = torch.tensor([parameter in STEERING for parameter in varied], device=device)
+    steers = torch.tensor([parameter in box.steering for parameter in varied], device=device)
     moves = mask[: len(varied)].any(-1) & steers
     kind = type(box)
     here = box.normal(parameters_at(search.point, kind))[columns].to(device)
@@ -234,12 +207,11 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     return dict(zip(varied, rows, strict=False))
 
 
-COMPASS = Method(name="compass", title="COMPASS", fit=identify, planar=True)
+COMPASS = Method(name="compass", title="COMPASS", fit=identify)
 
 COMPASS_UNIFORM = Method(
     name="compass_uniform",
     title="COMPASS, uniform",
-    learn=InSimulator(variation=WIDE_RANGES),
-    planar=True,
+    learn=InSimulator(ranges="wide"),
 )
 """COMPASS as the paper describes it: every episode draws its parameters from the ranges."""

@@ -1,10 +1,9 @@
 """Rapid motor adaptation: infer the simulator's parameters online (Section V-A; after Kumar et al. 2021).
 
-The parameters and their ranges are those that the paper prints for COMPASS. Its "position noise (±0.03m)" is
-read as uniform noise of that half width, its control timestep of 0.015 to 0.025 s as a quarter more
-or less than the simulator's own. Kumar et al.'s policy has no memory; ours has that of every policy of a raw
-simulator, and differs from domain randomization in the parameters that vary and in the extrinsics alone.
-Without it, a million steps taught it nothing on the Long Maze, where others then begin to succeed.
+The parameters and their ranges are those that the paper prints for COMPASS, as the task has them. Kumar et
+al.'s policy has no memory; ours has that of every policy of a raw simulator, and differs from domain
+randomization in the parameters that vary and in the extrinsics alone. Without it, a million steps taught it
+nothing on the Long Maze, where others then begin to succeed.
 """
 
 from dataclasses import dataclass, replace
@@ -33,8 +32,7 @@ class TeacherThenStudent(InSimulator):
         if not isinstance(config, PpoTrainConfig):
             raise BadInputError(f'rma: expected train.learner "ppo", got "{config.learner}"')
         settings = training.settings if isinstance(training.settings, RmaConfig) else RmaConfig()
-        told = replace(self, variation=training.task.planar.ranges)
-        env, simulation = told.world(training, tells_parameters=True)
+        env, simulation = self.world(training, tells_parameters=True)
         torch.manual_seed(derive(seed, "policy"))
         shape = AdaptiveShape(
             observation_size=env.observation_size - env.parameter_count,
@@ -64,6 +62,5 @@ class TeacherThenStudent(InSimulator):
 RMA = Method(
     name="rma",
     title="RMA",
-    learn=TeacherThenStudent(),
-    planar=True,
+    learn=TeacherThenStudent(ranges="wide"),
 )

@@ -27,8 +27,6 @@ The extended one leaves out:
 * Flight, slipping and double support: one foot always stands, the other never brakes. The floor is nowhere.
 """
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -76,16 +74,27 @@ class HumanoidKinematics(FreeStates):
         self.ranges = ranges or CommandRanges()
         standing = type(self).abstraction(torch.tensor(STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
-        damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
-        self._approach = STIFFNESS / (DAMPING + damping)
+        self._damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
+        self._approach = STIFFNESS / (DAMPING + self._damping)
+        self._timestep_s = torch.tensor(TIMESTEP_S, device=device)
 
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
 
+    def vary(self, friction: Tensor, timestep_scale: Tensor) -> None:
+        """Give each humanoid joints of its own, and a control step of its own.
+
+        Args:
+            friction: factors (B,) on the joints' damping d.
+            timestep_scale: factors (B,) on the control step.
+        """
+        self._approach = STIFFNESS / (DAMPING + friction.unsqueeze(-1) * self._damping)
+        self._timestep_s = TIMESTEP_S * timestep_scale.unsqueeze(-1)
+
     def step(self, action: Tensor) -> Tensor:
-        """Follow the commands `action` (B, 4) for 0.015 s; return the new state (B, X)."""
+        """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, X)."""
         self.state = self._moved(action)
         return self.state
 
@@ -94,7 +103,7 @@ class HumanoidKinematics(FreeStates):
         angles = self.state[:, :_COUNT]
         target = torch.zeros_like(angles)
         target[:, COMMANDED] = self.ranges.targets(action)
-        left = (target - angles) * torch.exp(-self._approach * TIMESTEP_S)
+        left = (target - angles) * torch.exp(-self._approach * self._timestep_s)
         return torch.cat([target - left, self._approach * left], dim=-1)
 
 
@@ -150,8 +159,8 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         aside = (later_mass - later_feet.mean(1)) - (mass - feet.mean(1))
         stance = feet[..., 2].argmin(dim=-1)
         rows = torch.arange(len(feet), device=feet.device)
-        driven = ((later_mass - later_feet[rows, stance]) - (mass - feet[rows, stance])) / TIMESTEP_S
-        share = 1.0 - math.exp(-TIMESTEP_S / self.follow_s)
+        driven = ((later_mass - later_feet[rows, stance]) - (mass - feet[rows, stance])) / self._timestep_s
+        share = -torch.expm1(-self._timestep_s / self.follow_s)
         velocity = torch.lerp(self.state[:, _VELOCITY], driven, share)
-        shift = torch.cat([aside[:, :2], velocity[:, 2:] * TIMESTEP_S], dim=-1)
+        shift = torch.cat([aside[:, :2], velocity[:, 2:] * self._timestep_s], dim=-1)
         return torch.cat([joints, self.state[:, _CENTRE] + shift, velocity], dim=-1)

@@ -6,7 +6,7 @@ from torch import Tensor
 from astra_data.ball import ROLLING_M_S2, knock, roll
 from astra_data.mazes import Maze
 from astra_data.planar import VariedStates
-from astra_data.variation import BallVariation, Variation, varied_command
+from astra_data.variation import BallVariation, Variation, planar_command
 
 
 class VariedBallAgent(VariedStates):
@@ -43,7 +43,7 @@ class VariedBallAgent(VariedStates):
         of = self.variation.by_name(self.parameters)
         period = self.timestep_s * of["timestep_scale"]
         position, _, ball, rolling = self.true_state.split(2, dim=-1)
-        way = varied_command(of, action) * self.speed_m_s * period.unsqueeze(-1)
+        way = planar_command(of, action) * self.speed_m_s * period.unsqueeze(-1)
         moved, self.blocked = self.free.slide(position, position + way)
         ball, rolling = knock(
             position,

@@ -5,11 +5,11 @@ from torch import Tensor
 
 from astra_data.mazes import Maze
 from astra_data.planar import VariedStates
-from astra_data.variation import Variation, varied_command
+from astra_data.variation import Variation, planar_command
 
 
 class VariedPointMass(VariedStates):
-    """B point masses like those of `PointMass`, each with its own parameters (see `Variation`).
+    """B point masses like those of `PointMass`, each with its own parameters (see `PlanarVariation`).
 
     A command gets noise, is clipped to ±1 per axis, scaled and turned; the mass follows it for one
     control period of its own length. What `state` shows is where it is plus the noise of the sensors; noise
@@ -37,7 +37,7 @@ class VariedPointMass(VariedStates):
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2); return what is shown of the new state (B, 4)."""
         of = self.variation.by_name(self.parameters)
-        velocity = varied_command(of, action) * self.speed_m_s
+        velocity = planar_command(of, action) * self.speed_m_s
         period = (self.timestep_s * of["timestep_scale"]).unsqueeze(-1)
         position = self.true_state[:, :2]
         moved, self.blocked = self.free.slide(position, position + velocity * period)

@@ -1,3 +1,5 @@
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -6,24 +8,28 @@ import torch
 from spending import SPENT, spend
 
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import BadInputError
+from astra_data.errors import BadInputError, RecipeError
 from astra_data.fitting import Fitting, GroundConfig
 from astra_data.methods.compass import CompassConfig, identify
 from astra_data.models.grounding import Windows
 from astra_data.plan import plan
 from astra_data.progress import Progress, silent
-from astra_data.recipe import Config, load_recipe
+from astra_data.recipe import Config, load_recipe, validated
 from astra_data.request import Recipe
+from astra_data.task import Task
 from astra_data.tasks import TASKS
-from astra_data.variation import WIDE_RANGES, Variation
+from astra_data.variation import WIDE_RANGES, PlanarVariation, Variation
 
 TASK = TASKS["antmaze-umaze"]
 PLANTED = {"friction": 0.92, "action_scale": 0.05, "timestep_scale": 1.1, "heading_bias_deg": 3.0}
 QUICK = CompassConfig(
+    **WIDE_RANGES.model_dump()
     # No more noise than leaves the planted gap of 3 cm to be seen.
-    action_noise=(0.0, 0.0),
-    position_noise_m=(0.0, 0.002),
-    velocity_noise_m_s=(0.0, 0.002),
+    | {
+        "action_noise": (0.0, 0.0),
+        "position_noise_m": (0.0, 0.002),
+        "velocity_noise_m_s": (0.0, 0.002),
+    },
     contexts=128,
     windows=60,
     window=15,
@@ -32,14 +38,15 @@ QUICK = CompassConfig(
 )
 
 
-def record(planted: dict[str, float], seed: int, episodes: int = 16, steps: int = 60) -> PairedEpisodes:
-    """Drive point masses with planted parameters by commands that are held for 15 steps."""
+def record(task: Task, planted: Variation, seed: int, episodes: int = 16, steps: int = 60) -> PairedEpisodes:
+    """Drive simulators with planted parameters by commands that are held for 15 steps."""
     torch.manual_seed(seed)
-    variation = Variation(**{name: (value, value) for name, value in planted.items()})
-    target = TASK.varied_simulator(episodes, variation)
-    start = torch.tensor(TASK.maze.cell_centre(*TASK.maze.start), dtype=torch.float32)
-    target.reset_to(torch.cat([start, torch.zeros(2)]).repeat(episodes, 1))
-    action = (torch.rand(episodes, steps // 15, 2) * 2.0 - 1.0).repeat_interleave(15, dim=1)
+    target = task.varied_simulator(episodes, planted)
+    if task.plane:
+        start = torch.tensor(task.maze.cell_centre(*task.maze.start), dtype=torch.float32)
+        target.reset_to(torch.cat([start, torch.zeros(2)]).repeat(episodes, 1))
+    held = torch.rand(episodes, steps // 15, task.objective.action_size) * 2.0 - 1.0
+    action = held.repeat_interleave(15, dim=1)
     state = torch.stack([target.state, *(target.step(action[:, step]) for step in range(steps))], dim=1)
     none = torch.zeros(episodes, steps, 2)
     windows = Windows(
@@ -59,9 +66,16 @@ def record(planted: dict[str, float], seed: int, episodes: int = 16, steps: int 
     )
 
 
-def fitting(folder: Path, settings: Config | None = QUICK, progress: Progress = silent) -> Fitting:
-    training, held_out = record(PLANTED, 0), record(PLANTED, 1, episodes=4)
-    return Fitting(TASK, GroundConfig(), settings, training, held_out, 0, "cpu", folder, progress)
+def fitting(
+    folder: Path,
+    settings: Config | None = QUICK,
+    progress: Progress = silent,
+    task: Task = TASK,
+    planted: Mapping[str, float] = PLANTED,
+) -> Fitting:
+    variation = type(task.varied.wide)(**{name: (value, value) for name, value in planted.items()})
+    training, held_out = (record(task, variation, seed, episodes) for seed, episodes in enumerate((16, 4)))
+    return Fitting(task, GroundConfig(), settings, training, held_out, 0, "cpu", folder, progress)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +96,28 @@ def test_planted_parameters_are_found(found: tuple[Variation, dict[str, Any]]) -
     for name, value in point.items():
         assert getattr(variation, name) == (value, value)
     # Noise cannot be identified: it keeps its ranges.
-    for name in Variation().names:
+    for name in PlanarVariation().names:
         if name not in point:
             assert getattr(variation, name) == getattr(QUICK, name)
+
+
+def test_planted_joints_are_found(tmp_path: Path) -> None:
+    task = TASKS["humanoid-kinematics"]
+    planted = {"friction": 1.15, "action_scale": 0.03, "timestep_scale": 1.3}
+    wide = task.varied.wide.model_copy(update={"action_noise": (0.0, 0.0)})
+    settings = CompassConfig(
+        **wide.model_dump(), contexts=64, windows=60, window=15, updates=600, iterations=4
+    )
+    variation, metrics = identify(fitting(tmp_path, settings, task=task, planted=planted))
+    point = metrics["point"]
+    assert point["action_scale"] == pytest.approx(0.03, abs=0.01)
+    assert point["timestep_scale"] == pytest.approx(1.3, abs=0.05)
+    # Of all that holds a joint back, the motor's own damping is most.
+    assert point["friction"] == pytest.approx(1.15, abs=0.1)
+    # The scale of what is shown is not asked about, and drawn from its range while the policy is trained.
+    assert metrics["mask"].keys() == planted.keys()
+    ends = {name: (value, value) for name, value in point.items()}
+    assert variation == wide.model_copy(update=ends)
 
 
 def test_the_mask_tells_causes_from_bystanders(found: tuple[Variation, dict[str, Any]]) -> None:
@@ -133,6 +166,7 @@ def test_around_the_point_is_within_the_ranges(
     fixed = {"friction": (1.0, 1.0), "heading_bias_deg": (0.0, 0.0)}
     settings = QUICK.model_copy(update={"policy_at": "around", "contexts": 32, "iterations": 1, **fixed})
     variation, metrics = identify(fitting(tmp_path, settings))
+    assert isinstance(variation, PlanarVariation)
     low, high = variation.timestep_scale
     assert 0.75 <= low < metrics["point"]["timestep_scale"] < high <= 1.25
     assert high - low <= 0.6 * (1.25 - 0.75) + 1e-6
@@ -157,6 +191,41 @@ def test_both_rows_read_the_same_table(tmp_path: Path) -> None:
     assert items["ground/compass/seed_0"]["settings"].window == 10
     assert items["ground/compass/seed_0"]["settings"].friction == (0.5, 0.9)
     uniform = items["train/compass_uniform/seed_0"]["settings"]
-    assert uniform == Variation(**{**WIDE_RANGES.model_dump(), "friction": (0.5, 0.9)})
+    assert uniform == PlanarVariation(**{**WIDE_RANGES.model_dump(), "friction": (0.5, 0.9)})
     assert items["train/compass/seed_0"]["settings"] is None
     assert items["train/compass_plus/seed_0"]["grounding"] == tmp_path / "ground/compass/seed_0"
+
+
+def ranges(task: str, tables: str) -> Recipe:
+    text = f'task = "{task}"\nmethods = ["compass"]\nseeds = [0]\n[collect]\nstart = "task"\n{tables}'
+    return validated(tomllib.loads(text), Recipe, "r.toml")
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_ranges_are_laid_over_those_of_the_task(task: Task) -> None:
+    usual = ranges(task.name, "")
+    assert usual.settings_of("compass_uniform") == task.varied.wide
+    assert usual.settings_of("domain_randomization") == task.varied.randomized
+    assert Recipe.model_validate(usual.model_dump()) == usual
+    own = ranges(
+        task.name, "[compass]\nfriction = [0.5, 0.9]\n[domain_randomization]\naction_noise = [0.0, 0.2]\n"
+    )
+    assert own.settings_of("compass_uniform") == task.varied.wide.model_copy(update={"friction": (0.5, 0.9)})
+    randomized = task.varied.randomized.model_copy(update={"action_noise": (0.0, 0.2)})
+    assert own.settings_of("domain_randomization") == randomized
+
+
+def test_ranges_that_the_simulator_does_not_have_are_refused() -> None:
+    known = "friction, action_scale, action_noise, observation_scale, timestep_scale"
+    other = "ball_friction = [0.5, 1.5]\nheading_bias_deg = [-5, 5]\n"
+    for table in ("compass", "domain_randomization"):
+        with pytest.raises(RecipeError) as caught:
+            ranges("humanoid-walker2d", f"[{table}]\n{other}")
+        found = "got one of heading_bias_deg, ball_friction"
+        assert str(caught.value) == f"r.toml: {table}: expected ranges of {known}, {found}"
+        with pytest.raises(RecipeError, match=f"{table}.frction: unknown key: did you mean 'friction'"):
+            ranges("antmaze-umaze", f"[{table}]\nfrction = [1.0, 1.0]")
+        with pytest.raises(RecipeError, match=f"^r.toml: {table}.friction: expected a range above 0, got"):
+            ranges("antmaze-umaze", f"[{table}]\nfriction = [0.0, 1.0]")
+    # Plain ones do no harm: what records older recipes lists them all.
+    assert ranges("antmaze-umaze", "[compass]\nball_friction = [1.0, 1.0]\n")

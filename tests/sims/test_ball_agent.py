@@ -6,7 +6,7 @@ import torch
 from astra_data.mazes import FIELD
 from astra_data.sims.ball_agent import BallAgent
 from astra_data.sims.varied_ball_agent import VariedBallAgent
-from astra_data.variation import BallVariation, Variation
+from astra_data.variation import BallVariation, PlanarVariation
 
 OPTIONS: dict[str, Any] = {
     "timestep_s": 0.2,
@@ -64,7 +64,7 @@ def test_a_correction_is_taken_over_as_far_as_there_is_room() -> None:
 
 def test_plain_parameters_are_the_plain_simulator() -> None:
     torch.manual_seed(0)
-    varied = VariedBallAgent(FIELD, 50, Variation(), **OPTIONS)
+    varied = VariedBallAgent(FIELD, 50, PlanarVariation(), **OPTIONS)
     plain = one(50)
     varied.reset_to(plain.state)
     for _ in range(60):

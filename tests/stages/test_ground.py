@@ -16,7 +16,7 @@ from astra_data.models.grounding import LossWeights
 from astra_data.progress import Progress, silent
 from astra_data.stages.ground import ground
 from astra_data.stages.train import train
-from astra_data.variation import Variation
+from astra_data.variation import WIDE_RANGES, Variation
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
@@ -161,7 +161,9 @@ def test_methods_without_a_grounding_and_raw_datasets_are_refused(
 def test_identified_parameters_are_an_artefact_that_policies_are_trained_with(
     task: str, paired: Path, tmp_path: Path
 ) -> None:
-    settings = CompassConfig(contexts=4, windows=20, window=10, updates=5, iterations=1)
+    settings = CompassConfig(
+        **WIDE_RANGES.model_dump(), contexts=4, windows=20, window=10, updates=5, iterations=1
+    )
     given = {"dataset": paired, "seed": 0, "device": "cpu", "progress": silent}
     ground(task, "compass", GROUND, settings=settings, out=tmp_path / "ground", **given)  # type: ignore[arg-type]
     files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}

@@ -141,7 +141,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
     assert isinstance(file.policy, Student)
     assert file.policy.shape.observation_size == 8  # position, velocity, goal, relative goal
     assert file.policy.shape.history_length == 40
-    assert file.simulation is not None and file.simulation.variation == TASKS[task].planar.ranges
+    assert file.simulation is not None and file.simulation.variation == TASKS[task].varied.wide
 
 
 @pytest.mark.parametrize("share", [0.45, 0.85], ids=["teacher", "student"])
