@@ -17,6 +17,8 @@ from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_history_model
 from astra_data.humanoid.model import STANDING
 from astra_data.humanoid_tasks import HUMANOID_TASKS
+from astra_data.models.soft_actor import SoftActor
+from astra_data.policy_file import PolicyFile
 from astra_data.progress import silent
 from astra_data.run import run
 from astra_data.stages.augment import AugmentConfig, augment
@@ -63,6 +65,57 @@ held_out_share = 0.25
 [evaluate]
 episodes = 3
 """
+SAC_RECIPE = """
+task = "humanoid-kinematics"
+methods = ["direct_transfer", "domain_randomization", "astra", "iql", "direct_transfer_iql", "full_obs"]
+seeds = [0]
+
+[collect]
+episodes = 8
+max_steps = 40
+start = "task"
+hold_s = [0.03, 0.2]
+
+[ground]
+updates = 5
+batch_windows = 4
+window = 20
+latent_size = 8
+held_out_share = 0.25
+
+[train]
+learner = "sac"
+num_envs = 8
+rollout_steps = 16
+total_steps = 512
+updates_per_step = 1
+batch_size = 8
+window = 4
+burn_in = 1
+hidden_sizes = [8]
+memory_size = 8
+
+[target]
+num_envs = 4
+total_steps = 128
+
+[iql]
+critic_updates = 3
+policy_updates = 3
+
+[direct_transfer_iql]
+critic_updates = 3
+policy_updates = 3
+
+[align]
+updates = 5
+batch_windows = 4
+window = 20
+held_out_share = 0.25
+
+[evaluate]
+episodes = 2
+"""
 LASTING = "humanoid-short"
 HORIZON = 12
 """Steps after which none has fallen yet."""
@@ -103,6 +156,28 @@ def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     assert states.shape == (evaluation["target"]["steps"][0] + 1, 47)
     assert states[-2, 2] > 1.0 >= states[-1, 2]
     check_page(folder)
+
+
+def test_a_recipe_with_sac_runs_whole(tmp_path: Path) -> None:
+    (tmp_path / "toy.toml").write_text(SAC_RECIPE)
+    folder = run(tmp_path / "toy.toml", root=tmp_path / "runs", jobs=1)
+    for method, remembers, observed, steps in (
+        ("direct_transfer", True, "abstract", 512),
+        ("domain_randomization", True, "abstract", 512),
+        ("astra", False, "abstract", 512),
+        ("direct_transfer_iql", True, "abstract", 6),
+        ("full_obs", False, "full", 128),
+    ):
+        made = folder / "train" / method / "seed_0"
+        trained = PolicyFile.load(made / "policy.safetensors")
+        assert isinstance(trained.policy, SoftActor)
+        assert (trained.policy.memory is not None, trained.observed) == (remembers, observed)
+        assert json.loads((made / "curve.json").read_text())["points"][-1]["steps"] == steps
+    initial, tuned = (
+        PolicyFile.load(folder / "train" / method / "seed_0" / "policy.safetensors").policy.state_dict()
+        for method in ("direct_transfer", "direct_transfer_iql")
+    )
+    assert not all(torch.equal(initial[name], tuned[name]) for name in initial)
 
 
 def check_page(folder: Path) -> None:
