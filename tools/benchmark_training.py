@@ -10,14 +10,10 @@ and by the processors' time, of all processes of a candidate together: the latte
 machine that does other work.
 """
 
-import copy
 import json
-import subprocess
 import tempfile
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from enum import StrEnum
 from itertools import cycle
 from pathlib import Path
@@ -26,11 +22,10 @@ from typing import Annotated, Any
 import gymnasium
 import gymnasium_robotics
 import numpy as np
-import psutil
 import torch
 import typer
-from rich.console import Console
-from rich.table import Table
+from single_file_iql import SingleFileIql
+from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
 
 from astra_data.ant import POSITIONS, VelocityController
 from astra_data.cores import cores
@@ -39,8 +34,11 @@ from astra_data.errors import AstraDataError
 from astra_data.fitting import Fitting, HistoryFit
 from astra_data.learners.iql import Experience, Iql, IqlConfig
 from astra_data.learners.ppo import Ppo
+from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.models.policy import PolicyShape
+from astra_data.models.soft_actor import SoftActor
 from astra_data.progress import silent
 from astra_data.recipe import load_recipe
 from astra_data.request import Recipe
@@ -51,10 +49,10 @@ from astra_data.world import SimulatorWorld
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
 TASK = TASKS[SETTINGS.task]
+WALKER = TASKS["humanoid-walker2d"]
 SHAPE = GroundingShape(state_size=4, action_size=2, goal_size=2)
 WEIGHTS = LossWeights(latent=0.1)
 """Of ASTRA."""
-OURS = "ours"
 PEERS = Path(__file__).parent / "peers"
 GYMNASIUM_ID = "AntMaze_UMaze-v5"
 ANTS = 128
@@ -62,24 +60,13 @@ TORCH = torch.__version__.partition("+")[0]
 
 gymnasium.register_envs(gymnasium_robotics)
 
-Stretch = Callable[[], float]
-"""Do some work; return how much that was."""
-Candidates = dict[str, Stretch]
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Work per second: by the clock, and by the processors' time."""
-
-    clock: float
-    processor: float
-
 
 class Part(StrEnum):
     """What can be measured."""
 
     ppo = "ppo"
     recurrent = "recurrent"
+    sac = "sac"
     iql = "iql"
     grounding = "grounding"
     target = "target"
@@ -102,29 +89,15 @@ def main(
             try:
                 title, candidates = MEASUREMENTS[part](dataset, quick, stack)
             except AstraDataError as error:
-                raise typer.Exit(_complain(str(error))) from None
+                raise typer.Exit(complain(str(error))) from None
             figures[title] = measure(candidates, 1 if quick else rounds)
-    table = Table("", "per second", "ours is", "per processor second", "ours is")
-    for title, rates in figures.items():
-        table.add_section()
-        table.add_row(f"[bold]{title}")
-        ours = rates[OURS]
-        for candidate, rate in rates.items():
-            cells = [(rate.clock, ours.clock), (rate.processor, ours.processor)]
-            words = [word for one, best in cells for word in (f"{one:,.0f}", f"{best / one:,.1f} x")]
-            table.add_row(f"  {candidate}", *words)
-    Console().print(table)
+    print_rates(figures)
     if json_path is not None:
         rates_of = {
             title: {name: asdict(rate) for name, rate in rates.items()} for title, rates in figures.items()
         }
         report = {"rounds": rounds, "quick": quick, "cores": cores(), "per_second": rates_of}
         json_path.write_text(json.dumps(report, indent=2) + "\n")
-
-
-def _complain(message: str) -> int:
-    Console(stderr=True).print(message)
-    return 1
 
 
 def grounded_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
@@ -169,6 +142,26 @@ def ppo_stretch(model: GroundingModel | None, memory_size: int) -> Stretch:
         return config.num_envs * config.rollout_steps
 
     return stretch
+
+
+def sac(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+    """Train an actor without memory in an abstract simulator of the humanoid."""
+    count, updates, steps = 32, 8, 8 if quick else 64
+    env = SimulatorWorld(WALKER.objective, simulator_of(WALKER, None, count, "cpu"))
+    actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
+    config = SacConfig(rollout_steps=steps, updates_per_step=updates, batch_size=256)
+    learner = Sac(env, actor, config, horizon=WALKER.objective.horizon, seed=0)
+
+    def ours() -> int:
+        learner.iterate()
+        return steps * updates
+
+    sizes = [str(size) for size in (count, updates, steps)]
+    command = ["--with", "stable-baselines3", "python", str(PEERS / "stable_baselines_sac.py"), *sizes]
+    return (
+        f"SAC in the walker, updates of 256 steps, {updates} for every {count} steps",
+        {OURS: ours, "Stable-Baselines3, one vector environment": peer(stack, *command)},
+    )
 
 
 def stable_baselines(stack: ExitStack, *arguments: str) -> Stretch:
@@ -228,91 +221,6 @@ def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
             "plain torch in one file": lambda: single_file.learn(updates),
         },
     )
-
-
-class SingleFileIql:
-    """The method as single-file implementations have it: plain torch, an optimizer per network."""
-
-    def __init__(self, experience: Experience) -> None:
-        """Learn from the transitions of `experience`."""
-        columns = ("observation", "action", "reward", "next_observation", "terminated")
-        self._table = {name: getattr(experience, name).flatten(0, 1) for name in columns}
-        observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
-        self._value = self._network(observed, 1)
-        self._action_values = torch.nn.ModuleList(self._network(observed + acted, 1) for _ in range(2))
-        self._targets = copy.deepcopy(self._action_values).requires_grad_(False)
-        self._actor = torch.nn.Sequential(self._network(observed, acted), torch.nn.Tanh())
-        self._log_std = torch.nn.Parameter(torch.zeros(acted))
-        self._value_optimizer, self._action_value_optimizer, self._actor_optimizer = (
-            torch.optim.Adam(parameters, lr=3e-4)
-            for parameters in (
-                self._value.parameters(),
-                self._action_values.parameters(),
-                [*self._actor.parameters(), self._log_std],
-            )
-        )
-
-    @staticmethod
-    def _network(inputs: int, outputs: int) -> torch.nn.Sequential:
-        linear, relu = torch.nn.Linear, torch.nn.ReLU
-        return torch.nn.Sequential(
-            linear(inputs, 256), relu(), linear(256, 256), relu(), linear(256, outputs)
-        )
-
-    def learn(self, updates: int) -> int:
-        """Make `updates` updates with batches of 256; return their number."""
-        for _ in range(updates):
-            rows = torch.randint(len(self._table["reward"]), (256,))
-            batch = {name: values[rows] for name, values in self._table.items()}
-            pair = torch.cat([batch["observation"], batch["action"]], dim=-1)
-            with torch.no_grad():
-                slow = torch.minimum(*(target(pair).squeeze(-1) for target in self._targets))
-                following = self._value(batch["next_observation"]).squeeze(-1)
-                wanted = batch["reward"] + 0.99 * following * ~batch["terminated"]
-            advantage = slow - self._value(batch["observation"]).squeeze(-1)
-            weight = (0.9 - (advantage < 0).float()).abs()
-            self._descend(self._value_optimizer, (weight * advantage.square()).mean())
-            errors = [(network(pair).squeeze(-1) - wanted).square().mean() for network in self._action_values]
-            self._descend(self._action_value_optimizer, errors[0] + errors[1])
-            mean = self._actor(batch["observation"])
-            likelihood = (
-                torch.distributions.Normal(mean, self._log_std.exp()).log_prob(batch["action"]).sum(-1)
-            )
-            regressed = (10.0 * advantage.detach()).exp().clamp_max(100.0) * likelihood
-            self._descend(self._actor_optimizer, -regressed.mean())
-            with torch.no_grad():
-                for slow_one, fast in zip(
-                    self._targets.parameters(), self._action_values.parameters(), strict=True
-                ):
-                    slow_one.lerp_(fast, 0.005)
-        return updates
-
-    @staticmethod
-    def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-
-
-def peer(stack: ExitStack, *command: str) -> Stretch:
-    """Start `uv run *command` and have it do some work at each call: a line in, a line with a number out."""
-    process = subprocess.Popen(
-        ["uv", "run", "--quiet", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    stack.enter_context(process)
-    assert process.stdin is not None
-    assert process.stdout is not None
-    given, answered = stack.enter_context(process.stdin), process.stdout
-
-    def stretch() -> float:
-        given.write("\n")
-        given.flush()
-        answer = answered.readline()
-        if not answer:
-            raise typer.Exit(_complain(f"the process ended early: uv run {' '.join(command)}"))
-        return float(answer)
-
-    return stretch
 
 
 def grounding(dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
@@ -416,31 +324,11 @@ class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
 MEASUREMENTS = {
     Part.ppo: grounded_ppo,
     Part.recurrent: recurrent_ppo,
+    Part.sac: sac,
     Part.iql: iql,
     Part.grounding: grounding,
     Part.target: target,
 }
-
-
-def measure(candidates: Candidates, rounds: int) -> dict[str, Rate]:
-    """Let the candidates take turns; return the rate of each, after one turn to warm up."""
-    done, clock, processor = ({name: 0.0 for name in candidates} for _ in range(3))
-    for turn in range(rounds + 1):
-        for name, stretch in candidates.items():
-            began, used = time.perf_counter(), processor_seconds()
-            amount = stretch()
-            if turn > 0:
-                done[name] += amount
-                clock[name] += time.perf_counter() - began
-                processor[name] += processor_seconds() - used
-    return {name: Rate(done[name] / clock[name], done[name] / processor[name]) for name in candidates}
-
-
-def processor_seconds() -> float:
-    """Return the time that this process and those that it started have kept processors busy."""
-    this = psutil.Process()
-    times = [process.cpu_times() for process in (this, *this.children(recursive=True))]
-    return float(sum(time.user + time.system for time in times))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,58 @@
+"""Batched worlds of ours, as Stable-Baselines3 wants them."""
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from astra_data.gymnasium_faces import Array, WorldVectorEnv
+
+
+class Rows(VecEnv):  # type: ignore[misc]
+    """Gymnasium's vector environment as Stable-Baselines3 wants it."""
+
+    def __init__(self, env: WorldVectorEnv) -> None:
+        """Show `env`."""
+        self.env = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> Array:
+        """Start all rows."""
+        return self.env.reset()[0]
+
+    def step_async(self, actions: Array) -> None:
+        """Keep `actions` for `step_wait`."""
+        self.actions = actions
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        """Step all rows."""
+        observation, reward, terminated, truncated, infos = self.env.step(self.actions)
+        done = terminated | truncated
+        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(done):
+            told[row] = {
+                "terminal_observation": infos["final_obs"][row],
+                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+            }
+        return observation, reward, done, told
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def get_attr(self, attr_name: str, indices: object = None) -> list[object]:
+        """Know of no attributes."""
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
+        """Refuse."""
+        raise NotImplementedError
+
+    def env_method(
+        self, method_name: str, *args: object, indices: object = None, **kwargs: object
+    ) -> list[Any]:
+        """Refuse."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
+        """Know of no wrappers."""
+        return [False] * self.num_envs
