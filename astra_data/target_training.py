@@ -24,7 +24,7 @@ class InTarget:
     """Train in the target, from its own rewards.
 
     Attributes:
-        observed: whether the policy sees φ of the state, which leaves it a memory to need, or all of it.
+        observed: whether the policy, which has a memory, sees φ of the state or all of it.
     """
 
     observed: Observed
@@ -42,6 +42,5 @@ class InTarget:
             device=training.device,
             num_threads=training.num_threads,
         )
-        memory_size = config.memory_size if self.observed == "abstract" else 0
-        policy, curve = train_in(env, config, memory_size, training)
+        policy, curve = train_in(env, config, config.memory_size, training)
         return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve

@@ -166,7 +166,7 @@ def test_a_recipe_with_sac_runs_whole(tmp_path: Path) -> None:
         ("domain_randomization", True, "abstract", 512),
         ("astra", False, "abstract", 512),
         ("direct_transfer_iql", True, "abstract", 6),
-        ("full_obs", False, "full", 128),
+        ("full_obs", True, "full", 128),
     ):
         made = folder / "train" / method / "seed_0"
         trained = PolicyFile.load(made / "policy.safetensors")
