@@ -19,6 +19,7 @@ from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
+from astra_data.learners.acting import Acting
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
@@ -127,8 +128,8 @@ class ResumableEnv(BatchedEnv, Protocol):
 class Learner(Protocol):
     """A training in progress, such as `Ppo`."""
 
+    acting: Acting
     steps: int
-    world_seconds: float
 
     @property
     def total_steps(self) -> int:
@@ -254,7 +255,7 @@ def optimise(
             save_tensors(checkpoint, flatten(state), {"points": points, "spent": stopwatch.spent()})
     return {
         "steps_per_second": learner.steps / stopwatch.seconds,
-        "simulator_steps_per_second": (learner.steps - first) / max(learner.world_seconds, 1e-9),
+        "simulator_steps_per_second": (learner.steps - first) / max(learner.acting.world_seconds, 1e-9),
         **stopwatch.spent(),
         "points": points,
     }

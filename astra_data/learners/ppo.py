@@ -6,8 +6,6 @@ seeds torch from (seed, iteration): a run that resumes from a checkpoint repeats
 would have done.
 """
 
-import math
-import time
 from typing import Any
 
 import torch
@@ -19,6 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from astra_data.batched import BatchedEnv
+from astra_data.learners.acting import Acting
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.seeding import derive
@@ -57,8 +56,7 @@ class Ppo:
     """A training in progress.
 
     Attributes:
-        policy: the networks being trained. steps: environment steps done.
-        world_seconds: the part of the time since the start, or since resuming, that the world took.
+        policy: the networks being trained. acting: how they act. steps: environment steps done.
     """
 
     def __init__(
@@ -74,21 +72,13 @@ class Ppo:
             seed: of all randomness.
         """
         self.env, self.policy, self.config = env, policy, config
-        self.horizon, self.seed = horizon, seed
-        self.steps = 0
-        self.world_seconds = 0.0
+        self.seed, self.steps = seed, 0
         self._iteration = 0
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
         self._loss = _ppo_loss(policy, config)
         torch.manual_seed(derive(seed, "first reset"))
-        self._observation = env.reset()
-        device = self._observation.device
-        self._previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
-        self._hidden = policy.initial_hidden(env.num_envs)
-        self._start = torch.ones(env.num_envs, device=device)
-        # Staggered ages: restarts by the horizon do not all fall into one iteration.
-        self._age = torch.randint(horizon, (env.num_envs,), device=device)
-        self._lasted = torch.zeros_like(self._age)
+        hidden = policy.initial_hidden(env.num_envs)
+        self.acting = Acting(env, hidden, horizon=horizon, is_staggered=True)
 
     @property
     def total_steps(self) -> int:
@@ -104,71 +94,50 @@ class Ppo:
         """Collect one stretch and learn from it.
 
         Returns:
-            "success" of the "episodes" that ended, wherever in the task they began, and their mean
-            "episode_steps", NaN where none did; the mean "reward" of a step; the mean "std" of the actions.
+            the figures of `Acting`, and the mean "std" of the actions.
         """
         torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
         share_left = 1.0 - self.steps / self.total_steps
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * share_left
-        rollout, metrics = self._collect()
-        self._learn(rollout)
+        self._learn(self._collect())
         self.steps += self.env.num_envs * self.config.rollout_steps
         self._iteration += 1
-        metrics["std"] = float(self.policy.log_std.detach().exp().mean())
-        return metrics
+        return self.acting.figures() | {"std": float(self.policy.log_std.detach().exp().mean())}
 
     @torch.no_grad()
-    def _collect(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        env, policy = self.env, self.policy
+    def _collect(self) -> dict[str, Tensor]:
+        acting, policy = self.acting, self.policy
         columns: dict[str, list[Tensor]] = {}
-        finished = succeeded = lasted = rewarded = 0.0
-        first_hidden = self._hidden.clone()
+        first_hidden = acting.hidden
         for _ in range(self.config.rollout_steps):
             row = {
-                "observation": self._observation,
-                "previous_action": self._previous_action,
-                "start": self._start,
+                "observation": acting.observation,
+                "previous_action": acting.previous_action,
+                "start": acting.first.float(),
             }
-            hidden = self._hidden * (1.0 - self._start).unsqueeze(-1)
-            features, hidden = policy.remember(self._observation, self._previous_action, hidden)
+            features, hidden = policy.remember(acting.observation, acting.previous_action, acting.hidden)
             mean, std = policy.policy(features)
             action = torch.normal(mean, std)
-            began = time.perf_counter()
-            step = env.step(action)
-            self.world_seconds += time.perf_counter() - began
-            self._age += 1
-            self._lasted += 1
-            expired = (self._age >= self.horizon) & ~step.terminated
-            done = step.terminated | expired
             value = policy.value(features)
+            taken = acting.take(action, hidden)
+            step, expired = taken.step, taken.expired
             row |= {
                 "action": action,
                 "action_log_prob": torch.distributions.Normal(mean, std).log_prob(action).sum(-1),
                 "value": value,
                 "reward": step.reward * self.config.reward_scale,
                 "terminated": step.terminated,
-                "done": done,
+                "done": taken.done,
                 "beyond": torch.zeros_like(value),
             }
-            executed = action.clamp(-1.0, 1.0)
             if bool(expired.any()):
-                beyond, _ = policy.remember(step.observation[expired], executed[expired], hidden[expired])
+                beyond, _ = policy.remember(step.observation[expired], taken.action[expired], hidden[expired])
                 row["beyond"][expired] = policy.value(beyond)
             for name, values in row.items():
                 columns.setdefault(name, []).append(values)
-            finished += float(done.sum())
-            succeeded += float(step.success.sum())
-            lasted += float(self._lasted[done].sum())
-            rewarded += float(step.reward.mean())
-            self._age, self._lasted = (torch.where(done, 0, steps) for steps in (self._age, self._lasted))
-            self._observation = env.reset(done) if bool(done.any()) else step.observation
-            self._previous_action = executed * (~done).unsqueeze(-1)
-            self._hidden = hidden
-            self._start = done.float()
         rollout = {name: torch.stack(values, dim=1) for name, values in columns.items()}
-        hidden = self._hidden * (1.0 - self._start).unsqueeze(-1)
-        last, _ = policy.remember(self._observation, self._previous_action, hidden)
+        last, _ = policy.remember(acting.observation, acting.previous_action, acting.hidden)
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
         advantage, target = vec_generalized_advantage_estimate(
@@ -179,13 +148,7 @@ class Ppo:
                 for name in ("value", following, "reward", "done", "terminated")
             ),
         )
-        rollout |= {"advantage": advantage, "value_target": target, "hidden": first_hidden}
-        return rollout, {
-            "success": succeeded / finished if finished else math.nan,
-            "episode_steps": lasted / finished if finished else math.nan,
-            "episodes": finished,
-            "reward": rewarded / self.config.rollout_steps,
-        }
+        return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
         config, policy = self.config, self.policy
@@ -215,11 +178,7 @@ class Ppo:
             "optimizer": self._optimizer.state_dict(),
             "steps": self.steps,
             "iteration": self._iteration,
-            "previous_action": self._previous_action,
-            "hidden": self._hidden,
-            "start": self._start,
-            "age": self._age,
-            "lasted": self._lasted,
+            "acting": self.acting.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
@@ -227,11 +186,7 @@ class Ppo:
         self.policy.load_state_dict(state["policy"])
         self._optimizer.load_state_dict(state["optimizer"])
         self.steps, self._iteration = state["steps"], state["iteration"]
-        device = observation.device
-        self._previous_action, self._hidden = state["previous_action"].to(device), state["hidden"].to(device)
-        self._start, self._age = state["start"].to(device), state["age"].to(device)
-        self._lasted = state["lasted"].to(device)
-        self._observation = observation
+        self.acting.load_state_dict(state["acting"], observation)
 
 
 def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> ClipPPOLoss:

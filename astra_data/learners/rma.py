@@ -5,7 +5,6 @@ histories that its mistakes lead to. Every iteration seeds torch from (seed, ite
 """
 
 import math
-import time
 from typing import Annotated, Any
 
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.batched import BatchedEnv
+from astra_data.learners.acting import Acting
 from astra_data.models.adaptation import SHORTEST_HISTORY, Student, Teacher
 from astra_data.recipe import Config, Count, Positive
 from astra_data.seeding import derive
@@ -36,8 +36,8 @@ class Adaptation:
     """A phase 2 in progress: one update per step, on the current histories of all rows.
 
     Attributes:
-        student: the networks; only the estimate of the extrinsics is trained. steps: environment steps done.
-        world_seconds: the part of the time since the start, or since resuming, that the world took.
+        student: the networks; only the estimate of the extrinsics is trained. acting: how they act.
+        steps: environment steps done.
     """
 
     def __init__(
@@ -61,20 +61,15 @@ class Adaptation:
             seed: of all randomness.
         """
         self.env, self.teacher, self.config = env, teacher, config
-        self.rollout_steps, self.horizon, self.seed = rollout_steps, horizon, seed
+        self.rollout_steps, self.seed = rollout_steps, seed
         self.steps = 0
-        self.world_seconds = 0.0
         self._iteration = 0
         torch.manual_seed(derive(seed, "student"))
         self.student = Student.of_teacher(teacher)
         learned = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.Adam(learned, lr=config.adaptation_learning_rate)
-        self._observation = env.reset()
-        device = self._observation.device
-        self._previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
-        self._hidden = self.student.initial_hidden(env.num_envs)
-        # Staggered ages: restarts by the horizon do not all fall into one iteration.
-        self._age = torch.randint(horizon, (env.num_envs,), device=device)
+        hidden = self.student.initial_hidden(env.num_envs)
+        self.acting = Acting(env, hidden, horizon=horizon, is_staggered=True)
 
     @property
     def total_steps(self) -> int:
@@ -90,61 +85,42 @@ class Adaptation:
         """Act and learn for one stretch of steps.
 
         Returns:
-            "success" of the "episodes" that ended, NaN where none did; the mean "reward" of a step;
-            "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
-            the start of episodes, when nothing has been seen; NaN where nothing varies.
+            the figures of `Acting`, and "r2_extrinsics", the share of the extrinsics' variance that the
+            estimates explain, with those at the start of episodes, when nothing has been seen; NaN where
+            nothing varies.
         """
         torch.manual_seed(derive(self.seed, f"adaptation {self._iteration}"))
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.adaptation_learning_rate * (1.0 - self.steps / self.total_steps)
-        finished = succeeded = rewarded = 0.0
         errors, true = [], []
         for _ in range(self.rollout_steps):
-            extrinsics, features = self._learn()
+            extrinsics, features, hidden = self._learn()
             errors.append(features[:, -extrinsics.shape[1] :] - extrinsics)
             true.append(extrinsics)
-            done, success, reward = self._act(features)
-            finished += float(done.sum())
-            succeeded += float(success.sum())
-            rewarded += float(reward.mean())
+            with torch.no_grad():
+                self.acting.take(self.student.act(features), hidden)
         self.steps += self.env.num_envs * self.rollout_steps
         self._iteration += 1
         error = float(torch.cat(errors).square().mean(0).sum())
         variance = float(torch.cat(true).var(0, correction=0).sum())
-        return {
-            "success": succeeded / finished if finished else math.nan,
-            "episodes": finished,
-            "reward": rewarded / self.rollout_steps,
-            "r2_extrinsics": 1.0 - error / variance if variance else math.nan,
-        }
+        return self.acting.figures() | {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
 
-    def _learn(self) -> tuple[Tensor, Tensor]:
-        """Take in the current observations and update; return true extrinsics (B, E), features (B, F)."""
-        shape = self.student.shape
+    def _learn(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Take in the current observations and update.
+
+        Returns:
+            the true extrinsics (B, E), the features (B, F), and the next hidden (B, H).
+        """
+        acting, shape = self.acting, self.student.shape
         with torch.no_grad():
-            extrinsics = self.teacher.extrinsics(self._observation)
-        seen = self._observation[:, : shape.observation_size]
-        features, self._hidden = self.student.remember(seen, self._previous_action, self._hidden)
+            extrinsics = self.teacher.extrinsics(acting.observation)
+        seen = acting.observation[:, : shape.observation_size]
+        features, hidden = self.student.remember(seen, acting.previous_action, acting.hidden)
         loss = functional.mse_loss(features[:, -shape.extrinsics_size :], extrinsics)
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()
-        return extrinsics, features.detach()
-
-    @torch.no_grad()
-    def _act(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Take the student's step; return what is done, what succeeded and the rewards, (B,) each."""
-        action, _ = self.student.policy(features)
-        began = time.perf_counter()
-        step = self.env.step(action)
-        self.world_seconds += time.perf_counter() - began
-        self._age += 1
-        done = step.terminated | (self._age >= self.horizon)
-        going = (~done).float().unsqueeze(-1)
-        self._age = torch.where(done, 0, self._age)
-        self._observation = self.env.reset(done) if bool(done.any()) else step.observation
-        self._previous_action, self._hidden = action * going, self._hidden * going
-        return done, step.success, step.reward
+        return extrinsics, features.detach(), hidden
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state; see `load_state_dict`."""
@@ -153,9 +129,7 @@ class Adaptation:
             "optimizer": self._optimizer.state_dict(),
             "steps": self.steps,
             "iteration": self._iteration,
-            "previous_action": self._previous_action,
-            "hidden": self._hidden,
-            "age": self._age,
+            "acting": self.acting.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
@@ -163,7 +137,4 @@ class Adaptation:
         self.student.load_state_dict(state["student"])
         self._optimizer.load_state_dict(state["optimizer"])
         self.steps, self._iteration = state["steps"], state["iteration"]
-        device = observation.device
-        self._previous_action, self._hidden = state["previous_action"].to(device), state["hidden"].to(device)
-        self._age = state["age"].to(device)
-        self._observation = observation
+        self.acting.load_state_dict(state["acting"], observation)

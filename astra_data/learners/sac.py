@@ -6,8 +6,6 @@ torch from (seed, iteration), as in `ppo`.
 """
 
 import copy
-import math
-import time
 from itertools import pairwise
 from typing import Annotated, Any, Self
 
@@ -20,6 +18,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from astra_data.batched import BatchedEnv
+from astra_data.learners.acting import Acting
 from astra_data.learners.replay import Replay
 from astra_data.models.policy import window_features
 from astra_data.models.soft_actor import SoftActor, gaussian
@@ -68,8 +67,7 @@ class Sac:
     """A training in progress.
 
     Attributes:
-        policy: the actor. steps: environment steps done.
-        world_seconds: the part of the time since the start, or since resuming, that the world took.
+        policy: the actor. acting: how it acts. steps: environment steps done.
     """
 
     def __init__(
@@ -85,9 +83,7 @@ class Sac:
             seed: of all randomness.
         """
         self.env, self.policy, self.config = env, policy, config
-        self.horizon, self.seed = horizon, seed
-        self.steps = 0
-        self.world_seconds = 0.0
+        self.seed, self.steps = seed, 0
         self._iteration = 0
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
@@ -102,11 +98,8 @@ class Sac:
         self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
         self._replay = Replay(config.buffer_size, env, device)
         torch.manual_seed(derive(seed, "first reset"))
-        self._observation = env.reset()
-        self._previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
-        self._hidden = policy.initial_hidden(env.num_envs)
-        self._first = torch.ones(env.num_envs, dtype=torch.bool, device=device)
-        self._age = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
+        hidden = policy.initial_hidden(env.num_envs)
+        self.acting = Acting(env, hidden, horizon=horizon, is_staggered=False)
 
     @property
     def total_steps(self) -> int:
@@ -122,56 +115,37 @@ class Sac:
         """Act for a stretch of steps, and learn after each.
 
         Returns:
-            "success" of the "episodes" that ended and their mean "episode_steps", NaN where none did; the
-            mean "reward" of a step; the "temperature" of the entropy.
+            the figures of `Acting`, and the "temperature" of the entropy.
         """
         torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
-        finished = succeeded = rewarded = lasted = 0.0
         for _ in range(self.config.rollout_steps):
-            done, success, reward = self._act()
-            finished += len(done)
-            lasted += float(done.sum())
-            succeeded += float(success.sum())
-            rewarded += float(reward.mean())
+            self._act()
             if len(self._replay) > self._window:
                 for _ in range(self.config.updates_per_step):
                     self._learn()
         self.steps += self.env.num_envs * self.config.rollout_steps
         self._iteration += 1
-        return {
-            "success": succeeded / finished if finished else math.nan,
-            "episodes": finished,
-            "episode_steps": lasted / finished if finished else math.nan,
-            "reward": rewarded / self.config.rollout_steps,
-            "temperature": float(self._loss.log_alpha.detach().exp()),
-        }
+        return self.acting.figures() | {"temperature": float(self._loss.log_alpha.detach().exp())}
 
     @torch.no_grad()
-    def _act(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Take one step; return the ages of the episodes that ended, successes and rewards (B,)."""
-        features, hidden = self.policy.remember(self._observation, self._previous_action, self._hidden)
+    def _act(self) -> None:
+        """Take one step and keep it."""
+        acting = self.acting
+        seen = {
+            "observation": acting.observation,
+            "previous_action": acting.previous_action,
+            "first": acting.first,
+        }
+        features, hidden = self.policy.remember(acting.observation, acting.previous_action, acting.hidden)
         loc, scale = self.policy.policy(features)
-        action = torch.tanh(torch.normal(loc, scale))
-        began = time.perf_counter()
-        step = self.env.step(action)
-        self.world_seconds += time.perf_counter() - began
-        self._age += 1
-        expired = (self._age >= self.horizon) & ~step.terminated
-        done = step.terminated | expired
+        taken = acting.take(torch.tanh(torch.normal(loc, scale)), hidden)
         self._replay.add(
-            observation=self._observation,
-            previous_action=self._previous_action,
-            action=action,
-            reward=step.reward * self.config.reward_scale,
-            terminated=step.terminated,
-            expired=expired,
-            first=self._first,
+            **seen,
+            action=taken.action,
+            reward=taken.step.reward * self.config.reward_scale,
+            terminated=taken.step.terminated,
+            expired=taken.expired,
         )
-        lasted, going = self._age[done], (~done).float().unsqueeze(-1)
-        self._age = torch.where(done, 0, self._age)
-        self._observation = self.env.reset(done) if bool(done.any()) else step.observation
-        self._previous_action, self._hidden, self._first = action * going, hidden * going, done
-        return lasted, step.success, step.reward
 
     def _learn(self) -> None:
         """Update actor, critics and temperature once."""
@@ -220,10 +194,7 @@ class Sac:
             "replay": self._replay.state_dict(),
             "steps": self.steps,
             "iteration": self._iteration,
-            "previous_action": self._previous_action,
-            "hidden": self._hidden,
-            "first": self._first,
-            "age": self._age,
+            "acting": self.acting.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
@@ -234,10 +205,7 @@ class Sac:
         self._optimizer.load_state_dict(state["optimizer"])
         self._replay.load_state_dict(state["replay"])
         self.steps, self._iteration = state["steps"], state["iteration"]
-        device = observation.device
-        self._previous_action, self._hidden = state["previous_action"].to(device), state["hidden"].to(device)
-        self._first, self._age = state["first"].to(device), state["age"].to(device)
-        self._observation = observation
+        self.acting.load_state_dict(state["acting"], observation)
 
 
 def _sac_loss(policy: SoftActor, config: SacConfig) -> SACLoss:

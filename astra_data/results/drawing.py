@@ -1,6 +1,7 @@
 """Results → figures."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +26,12 @@ from astra_data.figures import (
     trajectories,
 )
 from astra_data.inspection import visited
+from astra_data.mazes import Maze
 from astra_data.results.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.results.model import BandMeans, Results
 from astra_data.results.sizes import SizesResults
 from astra_data.rows import place
 from astra_data.score import SUCCESS, Score
-from astra_data.task import Task
 
 Floats = NDArray[np.float64]
 
@@ -38,11 +39,27 @@ _TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
 """When pictures of an episode are taken, beside its last moment."""
 
 
+@dataclass(frozen=True)
+class Camera:
+    """How a task's states are seen.
+
+    Attributes:
+        photograph: pictures (K, height, width, 3) of target states (K, S).
+        timestep_s: between two states.
+        longest_s: of an episode.
+    """
+
+    photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]]
+    timestep_s: float
+    longest_s: float
+
+
 def figures_of(
     results: Results,
     root: Path,
     *,
-    task: Task,
+    maze: Maze | None,
+    camera: Camera | None,
     trajectory_methods: Sequence[str],
     trajectory_episodes: int,
 ) -> dict[str, Figure]:
@@ -52,23 +69,23 @@ def figures_of(
         results: all numbers in them.
         root: the recipe's folder of runs; without the trajectories of a row that is to be drawn there, there
             is no figure of trajectories.
-        task: its maze is what trajectories are drawn in; without one there are pictures of the first
-            episodes, where the task has any and this machine can draw them.
+        maze: the task's; without one there is no figure of trajectories either.
+        camera: takes pictures of the first episodes, where there are any and this machine can draw them.
         trajectory_methods: rows whose trajectories are drawn; all where none of them is in the results.
         trajectory_episodes: how many of each row.
     """
     figures = {score.measure: _bars(results, score) for score in results.scores}
     drawn = [row for row in trajectory_methods if row in results.methods] or list(results.methods)
     folders = [_with_trajectories(root, results, row) for row in drawn]
-    if task.photograph is not None and None not in folders:
-        figures |= _pictures(drawn, [folder for folder in folders if folder], task)
-    if task.plane is not None and None not in folders:
+    if camera is not None and None not in folders:
+        figures |= _pictures(drawn, [folder for folder in folders if folder], camera)
+    if maze is not None and None not in folders:
         panels = [
             _panel(results, row, folder, trajectory_episodes)
             for row, folder in zip(drawn, folders, strict=True)
             if folder
         ]
-        figures["trajectories"] = trajectories(task.maze, panels)
+        figures["trajectories"] = trajectories(maze, panels)
     curves = _curves(results)
     if curves:
         name = "learning" if results.headline == SUCCESS else f"learning_{results.headline.measure}"
@@ -117,22 +134,19 @@ def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
     )
 
 
-def _pictures(rows: Sequence[str], folders: Sequence[Path], task: Task) -> dict[str, Figure]:
+def _pictures(rows: Sequence[str], folders: Sequence[Path], camera: Camera) -> dict[str, Figure]:
     """Return the figure "strips" of the first episode of each row; none where nothing can be drawn."""
-    if task.photograph is None:
-        return {}
-    last = task.objective.horizon * task.timestep_s
-    times_s = [time_s for time_s in _TIMES_S if time_s < last] + [last]
+    times_s = [time_s for time_s in _TIMES_S if time_s < camera.longest_s] + [camera.longest_s]
     found = {}
     for row, folder in zip(rows, folders, strict=True):
         states = read_tensors(folder / TRAJECTORIES, ("target.state",))["target.state"]
-        moments = [round(time_s / task.timestep_s) for time_s in times_s]
+        moments = [round(time_s / camera.timestep_s) for time_s in times_s]
         try:
-            pictures = task.photograph(states[[moment for moment in moments if moment < len(states)]])
+            pictures = camera.photograph(states[[moment for moment in moments if moment < len(states)]])
         except BadInputError:
             return {}
         failed = bool(read_json(Evaluation, folder / EVALUATION).target.failed[0])
-        found[row] = Strip(pictures, (len(states) - 1) * task.timestep_s, failed)
+        found[row] = Strip(pictures, (len(states) - 1) * camera.timestep_s, failed)
     return {"strips": strips(times_s, found)}
 
 

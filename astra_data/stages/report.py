@@ -14,7 +14,7 @@ from astra_data.mismatch import replay_commands
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Share
 from astra_data.results.assembly import assemble
-from astra_data.results.drawing import figure_of_sizes, figures_of
+from astra_data.results.drawing import Camera, figure_of_sizes, figures_of
 from astra_data.results.files import (
     Found,
     publish_results,
@@ -26,6 +26,7 @@ from astra_data.results.model import Results
 from astra_data.results.page import render
 from astra_data.results.sizes import SizeResults, SizesResults, by_size, render_sizes
 from astra_data.statistics import REPLICATES
+from astra_data.task import Task
 from astra_data.tasks import TASKS
 
 
@@ -139,7 +140,8 @@ def report(
         figures = figures_of(
             found,
             root,
-            task=task,
+            maze=None if task.plane is None else task.maze,
+            camera=_camera(task),
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
         )
@@ -156,6 +158,12 @@ def report(
         kept = {} if add_to is None else published_figures(publish, recipe.name)
         publish_results(found, page, kept | images, publish)
     progress(1.0, _headline(sizes[-1]))
+
+
+def _camera(task: Task) -> Camera | None:
+    if task.photograph is None:
+        return None
+    return Camera(task.photograph, task.timestep_s, task.objective.horizon * task.timestep_s)
 
 
 def _with_common_rows(sizes: Iterable[Results]) -> list[Results]:

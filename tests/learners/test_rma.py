@@ -53,7 +53,7 @@ def test_a_student_recovers_what_its_history_shows() -> None:
     assert correlation(learner.student, shuffled=False) > 0.9 > untrained
     assert abs(correlation(learner.student, shuffled=True)) < 0.3
     assert points[0]["r2_extrinsics"] < 0.5 < points[-1]["r2_extrinsics"] <= 1.0
-    assert points[-1].keys() == {"success", "episodes", "reward", "r2_extrinsics"}
+    assert points[-1].keys() == {"success", "episode_steps", "episodes", "reward", "r2_extrinsics"}
 
 
 def test_the_student_acts_and_only_its_estimate_learns() -> None:
@@ -64,7 +64,7 @@ def test_the_student_acts_and_only_its_estimate_learns() -> None:
     step = world.step
     world.step = lambda action: (acted.append(action.clone()), step(action))[1]  # type: ignore[method-assign, func-returns-value]
     before = {name: value.clone() for name, value in learner.student.state_dict().items()}
-    first_told, first_hidden = learner._observation.clone(), learner._hidden.clone()
+    first_told, first_hidden = learner.acting.observation.clone(), learner.acting.hidden.clone()
     with torch.no_grad():
         features, _ = learner.student.remember(first_told[:, :1], torch.zeros(4, 1), first_hidden)
         expected, _ = learner.student.policy(features)
