@@ -136,14 +136,8 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     adaptation = curve["adaptation"]["points"]
     assert [point["steps"] for point in adaptation] == [64 * (index + 1) for index in range(4)]
-    assert adaptation[0].keys() == {
-        "steps",
-        "success",
-        "episode_steps",
-        "episodes",
-        "reward",
-        "r2_extrinsics",
-    }
+    figures = {"steps", "success", "episode_steps", "episodes", "reward", "r2_extrinsics"}
+    assert adaptation[0].keys() == figures
     file = PolicyFile.load(tmp_path / "train" / "policy.safetensors")
     assert isinstance(file.policy, Student)
     assert file.policy.shape.observation_size == 8  # position, velocity, goal, relative goal
