@@ -37,7 +37,7 @@ REPLAY = CommandReplay(
 )
 
 LASTING_FIGURES = {"steps", "return", "learning_steps"}
-FIGURES = {*HOW_TO_READ} - LASTING_FIGURES
+FIGURES = {*HOW_TO_READ} - LASTING_FIGURES - {"strips"}
 
 CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
 
