@@ -134,6 +134,9 @@ class Experiment:
         points = set()
         for percent, found in by_size(read_published(self.published_in)).items():
             changed = _differences(found.settings, self.recipe) - ALWAYS_NEW
+            changed -= {
+                table for table in METHOD_TABLES if not any(_reads(row, table) for row in found.methods)
+            }
             if changed:
                 raise RecipeError(
                     f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
@@ -144,18 +147,8 @@ class Experiment:
         return points
 
     def _rows_of(self, table: str, stage: str) -> list[Path]:
-        """Return the folders in `stage` of the rows that `table` has settings for, or whose policy has."""
-
-        def reads(base: str) -> bool:
-            method = METHODS.get(base)
-            if method is None:
-                return False
-            ours = method.table or base
-            return table in (ours, DERIVED.get(ours)) or (
-                method.initial is not None and reads(method.initial)
-            )
-
-        return [row for row in sorted((self.folder / stage).iterdir()) if reads(base_method(row.name))]
+        """Return the folders in `stage` of the rows that read `table`."""
+        return [row for row in sorted((self.folder / stage).iterdir()) if _reads(row.name, table)]
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
@@ -180,6 +173,18 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
     _check_fit(recipe, base, path)
     return Experiment(recipe, path, folder, base)
+
+
+def _reads(row: str, table: str) -> bool:
+    """Tell whether a row, or the one whose policy it goes on from, has its settings from `table`."""
+    base = base_method(row)
+    method = METHODS.get(base)
+    if method is None:
+        return False
+    ours = method.table or base
+    return table in (ours, DERIVED.get(ours)) or (
+        method.initial is not None and _reads(method.initial, table)
+    )
 
 
 def _stale_stages(changed: set[str]) -> set[str]:

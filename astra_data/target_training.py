@@ -11,9 +11,9 @@ from astra_data.training import Training, train_in
 
 
 class TargetConfig(Config):
-    """What differs from `[train]` in the target, whose steps are slow; not in the paper."""
+    """What may differ from `[train]` in the target, whose steps are slow; not in the paper."""
 
-    total_steps: Count = 2_000_000
+    total_steps: Count = 4_000_000
     """Environment steps in all."""
     num_envs: Count = 128
     """Target environments stepped side by side."""

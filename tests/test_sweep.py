@@ -111,6 +111,18 @@ def test_points_published_with_other_settings_do_not_count(recipe: Path, tmp_pat
     assert not (tmp_path / "r").exists()
 
 
+def test_settings_of_rows_that_are_not_published_may_change(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text().replace('"astra"', '"full_obs"'))
+    publish(recipe, {50: {"nas": [0, 1], "follower": [0, 1]}, 150: {"nas": [0, 1], "follower": [0, 1]}})
+    recipe.write_text(recipe.read_text() + "[target]\nnum_envs = 7\n")
+    folder = sweep(recipe, seeds=[0], unpublished=True, root=tmp_path, jobs=2)
+    assert {line["method"] for line in lines(folder)} == {"full_obs"}
+    publish(recipe, {50: {"full_obs": [0]}})
+    recipe.write_text(recipe.read_text().replace("num_envs = 7", "num_envs = 8"))
+    with pytest.raises(RecipeError, match=r"^target changed in .*r.toml since its results in"):
+        load_experiment(recipe, tmp_path).published()
+
+
 def test_a_failed_sweep_keeps_the_points_that_are_finished(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text(recipe.read_text() + "[train]\nfails = true\n")
     sweep(recipe, methods=["follower"], root=tmp_path, jobs=1)
