@@ -116,7 +116,15 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     key = ".".join(str(part) for part in location if not _is_choice(part)) or "recipe"
     kind, message = error["type"], error["msg"]
     if kind == "extra_forbidden":
-        return f"{key}: unknown key{_key_hint(str(location[-1]), _section(model, location[:-1]), model)}"
+        hint = _choice_hint(location, model) or _key_hint(
+            str(location[-1]), _section(model, location[:-1]), model
+        )
+        return f"{key}: unknown key{hint}"
+    if kind == "union_tag_invalid":
+        told = error["ctx"]
+        known, got = (told[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
+        choices = known.replace(", ", " or ")
+        return f"{key}.{told['discriminator'].strip('()')}: expected {choices}, got '{got}'"
     if kind == "missing":
         return f"{key}: expected a value, but the key is missing"
     if kind == "value_error":
@@ -125,6 +133,18 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     if expected == message:
         return f"{key}: {message[0].lower()}{message[1:]}"
     return f"{key}: expected {expected}, got {_shortened(error['input'])}"
+
+
+def _choice_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    """Return a clause that names the other choice of a table that has the key at `location`, if one does."""
+    if len(location) < 2 or not _is_choice(location[-2]):
+        return ""
+    parent = _section(model, location[:-3])
+    field = parent.model_fields.get(str(location[-3])) if parent else None
+    for name, other in _nested_models(field.annotation if field else None).items():
+        if location[-1] in other.model_fields:
+            return f": '{name.strip('<>')}' has it, not '{str(location[-2]).strip('<>')}'"
+    return ""
 
 
 def _key_hint(key: str, section: type[BaseModel] | None, model: type[BaseModel]) -> str:

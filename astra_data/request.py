@@ -26,7 +26,7 @@ from astra_data.rows import PLUS, base_method, is_plus, place
 from astra_data.score import Score
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.augment import AugmentConfig
-from astra_data.stages.collect import CollectConfig
+from astra_data.stages.collect import CollectConfig, check_lasting
 from astra_data.stages.evaluate import EvaluateConfig
 from astra_data.stages.pair import PairConfig
 from astra_data.stages.report import ReportConfig
@@ -146,6 +146,9 @@ class Recipe(Config):
         train = info.data.get("train")
         if train is None or not isinstance(overrides, dict):
             return overrides
+        asked = overrides.get("learner", train.learner)
+        if asked != train.learner:
+            raise ValueError(f"learner: expected that of [train], '{train.learner}', got '{asked}'")
         return train.model_dump() | overrides
 
     @field_validator("domain_randomization", "compass", mode="wrap")
@@ -186,6 +189,18 @@ class Recipe(Config):
                     f"leave out {PLUS}"
                 )
         return rows
+
+    @model_validator(mode="after")
+    def _fits_the_learner(self) -> Self:
+        if self.collect.behavior == "suboptimal_sac":
+            try:
+                check_lasting(TASKS[self.task])
+            except BadInputError as error:
+                raise ValueError(str(error)) from None
+        for row in self.methods:
+            if base_method(row) == "rma" and self.train.learner != "ppo":
+                raise ValueError(f"methods: {row}: expected train.learner 'ppo', got '{self.train.learner}'")
+        return self
 
     @model_validator(mode="after")
     def _fits_the_task(self) -> Self:

@@ -20,6 +20,10 @@ _PPO_ENVS = 128
 _SAC_ENVS = 32
 """Targets that they are trained in."""
 
+_SAC = SacConfig(discount=0.99, reward_scale=0.1, learning_rate=3e-4)
+_HIDDEN_SIZES = (256, 256)
+"""With which the humanoid learns to stay up: rewards are 5 a step there."""
+
 _RECENT = 50
 """Episodes that tell how long they last at present."""
 
@@ -56,8 +60,8 @@ def suboptimal_by_sac(
     """
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = TargetWorld(task, _SAC_ENVS, observed="full", num_threads=num_threads)
-    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=(256, 256)))
-    config = SacConfig(total_steps=steps, discount=0.99, reward_scale=0.1, learning_rate=3e-4)
+    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_HIDDEN_SIZES))
+    config = _SAC.model_copy(update={"total_steps": steps})
     sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
     ended: deque[tuple[float, float]] = deque()
     lasted = 0.0

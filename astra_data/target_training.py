@@ -13,10 +13,10 @@ from astra_data.training import Training, train_in
 class TargetConfig(Config):
     """What may differ from `[train]` in the target, whose steps are slow; not in the paper."""
 
-    total_steps: Count = 4_000_000
-    """Environment steps in all."""
-    num_envs: Count = 128
-    """Target environments stepped side by side."""
+    total_steps: Count | None = None
+    """Environment steps in all; by default as many."""
+    num_envs: Count | None = None
+    """Target environments stepped side by side; by default as many."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class InTarget:
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
         settings, episodes = training.settings, training.episodes
-        config = training.config.model_copy(update=settings.model_dump() if settings else {})
+        config = training.config.model_copy(update=settings.model_dump(exclude_none=True) if settings else {})
         env = TargetWorld(
             training.task,
             config.num_envs,

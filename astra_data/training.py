@@ -9,15 +9,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import torch
-from pydantic import Discriminator, Tag
+from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
 from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.errors import BadInputError
 from astra_data.grounding_file import Grounding
 from astra_data.learners.acting import Acting
 from astra_data.learners.ppo import Ppo, PpoConfig
@@ -64,19 +65,23 @@ class SacTrainConfig(TrainConfig, SacConfig):
     num_envs: Count = 32
     """Worlds stepped side by side."""
 
+    @model_validator(mode="after")
+    def _learns_from_one_reward(self) -> Self:
+        if self.ramp:
+            raise ValueError("ramp: expected 0 with SAC, which learns from rewards of long ago as well")
+        return self
 
-def _learner_of(settings: object) -> str:
-    asked = settings.get("learner", "ppo") if isinstance(settings, Mapping) else None
-    return choice(str(asked or getattr(settings, "learner", "ppo")))
+
+def learner(settings: object) -> str:
+    """Return which of the tables below `settings` are; by default PPO's."""
+    if isinstance(settings, Mapping):
+        return choice(str(settings.get("learner", "ppo")))
+    return choice(str(getattr(settings, "learner", "ppo")))
 
 
 AnyTrainConfig = Annotated[
     Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
-    Discriminator(
-        _learner_of,
-        custom_error_type="learner",
-        custom_error_message='expected learner "ppo" or "sac"',
-    ),
+    Discriminator(learner),
 ]
 """Training as its `learner` says, by default by PPO."""
 
@@ -233,7 +238,13 @@ def optimise(
         tensors, told = load_tensors(checkpoint)
         state = unflatten(tensors)
         world = {name: values.to(device) for name, values in state["world"].items()}
-        learner.load_state_dict(state["learner"], env.load_state_dict(world))
+        try:
+            learner.load_state_dict(state["learner"], env.load_state_dict(world))
+        except (KeyError, RuntimeError) as error:
+            raise BadInputError(
+                f"{checkpoint}: expected a training that this version began, found another one ({error}): "
+                f"remove {folder}"
+            ) from error
         points, spent = told["points"], told["spent"]
     stopwatch, first = Stopwatch(spent), learner.steps
     while not learner.done:

@@ -66,7 +66,7 @@ held_out_share = 0.25
 episodes = 3
 """
 SAC_RECIPE = """
-task = "humanoid-kinematics"
+task = "humanoid-walker2d"
 methods = ["direct_transfer", "domain_randomization", "astra", "iql", "direct_transfer_iql", "full_obs"]
 seeds = [0]
 

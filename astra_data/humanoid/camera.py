@@ -29,7 +29,7 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
     data = mujoco.MjData(model)
     try:
         viewer = OffScreenViewer(model, data, width, height)
-    except (AttributeError, ImportError, RuntimeError) as error:
+    except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
         raise BadInputError(
             f"expected OpenGL that works without a window, found none ({error}): set MUJOCO_GL to egl or "
             "osmesa"

@@ -35,7 +35,7 @@ class Acting:
         observation: (B, O), to act on next.
         previous_action: (B, A) in ±1. hidden: the policy's memory, (B, H). Both are zero at the start.
         first: where an episode begins, (B,) bool.
-        world_seconds: the time that the environment took.
+        world_seconds: the time that the environment's steps took, since the start or since resuming.
     """
 
     def __init__(self, env: BatchedEnv, hidden: Tensor, *, horizon: int, is_staggered: bool) -> None:
@@ -56,6 +56,9 @@ class Acting:
         self.first = torch.ones(env.num_envs, dtype=torch.bool, device=device)
         self._lasted = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
         self._age = torch.randint_like(self._lasted, horizon) if is_staggered else self._lasted
+        self._forget()
+
+    def _forget(self) -> None:
         self._steps = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
 
     def take(self, action: Tensor, hidden: Tensor) -> Taken:
@@ -90,7 +93,7 @@ class Acting:
             "episodes": self._finished,
             "reward": self._rewarded / self._steps,
         }
-        self._steps = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
+        self._forget()
         return told
 
     def state_dict(self) -> dict[str, Any]:

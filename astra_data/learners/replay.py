@@ -13,7 +13,7 @@ class Replay:
 
     def __init__(self, size: int, env: BatchedEnv, device: torch.device) -> None:
         """Keep the last `size` steps of `env`, as many of each of its B rows."""
-        self._rows = max(2, size // env.num_envs)
+        self._rows = size // env.num_envs
         self._added = 0
         place = self._rows, env.num_envs
         numbers = {"observation": (env.observation_size,), "action": (env.action_size,), "reward": ()}
@@ -42,9 +42,9 @@ class Replay:
         """Draw windows of `length` steps in a row, and one step more, from torch's global generator.
 
         Returns:
-            the columns (count, length + 1, ...), and what can be learned from, (count, length) bool: what is
-            of the window's first episode and of a known outcome, after `burn_in` steps, which only fill the
-            memory; all where the episode begins with the window.
+            the columns (count, length + 1, ...), and what can be learned from, (count, length) bool: steps of
+            a known outcome, but for the first `burn_in` of a window, which only fill the memory, as long as
+            no episode has begun in it.
         """
         device = self._columns["reward"].device
         oldest = self._added - len(self)
@@ -52,11 +52,9 @@ class Replay:
         steps = (begin + torch.arange(length + 1, device=device)) % self._rows
         env = torch.randint(self._columns["reward"].shape[1], (count, 1), device=device)
         drawn = {name: column[steps, env] for name, column in self._columns.items()}
-        expired = drawn["expired"][:, :-1]
-        ended = (drawn["terminated"][:, :-1] | expired).int()
-        learned = (ended.cumsum(1) == ended) & ~expired
         filled = torch.arange(length, device=device) >= burn_in
-        return drawn, learned & (filled | drawn["first"][:, :1])
+        has_begun = drawn["first"][:, :-1].cumsum(1) > 0
+        return drawn, ~drawn["expired"][:, :-1] & (filled | has_begun)
 
     def state_dict(self) -> dict[str, Tensor | int]:
         """Return what is kept."""

@@ -1,8 +1,8 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
 
-Actor and critics each have a memory of their own, where the policy has one, and learn from windows of recent
-steps, whose first steps only fill the memories; otherwise they learn from single steps. Every iteration seeds
-torch from (seed, iteration), as in `ppo`.
+Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
+whose first steps only fill the memories; otherwise they learn from single steps. Every iteration seeds torch
+from (seed, iteration), as in `ppo`.
 """
 
 import copy
@@ -18,9 +18,10 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from astra_data.batched import BatchedEnv
+from astra_data.errors import BadInputError
 from astra_data.learners.acting import Acting
 from astra_data.learners.replay import Replay
-from astra_data.models.policy import window_features
+from astra_data.models.policy import features_of
 from astra_data.models.soft_actor import SoftActor, gaussian
 from astra_data.recipe import Config, Count, Positive, Share
 from astra_data.seeding import derive
@@ -36,11 +37,11 @@ class SacConfig(Config):
     updates_per_step: Count = 8
     """Gradient updates per batched step."""
     batch_size: Count = 256
-    """Steps per update."""
+    """Steps per update; where the policy has a memory, in as many windows as they make."""
     window: Count = 32
-    """Steps in a row that the steps of an update come in, where the policy has a memory."""
+    """Steps in a row, where the policy has a memory."""
     burn_in: Annotated[int, Field(ge=0)] = 8
-    """Steps at the start of a window that only fill the memory; none where the episode begins there."""
+    """Steps at the start of a window that only fill the memory, until an episode begins."""
     buffer_size: Count = 1_000_000
     """The most recent steps that are kept."""
     learning_rate: Positive = 1e-3
@@ -81,6 +82,9 @@ class Sac:
             config: settings.
             horizon: rows are restarted after so many steps, without ending the task.
             seed: of all randomness.
+
+        Raises:
+            BadInputError: the buffer would hold no window.
         """
         self.env, self.policy, self.config = env, policy, config
         self.seed, self.steps = seed, 0
@@ -96,6 +100,11 @@ class Sac:
         learned += [] if self._memory is None else self._memory.parameters()
         self._optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
         self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
+        if config.buffer_size // env.num_envs <= self._window:
+            raise BadInputError(
+                f"buffer_size: expected at least {(self._window + 1) * env.num_envs} steps, for a window of "
+                f"{self._window} in {env.num_envs} environments, got {config.buffer_size}"
+            )
         self._replay = Replay(config.buffer_size, env, device)
         torch.manual_seed(derive(seed, "first reset"))
         hidden = policy.initial_hidden(env.num_envs)
@@ -153,11 +162,12 @@ class Sac:
         steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
         if not bool(learned.any()):
             return
-        seen = steps["observation"], steps["previous_action"]
-        acting = window_features(self.policy.memory, *seen)
-        judging = window_features(self._memory, *seen)
+        nothing = self.policy.initial_hidden(len(learned))
+        seen = steps["observation"], steps["previous_action"], nothing, steps["first"].float()
+        acting = features_of(self.policy.memory, *seen)
+        judging = features_of(self._memory, *seen)
         with torch.no_grad():
-            following = window_features(self._late_memory, *seen)[:, 1:][learned]
+            following = features_of(self._late_memory, *seen)[:, 1:][learned]
         terminated = steps["terminated"][:, :-1][learned].unsqueeze(-1)
         table = {
             "acting": acting[:, :-1][learned],

@@ -41,12 +41,26 @@ class PolicyShape:
         )
 
 
-def window_features(memory: HistoryEncoder | None, observation: Tensor, previous_action: Tensor) -> Tensor:
-    """Return the features (B, T, F) of windows (B, T, O), (B, T, A) that begin with an empty memory."""
+def features_of(
+    memory: HistoryEncoder | None,
+    observation: Tensor,
+    previous_action: Tensor,
+    hidden: Tensor,
+    start: Tensor,
+) -> Tensor:
+    """Return the features (B, T, F) of `observation` (B, T, O), (B, T, A), from `hidden` (B, M).
+
+    `start` (B, T) is 1 where a new episode begins: there the memory is emptied.
+    """
     if memory is None:
         return observation
-    latents, _ = memory(torch.cat([observation, previous_action], dim=-1))
-    return torch.cat([observation, latents], dim=-1)
+    inputs = torch.cat([observation, previous_action], dim=-1)
+    keep = 1.0 - start.unsqueeze(-1)
+    states = []
+    for step in range(inputs.shape[1]):
+        hidden = memory.step(inputs[:, step], hidden * keep[:, step])
+        states.append(hidden)
+    return torch.cat([observation, memory.latent(torch.stack(states, dim=1))], dim=-1)
 
 
 class Policy(nn.Module, ABC):
@@ -79,19 +93,8 @@ class Policy(nn.Module, ABC):
     def remember_sequence(
         self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
     ) -> Tensor:
-        """Return the features (B, T, F) of `observation` (B, T, O), (B, T, A), from `hidden` (B, M).
-
-        `start` (B, T) is 1 where a new episode begins: there the memory is emptied.
-        """
-        if self.memory is None:
-            return observation
-        inputs = torch.cat([observation, previous_action], dim=-1)
-        keep = 1.0 - start.unsqueeze(-1)
-        states = []
-        for step in range(inputs.shape[1]):
-            hidden = self.memory.step(inputs[:, step], hidden * keep[:, step])
-            states.append(hidden)
-        return torch.cat([observation, self.memory.latent(torch.stack(states, dim=1))], dim=-1)
+        """Return the features (B, T, F) of T steps; see `features_of`."""
+        return features_of(self.memory, observation, previous_action, hidden, start)
 
     @abstractmethod
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:

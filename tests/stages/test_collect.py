@@ -1,4 +1,6 @@
 import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -137,22 +139,38 @@ def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
     assert dataset.description["behavior"]["trained_steps"] == 1
 
 
+@pytest.fixture
+def lasting() -> Iterator[str]:
+    usual = TASKS["humanoid-kinematics"]
+    name = "humanoid-short"
+    TASKS[name] = replace(usual, name=name, objective=replace(usual.objective, horizon=25))
+    yield name
+    del TASKS[name]
+
+
 @pytest.mark.parametrize(("episode_steps", "iterations"), [(20, 1), (26, 2)])
 def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
-    task: str, tmp_path: Path, episode_steps: int, iterations: int
+    lasting: str, tmp_path: Path, episode_steps: int, iterations: int
 ) -> None:
     """Episodes of this task last 25 steps, and an iteration 64 in each of 32 targets."""
     config = CollectConfig(
         behavior="suboptimal_sac",
         sac_steps=2 * 64 * 32,
         sac_episode_steps=episode_steps,
+        start="task",
         episodes=3,
         max_steps=3,
     )
-    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    collect(lasting, config, seed=0, out=tmp_path / "out", progress=silent)
     dataset = Dataset.open(tmp_path / "out")
-    assert dataset.reference == f"{TASK}-suboptimal-sac-seed0@data-1.0.0"
+    assert dataset.reference == f"{lasting}-suboptimal-sac-seed0@data-1.0.0"
     assert dataset.description["behavior"]["trained_steps"] == iterations * 64 * 32
+
+
+def test_where_good_episodes_are_short_sac_is_not_stopped_by_their_length(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"behavior": "suboptimal_sac"})
+    with pytest.raises(BadInputError, match="good ones are short: take 'suboptimal_ppo'"):
+        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
 
 
 def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:

@@ -1,0 +1,49 @@
+import re
+from typing import Any
+
+import pytest
+
+from astra_data.errors import RecipeError
+from astra_data.recipe import validated
+from astra_data.request import Recipe
+from astra_data.training import PpoTrainConfig, SacTrainConfig
+
+BASE = {
+    "task": "humanoid-walker2d",
+    "methods": ["direct_transfer"],
+    "seeds": [0],
+    "collect": {"start": "task"},
+}
+SAC = {"learner": "sac"}
+
+
+def read(**tables: Any) -> Recipe:  # noqa: ANN401
+    return validated(BASE | tables, Recipe, "r.toml")
+
+
+def test_the_learner_decides_what_the_training_is_told() -> None:
+    assert isinstance(read().train, PpoTrainConfig)
+    recipe = read(train=SAC | {"window": 16}, plus={"window": 24})
+    assert isinstance(recipe.train, SacTrainConfig) and isinstance(recipe.plus, SacTrainConfig)
+    assert (recipe.train.window, recipe.plus.window) == (16, 24)
+    assert read(**recipe.settings) == recipe
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"train": {"learner": "foo"}}, "train.learner: expected 'ppo' or 'sac', got 'foo'"),
+        ({"train": {"burn_in": 4}}, "train.burn_in: unknown key: 'sac' has it, not 'ppo'"),
+        ({"train": SAC | {"clip": 0.1}}, "train.clip: unknown key: 'ppo' has it, not 'sac'"),
+        ({"train": SAC | {"windw": 9}}, "train.windw: unknown key: did you mean 'window'?"),
+        ({"train": SAC, "plus": {"learner": "ppo"}}, "expected that of [train], 'sac', got 'ppo'"),
+        ({"train": SAC | {"ramp": 0.4}}, "train: ramp: expected 0 with SAC"),
+        ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
+        ({"train": 3}, "train: expected a table, got 3"),
+        ({"task": "antmaze-umaze", "collect": {"behavior": "suboptimal_sac"}}, "take 'suboptimal_ppo'"),
+    ],
+)
+def test_what_does_not_fit_the_learner_is_told_in_a_line(tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(RecipeError, match=f"^r.toml: .*{re.escape(message)}") as caught:
+        read(**tables)
+    assert "\n" not in str(caught.value)
