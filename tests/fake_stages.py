@@ -32,10 +32,12 @@ class FakeConfig(Config):
     steps: int = 1
     rate: float = 0.5
     fails: bool = False
+    learner: str = "ppo"
 
 
 class FakeCollectConfig(FakeConfig):
     episodes: int = 200
+    behavior: str = "random"
 
 
 class FakeMethod:
