@@ -26,7 +26,7 @@ from astra_data.rows import PLUS, base_method, is_plus, place
 from astra_data.score import Score
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.augment import AugmentConfig
-from astra_data.stages.collect import CollectConfig, check_lasting
+from astra_data.stages.collect import CollectConfig
 from astra_data.stages.evaluate import EvaluateConfig
 from astra_data.stages.pair import PairConfig
 from astra_data.stages.report import ReportConfig
@@ -146,8 +146,7 @@ class Recipe(Config):
         train = info.data.get("train")
         if train is None or not isinstance(overrides, dict):
             return overrides
-        asked = overrides.get("learner", train.learner)
-        if asked != train.learner:
+        if (asked := overrides.get("learner", train.learner)) != train.learner:
             raise ValueError(f"learner: expected that of [train], '{train.learner}', got '{asked}'")
         return train.model_dump() | overrides
 
@@ -192,14 +191,10 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _fits_the_learner(self) -> Self:
-        if self.collect.behavior == "suboptimal_sac":
-            try:
-                check_lasting(TASKS[self.task])
-            except BadInputError as error:
-                raise ValueError(str(error)) from None
-        for row in self.methods:
-            if base_method(row) == "rma" and self.train.learner != "ppo":
-                raise ValueError(f"methods: {row}: expected train.learner 'ppo', got '{self.train.learner}'")
+        if self.train.learner != "ppo" and "rma" in map(base_method, self.methods):
+            raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
+        if self.collect.behavior == "suboptimal_sac" and not TASKS[self.task].objective.is_lasting:
+            raise ValueError(f"collect: good episodes of {self.task} are short: take 'suboptimal_ppo'")
         return self
 
     @model_validator(mode="after")
@@ -215,11 +210,9 @@ class Recipe(Config):
             "plus.support_penalty": self.plus.support_penalty > 0,
             "report.paper_success": bool(self.report.paper_success),
         }
-        faults += [setting for setting, is_asked in asked.items() if is_asked]
-        if faults:
-            raise ValueError(
-                f"{self.task} has no maze, which these need: {', '.join(faults)}; leave them out"
-            )
+        if faults := faults + [setting for setting, is_asked in asked.items() if is_asked]:
+            needing = ", ".join(faults)
+            raise ValueError(f"{self.task} has no maze, which these need: {needing}; leave them out")
         return self
 
     @model_validator(mode="after")

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from astra_data.deployment import DeployedPolicy
+from astra_data.errors import BadInputError
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
@@ -57,7 +58,12 @@ def suboptimal_by_sac(
 
     Returns:
         the policy, and the environment steps that it was trained for.
+
+    Raises:
+        BadInputError: success ends the task's episodes, so that how long they last tells nothing.
     """
+    if not task.objective.is_lasting:
+        raise BadInputError(f"in {task.name} good episodes are short: take 'suboptimal_ppo'")
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = TargetWorld(task, _SAC_ENVS, observed="full", num_threads=num_threads)
     actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_HIDDEN_SIZES))

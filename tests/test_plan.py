@@ -2,6 +2,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from fake_stages import FakeConfig
 
 from astra_data.errors import RecipeError
 from astra_data.plan import plan
@@ -120,8 +121,8 @@ def test_every_artefact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: 
 
 def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
     recipe = load(tmp_path, fake_recipe, HEAD + "[train]\nsteps = 5\n[plus]\nrate = 2\n")
-    assert recipe.train.model_dump() == {"steps": 5, "rate": 0.5, "fails": False}
-    assert recipe.plus.model_dump() == {"steps": 5, "rate": 2.0, "fails": False}
+    assert recipe.train.model_dump() == FakeConfig(steps=5, rate=0.5).model_dump()
+    assert recipe.plus.model_dump() == FakeConfig(steps=5, rate=2.0).model_dump()
 
 
 @pytest.mark.parametrize(

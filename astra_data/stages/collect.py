@@ -90,19 +90,6 @@ class CollectConfig(Config):
         return self
 
 
-def check_lasting(task: Task) -> None:
-    """Refuse to judge a policy by how long its episodes last where that is not what `task` asks for.
-
-    Raises:
-        BadInputError: success ends its episodes.
-    """
-    if not task.objective.is_lasting:
-        raise BadInputError(
-            f"collect.behavior: 'suboptimal_sac' stops when episodes last long, but in {task.name} good ones "
-            "are short: take 'suboptimal_ppo'"
-        )
-
-
 def collect(
     task: str,
     config: CollectConfig,
@@ -195,7 +182,6 @@ def _behavior(
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
         else:
-            check_lasting(task)
             by = partial(suboptimal_by_sac, steps=config.sac_steps, episode_steps=config.sac_episode_steps)
         deployed, steps = by(task, seed=seed, num_threads=num_threads, progress=progress)
         return PolicyBehavior(deployed), {"trained_steps": steps}

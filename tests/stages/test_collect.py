@@ -169,7 +169,7 @@ def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
 
 def test_where_good_episodes_are_short_sac_is_not_stopped_by_their_length(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"behavior": "suboptimal_sac"})
-    with pytest.raises(BadInputError, match="good ones are short: take 'suboptimal_ppo'"):
+    with pytest.raises(BadInputError, match="good episodes are short: take 'suboptimal_ppo'"):
         collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
 
 

@@ -6,14 +6,16 @@ import torch
 from small_run import TRAIN
 
 from astra_data import training as stage
+from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.errors import BadInputError
 from astra_data.learners.rma import RmaConfig
 from astra_data.models.adaptation import Student
+from astra_data.models.soft_actor import SoftActor
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress, silent
 from astra_data.stages.train import train
 from astra_data.tasks import TASKS
-from astra_data.training import PpoTrainConfig
+from astra_data.training import PpoTrainConfig, SacTrainConfig
 
 SWITCHES = {
     "topple": True,
@@ -31,7 +33,7 @@ def make(
     dataset: Path,
     grounding: Path | None,
     out: Path,
-    config: PpoTrainConfig = TRAIN,
+    config: PpoTrainConfig | SacTrainConfig = TRAIN,
     progress: Progress = silent,
 ) -> bytes:
     inputs = {"dataset": dataset, "grounding": grounding, "settings": RMA if method == "rma" else None}
@@ -121,6 +123,46 @@ def test_after_an_interruption_it_goes_on(
     world = policy.simulation.world.model_dump()
     assert world == world | SWITCHES
     assert torch.linalg.matrix_rank(policy.simulation.scatter) == 4
+
+
+@pytest.mark.parametrize("method", ["direct_transfer", "astra"])
+def test_sac_goes_on_after_an_interruption(
+    method: str, task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 2)
+    grounding = grounded if method == "astra" else None
+    config = SacTrainConfig(
+        learner="sac",
+        num_envs=8,
+        rollout_steps=8,
+        total_steps=8 * 8 * 6,
+        updates_per_step=1,
+        batch_size=8,
+        window=4,
+        burn_in=1,
+        hidden_sizes=(16,),
+        memory_size=8,
+        data_start_share=0.5,
+    )
+    expected = make(task, method, paired, grounding, tmp_path / "whole", config)
+    out = tmp_path / "interrupted"
+    with pytest.raises(Stopped):
+        make(task, method, paired, grounding, out, config, stop)
+    assert make(task, method, paired, grounding, out, config) == expected
+    assert isinstance(PolicyFile.load(out / "policy.safetensors").policy, SoftActor)
+
+
+def test_a_checkpoint_of_another_version_is_told(
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 2)
+    with pytest.raises(Stopped):
+        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop)
+    (checkpoint,) = tmp_path.rglob("checkpoint.safetensors")
+    tensors, told = load_tensors(checkpoint)
+    save_tensors(checkpoint, {name: value for name, value in tensors.items() if "acting" not in name}, told)
+    with pytest.raises(BadInputError, match=r"expected a training that this version began.*remove"):
+        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN)
 
 
 def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Path, tmp_path: Path) -> None:
