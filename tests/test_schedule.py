@@ -117,7 +117,9 @@ def _hanging_run(folder: Path) -> subprocess.Popen[bytes]:
     """Start a process whose one item hangs, holding the lock of `folder`."""
     pid_file, script = folder / "pid", folder / "script.py"
     script.write_text(
-        "import sys\nfrom functools import partial\nfrom pathlib import Path\n"
+        "import signal\nimport sys\nfrom functools import partial\nfrom pathlib import Path\n"
+        # Who starts these tests in the background may have it ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from fake_items import hang\nfrom test_schedule import Record\n"
         "from astra_data.schedule import Item, execute\n"
