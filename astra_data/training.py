@@ -247,18 +247,19 @@ def optimise(
             ) from error
         points, spent = told["points"], told["spent"]
     stopwatch, first = Stopwatch(spent), learner.steps
+    is_lasting = training.task.objective.is_lasting
     while not learner.done:
         if isinstance(env, SimulatorWorld):
             env.caution = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
         metrics = learner.iterate()
         # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
-        if training.task.objective.is_lasting:
+        if is_lasting:
             # Horizons pass unseen here: what ended is what failed.
             known["success"] = None
         points.append({"steps": learner.steps, **known})
         rate = learner.steps / stopwatch.seconds
-        lately = _lately(points, "episode_steps" if training.task.objective.is_lasting else "success")
+        lately = _lately(points, "episode_steps" if is_lasting else "success")
         note = f"{rate:,.0f} steps/s  {lately}"
         training.progress(learner.steps / learner.total_steps, note)
         if len(points) % _CHECKPOINT_EVERY == 0 or learner.done:
