@@ -20,7 +20,7 @@ from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import Grounding
-from astra_data.learners.acting import Acting
+from astra_data.learners.learner import Learner
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
@@ -72,7 +72,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
         return self
 
 
-def learner(settings: object) -> str:
+def _learner(settings: object) -> str:
     """Return which of the tables below `settings` are; by default PPO's."""
     if isinstance(settings, Mapping):
         return choice(str(settings.get("learner", "ppo")))
@@ -81,7 +81,7 @@ def learner(settings: object) -> str:
 
 AnyTrainConfig = Annotated[
     Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
-    Discriminator(learner),
+    Discriminator(_learner),
 ]
 """Training as its `learner` says, by default by PPO."""
 
@@ -127,35 +127,6 @@ class ResumableEnv(BatchedEnv, Protocol):
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
         """Go on from `state`; return the observations (B, O)."""
-        ...
-
-
-class Learner(Protocol):
-    """A training in progress, such as `Ppo`."""
-
-    acting: Acting
-    steps: int
-
-    @property
-    def total_steps(self) -> int:
-        """Environment steps in all."""
-        ...
-
-    @property
-    def done(self) -> bool:
-        """Whether all steps are done."""
-        ...
-
-    def iterate(self) -> dict[str, float]:
-        """Take a stretch of steps and learn; return "success", NaN if unknown, and other figures."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything but the world's own state."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the world already set back and showing `observation` (B, O)."""
         ...
 
 

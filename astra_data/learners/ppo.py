@@ -1,12 +1,8 @@
 """Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
 
 One iteration collects a stretch of steps from every environment and makes a few passes over it. Whole
-stretches are kept together, so the same code trains policies with and without memory. Every iteration
-seeds torch from (seed, iteration): a run that resumes from a checkpoint repeats what an uninterrupted run
-would have done.
+stretches are kept together, so the same code trains policies with and without memory.
 """
-
-from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -18,6 +14,7 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from astra_data.batched import BatchedEnv
 from astra_data.learners.acting import Acting
+from astra_data.learners.learner import Learner
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.seeding import derive
@@ -52,11 +49,11 @@ class PpoConfig(Config):
     """Factor on the reward that the critic learns from."""
 
 
-class Ppo:
+class Ppo(Learner):
     """A training in progress.
 
     Attributes:
-        policy: the networks being trained. acting: how they act. steps: environment steps done.
+        policy: the networks being trained.
     """
 
     def __init__(
@@ -71,46 +68,31 @@ class Ppo:
             horizon: rows are restarted after so many steps, without ending the task.
             seed: of all randomness.
         """
-        self.env, self.policy, self.config = env, policy, config
-        self.seed, self.steps = seed, 0
-        self._iteration = 0
+        self.policy, self.config = policy, config
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
         self._loss = _ppo_loss(policy, config)
         torch.manual_seed(derive(seed, "first reset"))
-        hidden = policy.initial_hidden(env.num_envs)
-        self.acting = Acting(env, hidden, horizon=horizon, is_staggered=True)
+        super().__init__(
+            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=True),
+            {"policy": policy, "optimizer": self._optimizer},
+            total_steps=config.total_steps,
+            rollout_steps=config.rollout_steps,
+            seed=seed,
+        )
 
-    @property
-    def total_steps(self) -> int:
-        """Environment steps in all."""
-        return self.config.total_steps
-
-    @property
-    def done(self) -> bool:
-        """Whether all steps are done."""
-        return self.steps >= self.total_steps
-
-    def iterate(self) -> dict[str, float]:
-        """Collect one stretch and learn from it.
-
-        Returns:
-            the figures of `Acting`, and the mean "std" of the actions.
-        """
-        torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
-        share_left = 1.0 - self.steps / self.total_steps
+    def _iterate(self) -> dict[str, float]:
+        """Collect one stretch and learn from it; return the mean "std" of the actions."""
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * share_left
+            group["lr"] = self.config.learning_rate * self.share_left
         self._learn(self._collect())
-        self.steps += self.env.num_envs * self.config.rollout_steps
-        self._iteration += 1
-        return self.acting.figures() | {"std": float(self.policy.log_std.detach().exp().mean())}
+        return {"std": float(self.policy.log_std.detach().exp().mean())}
 
     @torch.no_grad()
     def _collect(self) -> dict[str, Tensor]:
         acting, policy = self.acting, self.policy
         columns: dict[str, list[Tensor]] = {}
         first_hidden = acting.hidden
-        for _ in range(self.config.rollout_steps):
+        for _ in range(self.rollout_steps):
             row = {
                 "observation": acting.observation,
                 "previous_action": acting.previous_action,
@@ -170,23 +152,6 @@ class Ppo:
                 total.backward()
                 nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
                 self._optimizer.step()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything but the environment's own state; see `load_state_dict`."""
-        return {
-            "policy": self.policy.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "steps": self.steps,
-            "iteration": self._iteration,
-            "acting": self.acting.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
-        self.policy.load_state_dict(state["policy"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self.steps, self._iteration = state["steps"], state["iteration"]
-        self.acting.load_state_dict(state["acting"], observation)
 
 
 def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> ClipPPOLoss:

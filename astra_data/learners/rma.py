@@ -1,11 +1,11 @@
 """Rapid motor adaptation, phase 2: a student learns to estimate its teacher's extrinsics while it acts.
 
 After Kumar et al. 2021. The student's own actions decide what it learns from, so that it knows the
-histories that its mistakes lead to. Every iteration seeds torch from (seed, iteration), as in `ppo`.
+histories that its mistakes lead to.
 """
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from astra_data.batched import BatchedEnv
 from astra_data.learners.acting import Acting
+from astra_data.learners.learner import Learner
 from astra_data.models.adaptation import SHORTEST_HISTORY, Student, Teacher
 from astra_data.recipe import Config, Count, Positive
 from astra_data.seeding import derive
@@ -32,12 +33,11 @@ class RmaConfig(Config):
     """Of phase 2, at the start; falls linearly to zero."""
 
 
-class Adaptation:
+class Adaptation(Learner):
     """A phase 2 in progress: one update per step, on the current histories of all rows.
 
     Attributes:
-        student: the networks; only the estimate of the extrinsics is trained. acting: how they act.
-        steps: environment steps done.
+        student: the networks; only the estimate of the extrinsics is trained.
     """
 
     def __init__(
@@ -60,38 +60,29 @@ class Adaptation:
             horizon: rows are restarted after so many steps, without ending the task.
             seed: of all randomness.
         """
-        self.env, self.teacher, self.config = env, teacher, config
-        self.rollout_steps, self.seed = rollout_steps, seed
-        self.steps = 0
-        self._iteration = 0
+        self.teacher, self.config = teacher, config
         torch.manual_seed(derive(seed, "student"))
         self.student = Student.of_teacher(teacher)
         learned = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.Adam(learned, lr=config.adaptation_learning_rate)
         hidden = self.student.initial_hidden(env.num_envs)
-        self.acting = Acting(env, hidden, horizon=horizon, is_staggered=True)
+        super().__init__(
+            Acting(env, hidden, horizon=horizon, is_staggered=True),
+            {"student": self.student, "optimizer": self._optimizer},
+            total_steps=config.adaptation_steps,
+            rollout_steps=rollout_steps,
+            seed=derive(seed, "adaptation"),
+        )
 
-    @property
-    def total_steps(self) -> int:
-        """Environment steps in all."""
-        return self.config.adaptation_steps
-
-    @property
-    def done(self) -> bool:
-        """Whether all steps are done."""
-        return self.steps >= self.total_steps
-
-    def iterate(self) -> dict[str, float]:
+    def _iterate(self) -> dict[str, float]:
         """Act and learn for one stretch of steps.
 
         Returns:
-            the figures of `Acting`, and "r2_extrinsics", the share of the extrinsics' variance that the
-            estimates explain, with those at the start of episodes, when nothing has been seen; NaN where
-            nothing varies.
+            "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
+            the start of episodes, when nothing has been seen; NaN where nothing varies.
         """
-        torch.manual_seed(derive(self.seed, f"adaptation {self._iteration}"))
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.adaptation_learning_rate * (1.0 - self.steps / self.total_steps)
+            group["lr"] = self.config.adaptation_learning_rate * self.share_left
         errors, true = [], []
         for _ in range(self.rollout_steps):
             extrinsics, features, hidden = self._learn()
@@ -99,11 +90,9 @@ class Adaptation:
             true.append(extrinsics)
             with torch.no_grad():
                 self.acting.take(self.student.act(features), hidden)
-        self.steps += self.env.num_envs * self.rollout_steps
-        self._iteration += 1
         error = float(torch.cat(errors).square().mean(0).sum())
         variance = float(torch.cat(true).var(0, correction=0).sum())
-        return self.acting.figures() | {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
+        return {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
 
     def _learn(self) -> tuple[Tensor, Tensor, Tensor]:
         """Take in the current observations and update.
@@ -121,20 +110,3 @@ class Adaptation:
         loss.backward()
         self._optimizer.step()
         return extrinsics, features.detach(), hidden
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything but the environment's own state; see `load_state_dict`."""
-        return {
-            "student": self.student.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "steps": self.steps,
-            "iteration": self._iteration,
-            "acting": self.acting.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O + P)."""
-        self.student.load_state_dict(state["student"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self.steps, self._iteration = state["steps"], state["iteration"]
-        self.acting.load_state_dict(state["acting"], observation)

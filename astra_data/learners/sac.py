@@ -1,13 +1,12 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
 
 Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
-whose first steps only fill the memories; otherwise they learn from single steps. Every iteration seeds torch
-from (seed, iteration), as in `ppo`.
+whose first steps only fill the memories; otherwise they learn from single steps.
 """
 
 import copy
 from itertools import pairwise
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import torch
 from pydantic import Field, model_validator
@@ -20,6 +19,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from astra_data.batched import BatchedEnv
 from astra_data.errors import BadInputError
 from astra_data.learners.acting import Acting
+from astra_data.learners.learner import Learner
 from astra_data.learners.replay import Replay
 from astra_data.models.policy import features_of
 from astra_data.models.soft_actor import SoftActor, gaussian
@@ -64,11 +64,11 @@ class SacConfig(Config):
         return self
 
 
-class Sac:
+class Sac(Learner):
     """A training in progress.
 
     Attributes:
-        policy: the actor. acting: how it acts. steps: environment steps done.
+        policy: the actor.
     """
 
     def __init__(
@@ -86,15 +86,13 @@ class Sac:
         Raises:
             BadInputError: the buffer would hold no window.
         """
-        self.env, self.policy, self.config = env, policy, config
-        self.seed, self.steps = seed, 0
-        self._iteration = 0
+        self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
         self._loss = _sac_loss(policy, config).to(device)
         self._memory = policy.shape.new_memory()
         self._late_memory = copy.deepcopy(self._memory)
-        self._memories = nn.ModuleList(filter(None, (self._memory, self._late_memory))).to(device)
+        memories = nn.ModuleList(filter(None, (self._memory, self._late_memory))).to(device)
         self._target = SoftUpdate(self._loss, tau=config.target_rate)
         learned = [*policy.parameters(), *self._loss.qvalue_network_params.parameters(), self._loss.log_alpha]
         learned += [] if self._memory is None else self._memory.parameters()
@@ -107,34 +105,28 @@ class Sac:
             )
         self._replay = Replay(config.buffer_size, env, device)
         torch.manual_seed(derive(seed, "first reset"))
-        hidden = policy.initial_hidden(env.num_envs)
-        self.acting = Acting(env, hidden, horizon=horizon, is_staggered=False)
+        super().__init__(
+            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=False),
+            {
+                "policy": policy,
+                "critics": self._loss,
+                "memories": memories,
+                "optimizer": self._optimizer,
+                "replay": self._replay,
+            },
+            total_steps=config.total_steps,
+            rollout_steps=config.rollout_steps,
+            seed=seed,
+        )
 
-    @property
-    def total_steps(self) -> int:
-        """Environment steps in all."""
-        return self.config.total_steps
-
-    @property
-    def done(self) -> bool:
-        """Whether all steps are done."""
-        return self.steps >= self.total_steps
-
-    def iterate(self) -> dict[str, float]:
-        """Act for a stretch of steps, and learn after each.
-
-        Returns:
-            the figures of `Acting`, and the "temperature" of the entropy.
-        """
-        torch.manual_seed(derive(self.seed, f"iteration {self._iteration}"))
-        for _ in range(self.config.rollout_steps):
+    def _iterate(self) -> dict[str, float]:
+        """Act for a stretch of steps, and learn after each; return the "temperature" of the entropy."""
+        for _ in range(self.rollout_steps):
             self._act()
             if len(self._replay) > self._window:
                 for _ in range(self.config.updates_per_step):
                     self._learn()
-        self.steps += self.env.num_envs * self.config.rollout_steps
-        self._iteration += 1
-        return self.acting.figures() | {"temperature": float(self._loss.log_alpha.detach().exp())}
+        return {"temperature": float(self._loss.log_alpha.detach().exp())}
 
     @torch.no_grad()
     def _act(self) -> None:
@@ -193,29 +185,6 @@ class Sac:
         if self._memory is not None and self._late_memory is not None:
             for late, now in zip(self._late_memory.parameters(), self._memory.parameters(), strict=True):
                 late.data.lerp_(now.data, config.target_rate)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything but the environment's own state; see `load_state_dict`."""
-        return {
-            "policy": self.policy.state_dict(),
-            "critics": self._loss.state_dict(),
-            "memories": self._memories.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "replay": self._replay.state_dict(),
-            "steps": self.steps,
-            "iteration": self._iteration,
-            "acting": self.acting.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
-        self.policy.load_state_dict(state["policy"])
-        self._loss.load_state_dict(state["critics"])
-        self._memories.load_state_dict(state["memories"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._replay.load_state_dict(state["replay"])
-        self.steps, self._iteration = state["steps"], state["iteration"]
-        self.acting.load_state_dict(state["acting"], observation)
 
 
 def _sac_loss(policy: SoftActor, config: SacConfig) -> SACLoss:
