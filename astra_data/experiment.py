@@ -3,7 +3,8 @@
     based_on = "antmaze_umaze"
 
 A recipe with this line says only what differs from the recipe of that name beside it. Stages that nothing
-differs for are not run again: links in its folder lead to the other recipe's artefacts.
+differs for are not run again: links in its folder lead to the other recipe's artefacts. It may have another
+task if that has the same target; then it shares the collected episodes.
 """
 
 import json
@@ -21,9 +22,14 @@ from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Point, Rec
 from astra_data.results.files import read_published
 from astra_data.results.sizes import by_size
 from astra_data.rows import base_method
+from astra_data.tasks import TASKS
 
 ALWAYS_NEW = {"report"}
 """Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+
+
+_SIMULATOR = "simulator"
+"""What differs between two tasks that have the same target."""
 
 
 @dataclass(frozen=True)
@@ -192,6 +198,7 @@ def _stale_stages(changed: set[str]) -> set[str]:
     stale: set[str] = set()
     for stage, reads in STAGES.items():
         sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
+        sections |= set() if stage == "collect" else {_SIMULATOR}
         sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
         if changed & sections or stale.intersection(reads):
             stale.add(stage)
@@ -206,7 +213,14 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     with suppress(RecipeError):
         before = validated(before, type(recipe), "recipe.json").settings
     before, now = _told(dict(before)), _told(recipe.settings)
-    return {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
+    changed = {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
+    if "task" in changed and _share_target(str(before.get("task")), recipe.task):
+        return changed - {"task"} | {_SIMULATOR}
+    return changed
+
+
+def _share_target(task: str, other: str) -> bool:
+    return task in TASKS and TASKS[task].shares_target(TASKS[other])
 
 
 def _told(settings: dict[str, Any]) -> dict[str, Any]:
@@ -225,8 +239,11 @@ def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
     name, faults = base.path.stem, []
-    if recipe.task != base.recipe.task:
-        faults.append(f"task: expected that of {name}, '{base.recipe.task}', got '{recipe.task}'")
+    if recipe.task != base.recipe.task and not _share_target(base.recipe.task, recipe.task):
+        faults.append(
+            f"task: expected that of {name}, '{base.recipe.task}', or one with the same target, "
+            f"got '{recipe.task}'"
+        )
     for key in ("methods", "seeds"):
         theirs, ours = getattr(base.recipe, key), getattr(recipe, key)
         unknown = [value for value in ours if value not in theirs]

@@ -91,6 +91,7 @@ def _task(
         instruction="walk forward without falling",
         objective=objective,
         make_target=_humanoids,
+        target_id="humanoid",
         make_simulator=kind,
         abstraction=kind.abstraction,
         beyond=beyond,

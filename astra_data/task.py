@@ -82,6 +82,7 @@ class Task:
         varied: the same simulator with parameters that vary.
         plane: what only a task in a maze has; None for others.
         photograph: pictures (K, height, width, 3) of target states (K, S), where they are worth seeing.
+        target_id: what the target is called where several tasks have it, so that episodes of one serve all.
     """
 
     name: str
@@ -101,6 +102,11 @@ class Task:
     varied: Varied
     plane: Plane | None = None
     photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
+    target_id: str | None = None
+
+    def shares_target(self, other: "Task") -> bool:
+        """Tell whether both tasks have the same target, and differ in what is simulated of it."""
+        return self.target_id is not None and self.target_id == other.target_id
 
     @property
     def planar(self) -> Plane:

@@ -72,7 +72,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
         return self
 
 
-def _learner(settings: object) -> str:
+def learner(settings: object) -> str:
     """Return which of the tables below `settings` are; by default PPO's."""
     if isinstance(settings, Mapping):
         return choice(str(settings.get("learner", "ppo")))
@@ -81,7 +81,7 @@ def _learner(settings: object) -> str:
 
 AnyTrainConfig = Annotated[
     Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
-    Discriminator(_learner),
+    Discriminator(learner),
 ]
 """Training as its `learner` says, by default by PPO."""
 

@@ -1,12 +1,9 @@
 import importlib
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import fake_stages
 import pytest
 from pydantic import create_model
-
-from astra_data.score import SUCCESS
 
 if TYPE_CHECKING:
     from astra_data.request import Recipe
@@ -28,9 +25,9 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     experiment = importlib.import_module("astra_data.experiment")
     for module in (plan, request, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
-    varied = request.TASKS["antmaze-umaze"].varied
-    task = SimpleNamespace(plane=object(), varied=varied, objective=SimpleNamespace(scores=(SUCCESS,)))
-    monkeypatch.setattr(request, "TASKS", {"maze": task})
+    monkeypatch.setitem(fake_stages.TASKS, "maze", request.TASKS["antmaze-umaze"])
+    for module in (request, experiment):
+        monkeypatch.setattr(module, "TASKS", fake_stages.TASKS)
     monkeypatch.setattr("astra_data.experiment.Recipe", model)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)

@@ -1,15 +1,18 @@
 import json
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import fake_stages
 import pytest
-from fake_stages import FakeConfig
 from typer.testing import CliRunner
 
 from astra_data import cli
 from astra_data.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiment import load_experiment
 from astra_data.run import check, run, run_stage
+from astra_data.tasks import TASKS
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 
@@ -72,9 +75,43 @@ def test_what_differs_and_what_reads_it_is_made_anew(
     assert experiment.place("pair/seed_0").parts[-3] == ("other" if borrowed == [] else "base")
 
 
+def sketch(base: Path, monkeypatch: pytest.MonkeyPatch, *targets: str | None) -> Path:
+    """Write a recipe based on `base` of another task; both have these targets."""
+    maze = TASKS["antmaze-umaze"]
+    for name, target in zip(("maze", "sketch"), targets, strict=True):
+        monkeypatch.setitem(fake_stages.TASKS, name, replace(maze, name=name, target_id=target))
+    path = base.with_name("other.toml")
+    path.write_text('based_on = "base"\ntask = "sketch"\nmethods = ["follower"]\nseeds = [1]\n')
+    return path
+
+
+def test_a_task_of_the_same_target_shares_the_episodes(
+    base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = sketch(base, monkeypatch, "ant", "ant")
+    assert load_experiment(path, base.parent).borrowed == {"collect"}
+    command = f"astra-data collect {base} --root {tmp_path}"
+    with pytest.raises(MissingStageError, match=f"run `{re.escape(command)}` first"):
+        run(path, root=tmp_path)
+    run_stage(base, "collect", root=tmp_path)
+    folder = run(path, root=tmp_path, jobs=1)
+    assert asked(folder / "collect/seed_1")["task"] == "maze"
+    assert asked(folder / "pair/seed_1")["task"] == "sketch"
+    assert attempts(tmp_path / "base") == 2
+
+
+@pytest.mark.parametrize("other", [("ant", "other ant"), (None, None)])
+def test_a_task_of_another_target_does_not_fit(
+    base: Path, other: tuple[str | None, str | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = sketch(base, monkeypatch, *other)
+    with pytest.raises(RecipeError, match=r"'maze', or one with the same target, got 'sketch'$"):
+        load_experiment(path, base.parent)
+
+
 def test_tables_lie_over_those_of_the_base(base: Path, longer: Path) -> None:
     recipe = load_experiment(longer, base.parent).recipe
-    assert recipe.evaluate.model_dump() == FakeConfig(steps=3, rate=2.0).model_dump()
+    assert recipe.evaluate.model_dump() == fake_stages.FakeConfig(steps=3, rate=2.0).model_dump()
     assert recipe.methods == ("astra", "astra_plus", "follower")
     assert recipe.based_on == "base"
 
