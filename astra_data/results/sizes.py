@@ -9,7 +9,7 @@ from astra_data.results.model import Part, Results
 
 HOW_TO_READ = {
     "data_efficiency": (
-        "Above: where the robot was and how fast it went, in the dataset of the first seed at each size; the "
+        "Above: where the robot was and how fast it went, in the datasets of one seed; the "
         "brighter, the more often. Below: {score} in the target over the size; lines are interquartile means "
         "over seeds, bands their 95 % bootstrap intervals, dots single seeds."
     ),
