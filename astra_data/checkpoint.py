@@ -68,6 +68,24 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 @contextmanager
+def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Yield the state in `checkpoint`, as `flatten` took it, and the metadata; the block goes on from them.
+
+    Raises:
+        BadInputError: it cannot be read, or the block does not find in it what it needs, as in one from an
+            older version.
+    """
+    tensors, metadata = load_tensors(checkpoint)
+    try:
+        yield unflatten(tensors), metadata
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise BadInputError(
+            f"{checkpoint}: expected what this version began, found something else ({error}): "
+            f"remove {checkpoint.parent}"
+        ) from error
+
+
+@contextmanager
 def understood(
     path: Path, what: str, kinds: Collection[str], device: str
 ) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:

@@ -9,12 +9,12 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind, Windows
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, Positive, Share
+from astra_data.recipe import Config, Count, Number, Positive, Share
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
@@ -41,7 +41,7 @@ class GroundConfig(Config):
     """Share by which the slow encoder of "ema" follows, per update."""
     latent_size: Count = 64
     """Z, also the size of the encoder's memory."""
-    position_octaves: int = 4
+    position_octaves: Number = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
     where a task has no positions."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
@@ -120,12 +120,11 @@ def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
     spent, first = None, 0
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
-        tensors, told = load_tensors(checkpoint)
-        state = unflatten(tensors)
-        model.load_state_dict(state["model"])
-        optimizer.load_state_dict(state["optimizer"])
-        schedule.load_state_dict(told["schedule"])
-        epochs, spent, first = told["epochs"], told["spent"], told["update"]
+        with resumed(checkpoint) as (state, told):
+            model.load_state_dict(state["model"])
+            optimizer.load_state_dict(state["optimizer"])
+            schedule.load_state_dict(told["schedule"])
+            epochs, spent, first = told["epochs"], told["spent"], told["update"]
     stopwatch = Stopwatch(spent)
     for update in range(first, config.updates):
         torch.manual_seed(derive(fitting.seed, f"grounding update {update}"))

@@ -16,6 +16,7 @@ from astra_data.errors import RecipeError
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+Number = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -124,7 +125,7 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
         told = error["ctx"]
         known, got = (told[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
         choices = known.replace(", ", " or ")
-        return f"{key}.{told['discriminator'].strip('()')}: expected {choices}, got '{got}'"
+        return f"{key}.{told['discriminator'].strip('()_')}: expected {choices}, got '{got}'"
     if kind == "missing":
         return f"{key}: expected a value, but the key is missing"
     if kind == "value_error":

@@ -198,6 +198,17 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
+    def _limits_all_commands(self) -> Self:
+        rows = {row: METHODS[base_method(row)] for row in self.methods}
+        elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]
+        if self.train.limits_commands and elsewhere:
+            raise ValueError(
+                f"train.command_limit_m_s: it does not reach {', '.join(elsewhere)}, which no simulator "
+                "trains: leave these rows out, or give it in [plus]"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _fits_the_task(self) -> Self:
         if TASKS[self.task].plane is not None:
             return self
@@ -207,7 +218,10 @@ class Recipe(Config):
             'collect.start = "anywhere" (the default; "task" does not)': self.collect.start == "anywhere",
             "collect.clearance_m": self.collect.clearance_m > 0,
             "train.support_penalty": self.train.support_penalty > 0,
+            "train.command_limit_m_s": self.train.limits_commands,
             "plus.support_penalty": self.plus.support_penalty > 0,
+            "plus.command_limit_m_s": self.plus.limits_commands,
+            "evaluate.leg_scale": self.evaluate.leg_scale != 1.0,
             "report.paper_success": bool(self.report.paper_success),
         }
         if faults := faults + [setting for setting, is_asked in asked.items() if is_asked]:

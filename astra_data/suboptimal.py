@@ -1,6 +1,7 @@
 """Policies that were stopped early: better than chance, far from good."""
 
 from collections import deque
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +11,10 @@ from astra_data.errors import BadInputError
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.policy import PolicyShape
+from astra_data.models.policy import Policy, PolicyShape
 from astra_data.models.soft_actor import SoftActor
 from astra_data.progress import Progress
+from astra_data.recipe import Config
 from astra_data.seeding import derive
 from astra_data.target_world import TargetWorld
 from astra_data.task import Task
@@ -22,8 +24,12 @@ _SAC_ENVS = 32
 """Targets that they are trained in."""
 
 _SAC = SacConfig(discount=0.99, reward_scale=0.1, learning_rate=3e-4)
-_HIDDEN_SIZES = (256, 256)
 """With which the humanoid learns to stay up: rewards are 5 a step there."""
+_SAC_SIZES = (256, 256)
+"""Hidden layers of actor and critics."""
+
+type Told = dict[str, Any]
+"""What a dataset records about the behaviour."""
 
 _RECENT = 50
 """Episodes that tell how long they last at present."""
@@ -31,11 +37,11 @@ _RECENT = 50
 
 def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, num_threads: int | None, progress: Progress
-) -> tuple[DeployedPolicy, int]:
+) -> tuple[DeployedPolicy, Told]:
     """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
 
     Returns:
-        the policy, and the environment steps that it was trained for.
+        the policy, and how it was trained.
     """
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = TargetWorld(task, _PPO_ENVS, num_threads=num_threads)
@@ -46,18 +52,19 @@ def suboptimal_by_ppo(
         metrics = ppo.iterate()
         note = f"training the behaviour: reward per step {metrics['reward']:.3f}"
         progress(min(1.0, ppo.steps / steps), note)
-    return DeployedPolicy(task, policy.requires_grad_(False)), steps
+    told = _told(steps, policy, world, config)
+    return DeployedPolicy(task, policy.requires_grad_(False)), told
 
 
 def suboptimal_by_sac(
     task: Task, *, steps: int, episode_steps: int, seed: int, num_threads: int | None, progress: Progress
-) -> tuple[DeployedPolicy, int]:
+) -> tuple[DeployedPolicy, Told]:
     """Train a policy without memory by SAC in the target, on its full state.
 
     Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest.
 
     Returns:
-        the policy, and the environment steps that it was trained for.
+        the policy, and how it was trained.
 
     Raises:
         BadInputError: success ends the task's episodes, so that how long they last tells nothing.
@@ -66,7 +73,7 @@ def suboptimal_by_sac(
         raise BadInputError(f"in {task.name} good episodes are short: take 'suboptimal_ppo'")
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = TargetWorld(task, _SAC_ENVS, observed="full", num_threads=num_threads)
-    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_HIDDEN_SIZES))
+    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))
     config = _SAC.model_copy(update={"total_steps": steps})
     sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
     ended: deque[tuple[float, float]] = deque()
@@ -82,4 +89,11 @@ def suboptimal_by_sac(
             ended.popleft()
         share = max(sac.steps / steps, lasted / episode_steps)
         progress(min(1.0, share), f"training the behaviour: episodes last {lasted:.0f} steps")
-    return DeployedPolicy(task, actor.requires_grad_(False), observed="full"), sac.steps
+    told = _told(sac.steps, actor, world, config)
+    return DeployedPolicy(task, actor.requires_grad_(False), observed="full"), told
+
+
+def _told(steps: int, policy: Policy, world: TargetWorld, config: Config) -> Told:
+    sizes = list(policy.shape.hidden_sizes)
+    learner = {"num_envs": world.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
+    return {"trained_steps": steps, "learner": learner}

@@ -16,9 +16,8 @@ from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
 from astra_data.batched import BatchedEnv
-from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import BadInputError
 from astra_data.grounding_file import Grounding
 from astra_data.learners.learner import Learner
 from astra_data.learners.ppo import Ppo, PpoConfig
@@ -28,7 +27,7 @@ from astra_data.models.policy import Policy, PolicyShape
 from astra_data.models.soft_actor import SoftActor
 from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, choice
+from astra_data.recipe import Config, Count, Number, choice
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
@@ -44,9 +43,9 @@ class TrainConfig(WorldConfig):
 
     num_envs: Count = 256
     """Worlds stepped side by side."""
-    hidden_sizes: tuple[int, ...] = (64, 64)
+    hidden_sizes: tuple[Count, ...] = (64, 64)
     """Of actor and critic."""
-    memory_size: int = 64
+    memory_size: Number = 64
     """Of the policy's own GRU, where no grounding provides a latent."""
 
 
@@ -72,7 +71,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
         return self
 
 
-def learner(settings: object) -> str:
+def _learner(settings: object) -> str:
     """Return which of the tables below `settings` are; by default PPO's."""
     if isinstance(settings, Mapping):
         return choice(str(settings.get("learner", "ppo")))
@@ -81,7 +80,7 @@ def learner(settings: object) -> str:
 
 AnyTrainConfig = Annotated[
     Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
-    Discriminator(learner),
+    Discriminator(_learner),
 ]
 """Training as its `learner` says, by default by PPO."""
 
@@ -206,17 +205,10 @@ def optimise(
     spent: dict[str, float] | None = None
     checkpoint = folder / checkpoint_name
     if checkpoint.exists():
-        tensors, told = load_tensors(checkpoint)
-        state = unflatten(tensors)
-        world = {name: values.to(device) for name, values in state["world"].items()}
-        try:
+        with resumed(checkpoint) as (state, told):
+            world = {name: values.to(device) for name, values in state["world"].items()}
             learner.load_state_dict(state["learner"], env.load_state_dict(world))
-        except (KeyError, RuntimeError) as error:
-            raise BadInputError(
-                f"{checkpoint}: expected a training that this version began, found another one ({error}): "
-                f"remove {folder}"
-            ) from error
-        points, spent = told["points"], told["spent"]
+            points, spent = told["points"], told["spent"]
     stopwatch, first = Stopwatch(spent), learner.steps
     is_lasting = training.task.objective.is_lasting
     while not learner.done:

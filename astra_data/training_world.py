@@ -32,7 +32,7 @@ class WorldConfig(Config):
     """Switches of the training world; all off is the method as it is published.
 
     Each may be given to any method, but the raw simulator has no model to predict from: there `topple` is
-    without effect and the rewards "predicted" and "blend" are the abstract one.
+    without effect, the reward "blend" is the abstract one, and "predicted" is refused.
     """
 
     reward: RewardSource | None = None
@@ -53,6 +53,11 @@ class WorldConfig(Config):
     """Share of the training over which the penalties grow from nothing: at once, they teach to stand."""
     data_start_share: Share = 0.0
     """Share of the episodes that start in the midst of a recorded one."""
+
+    @property
+    def limits_commands(self) -> bool:
+        """Whether commands are shortened."""
+        return bool(self.command_limit_m_s != type(self).model_fields["command_limit_m_s"].default)
 
 
 @dataclass(frozen=True)
@@ -133,8 +138,7 @@ def training_world(
     Raises:
         BadInputError: `config` asks for what needs a maze, and the task has none.
     """
-    usual = WorldConfig.model_fields["command_limit_m_s"].default
-    if task.plane is None and (config.support_penalty or config.command_limit_m_s != usual):
+    if task.plane is None and (config.support_penalty or config.limits_commands):
         raise task.without_maze()
     scatter = parts.scatter if config.residual_noise else None
     simulator = simulator_of(task, grounding, num_envs, device, variation=parts.variation, scatter=scatter)

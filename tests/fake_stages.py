@@ -33,6 +33,7 @@ class FakeConfig(Config):
     rate: float = 0.5
     fails: bool = False
     learner: str = "ppo"
+    limits_commands: bool = False
 
 
 class FakeCollectConfig(FakeConfig):

@@ -38,6 +38,17 @@ def test_only_the_legs_differ_in_the_morphology_test() -> None:
     assert experiment.borrowed == {"collect", "pair", "ground", "train", "align"}
 
 
+@pytest.mark.parametrize("name", ["kinematics", "extended"])
+def test_only_the_simulator_differs_in_the_humanoids_tests(name: str) -> None:
+    ours, base = (
+        load_experiment(HOUSE / "recipes" / f"humanoid_{kind}.toml", Path("runs"))
+        for kind in (name, "walker2d")
+    )
+    assert ours.borrowed == {"collect"}
+    kept = ours.recipe.model_copy(update={"task": base.recipe.task, "based_on": None})
+    assert kept == base.recipe
+
+
 @pytest.mark.parametrize(
     ("name", "borrowed"), [("nao_navigation_50", {"collect"}), ("nao_navigation_200", set())]
 )
@@ -62,6 +73,8 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
         (', "rma", "follower"', "", "methods: follower"),
         ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
         ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
+        ("", "[plus]\ncommand_limit_m_s = 1.0\n", "plus.command_limit_m_s"),
+        ("", "[evaluate]\nleg_scale = 1.25\n", "evaluate.leg_scale"),
         ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),
     ],
 )

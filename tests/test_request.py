@@ -29,6 +29,14 @@ def test_the_learner_decides_what_the_training_is_told() -> None:
     assert read(**recipe.settings) == recipe
 
 
+def test_a_limit_of_commands_that_does_not_reach_all_rows_is_refused() -> None:
+    limit = {"command_limit_m_s": 1.0}
+    tables: dict[str, Any] = {"task": "antmaze-umaze", "methods": ["astra", "iql", "target", "follower"]}
+    assert not read(**tables, plus=limit).train.limits_commands
+    with pytest.raises(RecipeError, match="it does not reach iql, target, which no simulator trains"):
+        read(**tables, train=limit)
+
+
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
@@ -40,6 +48,17 @@ def test_the_learner_decides_what_the_training_is_told() -> None:
         ({"train": SAC | {"ramp": 0.4}}, "train: ramp: expected 0 with SAC"),
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
         ({"train": 3}, "train: expected a table, got 3"),
+        ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
+        ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),
+        (
+            {"ground": {"position_octaves": -1}},
+            "ground.position_octaves: expected greater than or equal to 0",
+        ),
+        ({"align": {"bandwidths": [1.0, 0.0]}}, "align.bandwidths.1: expected greater than 0"),
+        (
+            {"collect": {"start": "task", "hold_s": [3.0, 0.5]}},
+            "collect: hold_s: expected the shorter time first, got [3.0, 0.5]",
+        ),
         ({"task": "antmaze-umaze", "collect": {"behavior": "suboptimal_sac"}}, "take 'suboptimal_ppo'"),
     ],
 )

@@ -42,6 +42,7 @@ class PairedEpisodes:
         windows: everything else, (E, T, ...), with the mask of real steps.
         reference: name and version of the dataset. content_hash: its hash.
         held_out: which episodes the dataset itself sets aside, (E,) bool; None where it does not.
+        dropped_place: the entries of s_i that tell where the robot is, if φ drops all of them.
     """
 
     target_state: Tensor
@@ -51,6 +52,7 @@ class PairedEpisodes:
     reference: str
     content_hash: str
     held_out: Tensor | None = None
+    dropped_place: tuple[int, ...] = ()
 
     @classmethod
     def load(cls, root: Path, device: str = "cpu") -> "PairedEpisodes":
@@ -96,6 +98,7 @@ class PairedEpisodes:
             reference=dataset.reference,
             content_hash=dataset.content_hash,
             held_out=torch.tensor(said, dtype=torch.bool, device=device) if any(said) else None,
+            dropped_place=_dropped_place(dataset),
         )
 
     def __len__(self) -> int:
@@ -147,6 +150,15 @@ class PairedEpisodes:
         episodes, steps, is_drawn = draw_steps(self.lengths, count, length)
         windows = _gather(self.windows, (episodes, steps))
         return replace(windows, mask=windows.mask * is_drawn), self.target_state[episodes, steps]
+
+
+def _dropped_place(dataset: Dataset) -> tuple[int, ...]:
+    columns = {column.name: column for column in dataset.schema}
+    roles = columns[ABSTRACT_STATE].roles
+    if not roles or "position" in dict(roles):
+        return ()
+    groups = [group for role, group in columns[STATE].roles if role == "position"]
+    return tuple(index for group in groups for index in range(group.start, group.stop))
 
 
 def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,6 +2,10 @@
 
 All pay for going forward and for staying up, as `Locomotion` does; none knows of effort and contact forces,
 which cost the target little. Nothing is to be reached: who lasts to the horizon without falling succeeds.
+
+Under random commands the pay for a step differs from the target's, costs aside, by 0.02 (root mean square)
+where the centre of mass is known, by 0.6 in the plane, and by 2 of the joints alone, whose pay has nothing to
+do with the target's there: the level torso that it goes by is what such a body does not have.
 """
 
 from abc import abstractmethod
@@ -19,7 +23,7 @@ from astra_data.humanoid.abstraction import (
 )
 from astra_data.humanoid.locomotion import Locomotion
 from astra_data.humanoid.model import COMMANDED, JOINTS, TIMESTEP_S
-from astra_data.humanoid.skeleton import mass_and_feet
+from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity
 from astra_data.objective import Objective
 
 _COUNT = len(JOINTS)
@@ -91,8 +95,14 @@ class PlanarWalking(Walking):
         return ~((state[:, 0] > low) & (state[:, 0] < high))
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return the torso's velocity along x after the step, (B,) in m/s."""
-        return after[:, 6]
+        """Return the centre of mass's velocity along x after the step, (B,) in m/s, trunk and arms stiff."""
+        joints = after.new_zeros(2, len(after), _COUNT)
+        joints[..., COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
+        mass, _ = mass_and_feet(joints[0])
+        swept = mass_velocity(*joints)
+        pitch, pitch_rate = after[:, 1], after[:, 8]
+        forward, up = swept[:, 0] + pitch_rate * mass[:, 2], swept[:, 2] - pitch_rate * mass[:, 0]
+        return after[:, 6] + torch.cos(pitch) * forward + torch.sin(pitch) * up
 
 
 @dataclass(frozen=True)
@@ -120,7 +130,8 @@ class MassWalking(Walking):
     """Of joints and centre of mass, states (..., 40).
 
     Attributes:
-        lowest_mass_m: a centre of mass lower than this has fallen; that of one who stands is 0.9 m high.
+        lowest_mass_m: a centre of mass lower than this has fallen, two steps before the target says so on
+            average; that of one who stands is 0.9 m high.
     """
 
     lowest_mass_m: float = 0.65
@@ -136,7 +147,7 @@ class MassWalking(Walking):
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell which centres of mass (B,) of states (B, 40) have fallen."""
-        return state[:, 2 * _COUNT + 2] < self.lowest_mass_m
+        return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the velocity of the centre of mass along x after the step, (B,) in m/s."""

@@ -11,10 +11,10 @@ uninterrupted run would have done.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ from astra_data.dataset.pairs import draw_steps
 from astra_data.errors import BadInputError
 from astra_data.models.history import mlp
 from astra_data.models.policy import Policy
-from astra_data.recipe import Config, Count, NotNegative, Positive, Share
+from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
 from astra_data.seeding import derive
 
 
@@ -36,7 +36,7 @@ class IqlConfig(Config):
     """Gradient updates of the critics, before the first of the policy."""
     critic_batch: Count = 256
     """Transitions per update of the critics."""
-    critic_sizes: tuple[int, ...] = (128, 128)
+    critic_sizes: tuple[Count, ...] = (128, 128)
     """Hidden layers of each critic."""
     critic_learning_rate: Positive = 1e-3
     """Of the critics."""
@@ -61,7 +61,7 @@ class IqlConfig(Config):
     """Windows per update of the policy."""
     window: Count = 100
     """Steps per window, in backpropagation through time."""
-    burn_in: Annotated[int, Field(ge=0)] = 20
+    burn_in: Number = 20
     """Steps at the start of a window that only fill the memory; none where the episode begins there."""
     learning_rate: Positive = 1e-3
     """Of the policy at the start; falls to zero along a half cosine."""

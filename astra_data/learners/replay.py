@@ -11,13 +11,13 @@ from astra_data.batched import BatchedEnv
 class Replay:
     """The last steps of B environments, row after row, in contiguous tensors."""
 
-    def __init__(self, size: int, env: BatchedEnv, device: torch.device) -> None:
-        """Keep the last `size` steps of `env`, as many of each of its B rows."""
+    def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: torch.device) -> None:
+        """Keep the last `size` steps of `env`, as many of each row, and memories of `memory_size` numbers."""
         self._rows = size // env.num_envs
         self._added = 0
         place = self._rows, env.num_envs
         numbers = {"observation": (env.observation_size,), "action": (env.action_size,), "reward": ()}
-        numbers["previous_action"] = numbers["action"]
+        numbers |= {"previous_action": numbers["action"], "hidden": (memory_size,)}
         self._columns = {name: torch.empty(*place, *size, device=device) for name, size in numbers.items()}
         for name in ("terminated", "expired", "first"):
             self._columns[name] = torch.empty(place, dtype=torch.bool, device=device)
@@ -30,8 +30,9 @@ class Replay:
         """Add a step of every environment.
 
         Args:
-            step: observation (B, O), previous_action (B, A), zero at the start, action (B, A), reward (B,);
-                bool (B,): terminated, expired, where time ran out, and first, where an episode begins.
+            step: observation (B, O); previous_action (B, A) and the policy's memory before the step, hidden
+                (B, M), both zero at the start; action (B, A); reward (B,); bool (B,): terminated, expired,
+                where time ran out, and first, where an episode begins.
         """
         row = self._added % self._rows
         for name, column in self._columns.items():

@@ -1,15 +1,17 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
 
 Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
-whose first steps only fill the memories; otherwise they learn from single steps.
+whose first steps only fill the memories; otherwise they learn from single steps. The policy's memory begins a
+window as it was when it acted, for it goes on through whole episodes when it acts again (Kapturowski et al.
+2019); that of the critics, which judge nothing but windows, begins empty.
 """
 
 import copy
 from itertools import pairwise
-from typing import Annotated, Self
+from typing import Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -23,7 +25,7 @@ from astra_data.learners.learner import Learner
 from astra_data.learners.replay import Replay
 from astra_data.models.policy import features_of
 from astra_data.models.soft_actor import SoftActor, gaussian
-from astra_data.recipe import Config, Count, Positive, Share
+from astra_data.recipe import Config, Count, Number, Positive, Share
 from astra_data.seeding import derive
 
 
@@ -40,7 +42,7 @@ class SacConfig(Config):
     """Steps per update; where the policy has a memory, in as many windows as they make."""
     window: Count = 32
     """Steps in a row, where the policy has a memory."""
-    burn_in: Annotated[int, Field(ge=0)] = 8
+    burn_in: Number = 8
     """Steps at the start of a window that only fill the memory, until an episode begins."""
     buffer_size: Count = 1_000_000
     """The most recent steps that are kept."""
@@ -103,7 +105,7 @@ class Sac(Learner):
                 f"buffer_size: expected at least {(self._window + 1) * env.num_envs} steps, for a window of "
                 f"{self._window} in {env.num_envs} environments, got {config.buffer_size}"
             )
-        self._replay = Replay(config.buffer_size, env, device)
+        self._replay = Replay(config.buffer_size, env, policy.shape.memory_size, device)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
             Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=False),
@@ -135,6 +137,7 @@ class Sac(Learner):
         seen = {
             "observation": acting.observation,
             "previous_action": acting.previous_action,
+            "hidden": acting.hidden,
             "first": acting.first,
         }
         features, hidden = self.policy.remember(acting.observation, acting.previous_action, acting.hidden)
@@ -154,12 +157,12 @@ class Sac(Learner):
         steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
         if not bool(learned.any()):
             return
+        seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
         nothing = self.policy.initial_hidden(len(learned))
-        seen = steps["observation"], steps["previous_action"], nothing, steps["first"].float()
-        acting = features_of(self.policy.memory, *seen)
-        judging = features_of(self._memory, *seen)
+        acting = features_of(self.policy.memory, *seen, steps["hidden"][:, 0], first)
+        judging = features_of(self._memory, *seen, nothing, first)
         with torch.no_grad():
-            following = features_of(self._late_memory, *seen)[:, 1:][learned]
+            following = features_of(self._late_memory, *seen, nothing, first)[:, 1:][learned]
         terminated = steps["terminated"][:, :-1][learned].unsqueeze(-1)
         table = {
             "acting": acting[:, :-1][learned],

@@ -15,7 +15,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.checkpoint import resumed, save_tensors
 from astra_data.errors import BadInputError
 from astra_data.fitting import Fitting
 from astra_data.method import Method
@@ -80,8 +80,8 @@ class Search:
     def begin(cls, ranges: Variation, checkpoint: Path) -> "Search":
         """Go on from `checkpoint`; without one, begin at the plain simulator, as far as it is in `ranges`."""
         if checkpoint.exists():
-            _, told = load_tensors(checkpoint)
-            return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
+            with resumed(checkpoint) as (_, told):
+                return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
         plain = type(ranges)()
         point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in ranges.steering}
         return cls(ranges, point, [], None)

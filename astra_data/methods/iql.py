@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.learners.iql import FINE_TUNING, Experience, Iql, IqlConfig
 from astra_data.method import Method
@@ -88,9 +88,9 @@ def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
     points: list[dict[str, float | None]] = []
     spent: dict[str, float] | None = None
     if checkpoint.exists():
-        tensors, told = load_tensors(checkpoint)
-        iql.load_state_dict(unflatten(tensors))
-        points, spent = told["points"], told["spent"]
+        with resumed(checkpoint) as (state, told):
+            iql.load_state_dict(state)
+            points, spent = told["points"], told["spent"]
     stopwatch = Stopwatch(spent)
     while not iql.done:
         losses = iql.iterate()

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from astra_data.checkpoint import flatten, load_tensors, save_tensors, unflatten
+from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import Fitting, correction_r2, scatter_factor
 from astra_data.method import Method
@@ -58,11 +58,10 @@ def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> d
     spent: dict[str, float] | None = None
     checkpoint = fitting.folder / "checkpoint.safetensors"
     if checkpoint.exists():
-        tensors, told = load_tensors(checkpoint)
-        state = unflatten(tensors)
-        model.load_state_dict(state["model"])
-        optimizer.load_state_dict(state["optimizer"])
-        points, spent = told["epochs"], told["spent"]
+        with resumed(checkpoint) as (state, told):
+            model.load_state_dict(state["model"])
+            optimizer.load_state_dict(state["optimizer"])
+            points, spent = told["epochs"], told["spent"]
     stopwatch = Stopwatch(spent)
     for epoch in range(len(points), config.epochs):
         order = generator(fitting.seed, f"grounding epoch {epoch}").permutation(count)

@@ -1,5 +1,7 @@
 """The target encoder ψ^t and the discrepancy that aligns it with the source encoder (paper, Section IV-B)."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -39,11 +41,17 @@ class TargetEncoder(nn.Module):
         self.goal_mean: Tensor
         self.goal_std: Tensor
 
-    def set_scales(self, state: Tensor, goal: Tensor) -> None:
-        """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G)."""
+    def set_scales(self, state: Tensor, goal: Tensor, unseen: Sequence[int] = ()) -> None:
+        """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G).
+
+        The entries `unseen` of states get an infinite one, with which they do not count.
+        """
         for name, values in {"state": state, "goal": goal}.items():
+            if not values.numel():
+                continue
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+        self.state_std[list(unseen)] = torch.inf
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble [s_i, its position's features, goal, a_{i-1}] (..., I), states within ±5 deviations."""

@@ -122,6 +122,8 @@ class GroundingModel(nn.Module):
     def set_scales(self, columns: Mapping[str, Tensor]) -> None:
         """Take means and deviations from training steps: state, goal, correction, reward (N, ...)."""
         for name, values in columns.items():
+            if not values.numel():
+                continue  # no goals
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
 

@@ -13,8 +13,11 @@ It leaves out:
   way to gravity and to the legs' motion; here they are stiff.
 * Legs that hit each other.
 * Which part of a foot touches: both worlds have spheres for feet, but a humanoid that rolls lifts one of them
-  at joint angles at which the walker stands on both. Contacts come from the joints and the torso here, and
-  so may change as soon as a state that was set takes its first step.
+  at joint angles at which the walker stands on both. Contacts that a step leads to come from the joints and
+  the torso here, others than those of a humanoid in that pose.
+* How the waist and the hips' other axes lower the feet. At the humanoid's height of the torso the walker's
+  would often be inside the floor, which would throw it into the air: a step is taken as if the floor were
+  lower by that much.
 * The memory of MuJoCo's solver from step to step: a state says all about what follows from it.
 """
 
@@ -36,6 +39,7 @@ from astra_data.humanoid.walker import sole_clearance, walker_model
 _JOINTS = ("left_hip", "left_knee", "right_hip", "right_knee")
 _POSE = slice(0, 6)
 _MOTION = slice(0, 13)
+_CONTACTS = slice(13, 15)
 
 
 class HumanoidWalker2d(FreeStates):
@@ -110,24 +114,24 @@ class HumanoidWalker2d(FreeStates):
             model.opt.timestep = scale * plain.opt.timestep
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move to `landed` (B, 15), but for its contacts: they are what torso and legs say; return it."""
-        motion = landed[:, _MOTION]
-        return super().settle(before, torch.cat([motion, _contacts(motion)], dim=-1))
+        """Move to `landed` (B, 15), its contacts rounded to 1 or 0; return it."""
+        contacts = (landed[:, _CONTACTS] > 0.5).to(landed.dtype)
+        return super().settle(before, torch.cat([landed[:, _MOTION], contacts], dim=-1))
 
     def step(self, action: Tensor) -> Tensor:
         """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, 15)."""
         model, count = self._model, len(self.state)
         initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
+        motion = self.state[:, _MOTION].cpu().double()
+        sunk = (-sole_clearance(motion[:, _POSE]).amin(-1)).clamp_min(0.0)
+        motion[:, 0] += sunk
         # Behind the time, and x, where every step begins anew.
-        initial[:, 2 : 2 + _MOTION.stop] = self.state[:, _MOTION].cpu().numpy()
+        initial[:, 2 : 2 + _MOTION.stop] = motion.numpy()
         targets = self.ranges.targets(action.cpu().double()).numpy()
         control = np.repeat(targets[:, None], CONTROL_SUBSTEPS, axis=1)
         states, _ = self._rollout.rollout(self._models, self._data, initial, control)
-        motion = torch.from_numpy(states[:, -1, 2 : 2 + _MOTION.stop])
-        self.state = torch.cat([motion, _contacts(motion)], dim=-1).float().to(self.state.device)
+        motion = torch.from_numpy(states[:, -1, 2 : 2 + _MOTION.stop].copy())
+        contacts = (sole_clearance(motion[:, _POSE]) < CONTACT_M).to(motion.dtype)
+        motion[:, 0] -= sunk
+        self.state = torch.cat([motion, contacts], dim=-1).float().to(self.state.device)
         return self.state
-
-
-def _contacts(motion: Tensor) -> Tensor:
-    """Tell for `motion` (B, 13) which feet touch the floor, (B, 2), 1 or 0."""
-    return (sole_clearance(motion[:, _POSE]) < CONTACT_M).to(motion.dtype)

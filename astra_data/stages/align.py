@@ -34,7 +34,7 @@ class AlignConfig(Config):
     """At the start; falls to zero along a half cosine."""
     gradient_norm: Positive = 1.0
     """Gradients are clipped to this norm."""
-    bandwidths: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
+    bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
     """Of the MMD's kernels, in units of the square root of the latent's size."""
     paired_weight: NotNegative = 0.0
     """Weight of the direct distance between paired latents; 0 is the paper's loss."""
@@ -71,7 +71,10 @@ def align(
         latent_size=model.shape.latent_size,
         position_octaves=model.shape.position_octaves,
     ).to(device)
-    encoder.set_scales(training.steps(training.target_state), training.steps(training.windows.goal))
+    # Where φ drops the place, latents must not change with the way that a robot has come.
+    encoder.set_scales(
+        training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
+    )
     optimizer = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5

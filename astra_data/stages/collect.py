@@ -87,6 +87,8 @@ class CollectConfig(Config):
         ]
         if self.behavior != "policy" and given:
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
+        if self.hold_s[0] > self.hold_s[1]:
+            raise ValueError(f"hold_s: expected the shorter time first, got {list(self.hold_s)}")
         return self
 
 
@@ -183,8 +185,8 @@ def _behavior(
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
         else:
             by = partial(suboptimal_by_sac, steps=config.sac_steps, episode_steps=config.sac_episode_steps)
-        deployed, steps = by(task, seed=seed, num_threads=num_threads, progress=progress)
-        return PolicyBehavior(deployed), {"trained_steps": steps}
+        deployed, told = by(task, seed=seed, num_threads=num_threads, progress=progress)
+        return PolicyBehavior(deployed), told
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
     model = load_grounding(files["grounding"]) if "grounding" in files else None

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import numpy as np
@@ -155,3 +156,18 @@ def test_an_unpaired_dataset_is_refused(tmp_path: Path) -> None:
     write_fake(tmp_path / "raw")
     with pytest.raises(BadInputError, match="expected a dataset that was paired"):
         PairedEpisodes.load(tmp_path / "raw")
+
+
+@pytest.mark.parametrize(
+    ("kept", "dropped"), [("invariant", (1, 2)), ("position", ()), (None, ())], ids=["no", "yes", "untold"]
+)
+def test_what_tells_the_place_is_dropped_if_phi_drops_it(
+    tmp_path: Path, kept: str | None, dropped: tuple[int, ...]
+) -> None:
+    root = write(tmp_path / "dataset", SIZES | {STATE: 4})
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][STATE]["astra"] = {"role": ["invariant", "position", "position", "heading"]}
+    if kept:
+        info["features"][ABSTRACT_STATE]["astra"] = {"role": [kept] * 4}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    assert PairedEpisodes.load(root).dropped_place == dropped

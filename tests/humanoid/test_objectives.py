@@ -7,6 +7,7 @@ from astra_data.envs.humanoid import HumanoidEnv
 from astra_data.humanoid import Locomotion, humanoid_model
 from astra_data.humanoid.model import COMMANDED, FEET, STANDING, TIMESTEP_S
 from astra_data.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
+from astra_data.humanoid.walker import walker_model
 
 KINDS = (PlanarWalking, JointWalking, MassWalking)
 NOTHING = torch.zeros(3, 0)
@@ -47,17 +48,48 @@ def test_to_last_is_to_succeed(kind: type[Walking]) -> None:
     assert objective.succeeded(reached, failed, 5).tolist() == [False, True]
 
 
-def test_the_walker_is_paid_as_the_target_but_for_costs() -> None:
-    objective = PlanarWalking(horizon=5)
-    before, after = torch.zeros(4, 15), torch.zeros(4, 15)
-    after[:, 0] = torch.tensor([1.4, 0.9, 1.4, 2.1])
-    after[:, 6] = torch.tensor([0.0, 1.0, -2.0, 0.5])
-    failed = objective.missed(after, torch.zeros(4, 0))
-    assert failed.tolist() == [False, True, False, True]
-    free = np.zeros(4)
-    expected = Locomotion().reward(after[:, 6].numpy(), ~failed.numpy(), free, free)
-    reward = objective.reward(before, after, torch.zeros(4, 0), failed)
-    np.testing.assert_allclose(reward.numpy(), expected)
+@pytest.mark.parametrize(
+    ("kind", "bias", "scatter", "early"),
+    [(PlanarWalking, 0.1, 0.8, 0.0), (MassWalking, 0.03, 0.05, 4.0)],
+)
+def test_pay_and_falls_are_the_targets_but_for_costs(
+    kind: type[Walking], bias: float, scatter: float, early: float
+) -> None:
+    """Of what the humanoid does under random commands; `early`: steps by which falls are told too early."""
+    env = HumanoidEnv(Locomotion(effort_cost=0.0, contact_cost=0.0), 32, seed=0, num_threads=1)
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    objective, alive = made(kind), torch.ones(32, dtype=torch.bool)
+    wrong, misjudged = [], []
+    for number in range(80):
+        if number % 7 == 0:
+            action = 2 * torch.rand(32, 4, generator=generator) - 1
+        states = [env.state.numpy()]
+        step = env.step(action)
+        states.append(env.state.numpy())
+        before, after = (torch.from_numpy(objective.abstracted(state))[alive] for state in states)
+        failed = objective.missed(after, NOTHING)
+        judged_alike = failed == step.terminated[alive]
+        paid = objective.reward(before, after, NOTHING, failed)
+        wrong.append((paid - step.reward[alive])[judged_alike])
+        misjudged.append(~judged_alike)
+        alive &= ~step.terminated
+    assert int(alive.sum()) < 8
+    assert abs(float(torch.cat(wrong).mean())) < bias
+    assert float(torch.cat(wrong).square().mean().sqrt()) < scatter
+    assert float(torch.cat(misjudged).sum()) / 32 <= early
+
+
+def test_the_walkers_mass_moves_as_mujoco_says() -> None:
+    objective, model = PlanarWalking(horizon=5), walker_model()
+    data = mujoco.MjData(model)
+    generator = np.random.default_rng(0)
+    data.qpos[1:], data.qvel[:] = [1.4, 0.3, -0.4, -1.0, 0.2, -0.5], generator.normal(size=7)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    after = torch.zeros(1, 15)
+    after[0, :13] = torch.from_numpy(np.concatenate([data.qpos[1:], data.qvel]))
+    assert float(objective.velocity(after, after)) == pytest.approx(data.subtree_linvel[0, 0], abs=1e-5)
 
 
 def test_joints_are_paid_for_the_way_of_the_torso_over_the_lower_foot() -> None:
@@ -92,5 +124,6 @@ def test_a_centre_of_mass_near_the_floor_has_fallen() -> None:
     state = torch.from_numpy(objective.abstracted(lying))
     failed = objective.missed(state, NOTHING)
     assert failed.tolist() == [False, True, False]
+    assert objective.missed(state * torch.nan, NOTHING).all()  # as what no simulator comes back from
     reward = objective.reward(state, state, NOTHING, failed)
     np.testing.assert_allclose(reward.numpy(), [5.0, 0.0, 5.0 + 1.25 * 2.0], atol=1e-6)

@@ -8,13 +8,14 @@ ROWS = 3
 
 def replay(size: int, steps: int) -> Replay:
     """Return a replay of what tells the step it is of and, in tenths, the row."""
-    kept = Replay(size, GoToZero(ROWS), torch.device("cpu"))
+    kept = Replay(size, GoToZero(ROWS), 2, torch.device("cpu"))
     for step in range(steps):
         value = step + torch.arange(ROWS) / 10
         nothing = torch.zeros(ROWS, dtype=torch.bool)
         kept.add(
             observation=value[:, None],
             previous_action=-value[:, None],
+            hidden=torch.stack([2 * value, 3 * value], dim=-1),
             action=10 * value[:, None],
             reward=100 * value,
             terminated=torch.tensor([step % 5 == 4, False, False]),
@@ -34,6 +35,7 @@ def test_windows_are_steps_in_a_row_of_the_most_recent() -> None:
     assert set((observation[:, 0] % 1 * 10).round().int().tolist()) == {0, 1, 2}
     torch.testing.assert_close(drawn["action"].squeeze(-1), 10 * observation)
     torch.testing.assert_close(drawn["previous_action"].squeeze(-1), -observation)
+    torch.testing.assert_close(drawn["hidden"][..., 1], 3 * observation)
     torch.testing.assert_close(drawn["reward"], 100 * observation)
 
 

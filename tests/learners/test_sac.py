@@ -1,3 +1,4 @@
+import math
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, unflatten
 from astra_data.errors import BadInputError
 from astra_data.learners.sac import Sac, SacConfig
-from astra_data.models.policy import PolicyShape
+from astra_data.models.policy import PolicyShape, features_of
 from astra_data.models.soft_actor import SoftActor
 
 
@@ -80,24 +81,61 @@ def _cloned(state: dict[str, Any]) -> dict[str, Any]:
     return unflatten({name: tensor.clone() for name, tensor in flatten(state).items()})
 
 
-@pytest.mark.parametrize(("terminates_after", "expected"), [(float("inf"), 10.0), (10.0, 5.26)])
-def test_running_out_of_time_bootstraps_and_ending_does_not(terminates_after: float, expected: float) -> None:
+@pytest.mark.parametrize(
+    ("terminates_after", "memory", "expected"), [(math.inf, 0, 10.0), (math.inf, 8, 10.0), (10.0, 0, 5.26)]
+)
+def test_running_out_of_time_bootstraps_and_ending_does_not(
+    terminates_after: float, memory: int, expected: float
+) -> None:
     """One unit each step is worth 1 / (1 - 0.9) = 10; where a tenth of like steps are the last, 1 / 0.19."""
     horizon = 10 if terminates_after > 10 else 1000
     env = ConstantReward(16, terminates_after)
     learner = sac(
         *(env, 400),
         horizon=horizon,
+        memory=memory,
+        window=4,
+        burn_in=1,
         target_rate=0.05,
         initial_temperature=1e-6,
         learning_rate=3e-3,
     )
     train(learner)
     loss = learner._loss
-    state = TensorDict({"judging": torch.ones(1, 1), "action": torch.zeros(1, 1)}, batch_size=[1])
+    begun = (torch.ones(1, 1, 1), torch.zeros(1, 1, 1), learner.policy.initial_hidden(1), torch.ones(1, 1))
+    judging = features_of(learner._memory, *begun)[:, 0].detach()
+    state = TensorDict({"judging": judging, "action": torch.zeros(1, 1)}, batch_size=[1])
     with torch.no_grad(), loss.qvalue_network_params[0].to_module(loss.qvalue_network):
         value = float(loss.qvalue_network(state)["state_action_value"])
     assert value == pytest.approx(expected, rel=0.12)
+
+
+def test_the_memory_that_values_come_from_follows_slowly() -> None:
+    learner = sac(
+        GoToZero(8),
+        20,
+        horizon=9,
+        memory=4,
+        window=2,
+        burn_in=0,
+        rollout_steps=1,
+        updates_per_step=1,
+        target_rate=0.1,
+    )
+    expected = [values.clone() for values in _memory_of(learner, "late")]
+    while not learner.done:
+        learner.iterate()
+        now = _memory_of(learner, "now")
+        expected = [0.9 * before + 0.1 * after for before, after in zip(expected, now, strict=True)]
+        for late, values in zip(_memory_of(learner, "late"), expected, strict=True):
+            torch.testing.assert_close(late, values, atol=1e-6, rtol=0)
+    assert any((a - b).abs().max() > 1e-4 for a, b in zip(now, expected, strict=True))
+
+
+def _memory_of(learner: Sac, which: str) -> list[torch.Tensor]:
+    memory = learner._memory if which == "now" else learner._late_memory
+    assert memory is not None
+    return [values.detach().clone() for values in memory.parameters()]
 
 
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:

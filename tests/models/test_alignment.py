@@ -66,3 +66,11 @@ def test_target_encoder_clips_normalised_states() -> None:
     torch.testing.assert_close(inputs[:, :3].std(0), torch.ones(3), atol=0.01, rtol=0)
     far = encoder.encoder_input(torch.full((1, 3), 1e6), goal[:1], torch.zeros(1, 1))
     assert far[0, :3].tolist() == pytest.approx([5.0] * 3)
+
+
+def test_target_encoder_does_not_see_what_it_shall_not() -> None:
+    encoder = TargetEncoder(3, 0, 1, embedding_size=4, latent_size=4, position_octaves=0)
+    state, nothing = torch.randn(50, 3), torch.zeros(50, 0)
+    encoder.set_scales(state, nothing, unseen=[0, 2])
+    inputs = encoder.encoder_input(1e6 * state, nothing, torch.zeros(50, 1))
+    assert not inputs[:, [0, 2]].any() and inputs[:, 1].all()

@@ -167,6 +167,7 @@ def test_a_longer_step_slows_the_body_and_moves_it_for_longer() -> None:
 
 def test_walkers_have_the_damping_and_the_time_that_they_were_given() -> None:
     state = moving(HumanoidWalker2d, 3)
+    state[:, 0] += 0.2  # off the floor
     simulator = varied(HumanoidWalker2d, state, JointVariation())
     friction, scale = [0.5, 1.0, 2.0], [1.0, 1.5, 0.8]
     simulator.parameters = simulator.parameters.clone()
