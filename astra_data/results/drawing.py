@@ -1,6 +1,6 @@
 """Results → figures."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,15 +76,11 @@ def figures_of(
     """
     figures = {score.measure: _bars(results, score) for score in results.scores}
     drawn = [row for row in trajectory_methods if row in results.methods] or list(results.methods)
-    folders = [_with_trajectories(root, results, row) for row in drawn]
-    if camera is not None and None not in folders:
-        figures |= _pictures(drawn, [folder for folder in folders if folder], camera)
-    if maze is not None and None not in folders:
-        panels = [
-            _panel(results, row, folder, trajectory_episodes)
-            for row, folder in zip(drawn, folders, strict=True)
-            if folder
-        ]
+    folders = _with_trajectories(root, results, drawn)
+    if camera is not None:
+        figures |= _pictures(folders, camera)
+    if maze is not None and folders:
+        panels = [_panel(results, row, folder, trajectory_episodes) for row, folder in folders.items()]
         figures["trajectories"] = trajectories(maze, panels)
     curves = _curves(results)
     if curves:
@@ -113,10 +109,16 @@ def _bars(results: Results, score: Score) -> Figure:
     )
 
 
-def _with_trajectories(root: Path, results: Results, row: str) -> Path | None:
-    """Return the folder of the first seed of a row whose trajectories are there."""
-    folders = (root / "evaluate" / row / place(seed) for seed in results.methods[row].seeds)
-    return next((folder for folder in folders if (folder / TRAJECTORIES).exists()), None)
+def _with_trajectories(root: Path, results: Results, rows: Sequence[str]) -> dict[str, Path]:
+    """Return the folder of the first seed of each row that has trajectories; none where a row has none."""
+    found = {}
+    for row in rows:
+        folders = (root / "evaluate" / row / place(seed) for seed in results.methods[row].seeds)
+        folder = next((folder for folder in folders if (folder / TRAJECTORIES).exists()), None)
+        if folder is None:
+            return {}
+        found[row] = folder
+    return found
 
 
 def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
@@ -134,11 +136,11 @@ def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
     )
 
 
-def _pictures(rows: Sequence[str], folders: Sequence[Path], camera: Camera) -> dict[str, Figure]:
+def _pictures(folders: Mapping[str, Path], camera: Camera) -> dict[str, Figure]:
     """Return the figure "strips" of the first episode of each row; none where nothing can be drawn."""
     times_s = [time_s for time_s in _TIMES_S if time_s < camera.longest_s] + [camera.longest_s]
     found = {}
-    for row, folder in zip(rows, folders, strict=True):
+    for row, folder in folders.items():
         states = read_tensors(folder / TRAJECTORIES, ("target.state",))["target.state"]
         moments = [round(time_s / camera.timestep_s) for time_s in times_s]
         try:
@@ -147,7 +149,7 @@ def _pictures(rows: Sequence[str], folders: Sequence[Path], camera: Camera) -> d
             return {}
         failed = bool(read_json(Evaluation, folder / EVALUATION).target.failed[0])
         found[row] = Strip(pictures, (len(states) - 1) * camera.timestep_s, failed)
-    return {"strips": strips(times_s, found)}
+    return {"strips": strips(times_s, found)} if found else {}
 
 
 def _curves(results: Results) -> dict[str, list[Curve]]:
