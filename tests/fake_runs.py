@@ -134,16 +134,18 @@ def write_runs(parent: Path) -> Path:
     return root
 
 
-def write_iql(root: Path) -> None:
-    """Add a row that was trained, but in no simulator."""
+def write_elsewhere(root: Path, name: str, like: str = "direct_transfer") -> None:
+    """Add the row `name`, `like` another one, that was trained, but in no simulator."""
     for seed in SEEDS:
-        write_evaluation(root, "direct_transfer", seed, name="iql")
-        path = root / f"evaluate/iql/seed_{seed}/evaluation.json"
+        write_evaluation(root, like, seed, name=name)
+        path = root / f"evaluate/{name}/seed_{seed}/evaluation.json"
         values = json.loads(path.read_text())
         del values["simulated"]
         write_json(path, values)
         points = [{"steps": 1000, "success": None, "loss": 1.0}]
-        write_json(root / f"train/iql/seed_{seed}/curve.json", MADE | {"wall_seconds": 3.0, "points": points})
+        write_json(
+            root / f"train/{name}/seed_{seed}/curve.json", MADE | {"wall_seconds": 3.0, "points": points}
+        )
 
 
 def bare_results(recipe: str, rows: Mapping[str, list[int]], settings: dict[str, Any]) -> Results:

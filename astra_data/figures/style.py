@@ -63,8 +63,14 @@ COLOURS = {
 SPARE_COLOURS = ("#882255", "#AA4499", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a colour of their own."""
 
-ROLES = {"direct_transfer": "floor", "target": "ceiling", "full_obs": "ceiling", "follower": "ceiling"}
-"""Rows that bound the others: no grounding at all; trained in the target itself, or written by hand."""
+ROLES = {
+    "direct_transfer": "floor",
+    "target": "trained there",
+    "full_obs": "trained there",
+    "follower": "ceiling",
+}
+"""Rows that the others are seen against: no grounding at all; trained in the target itself, which the same
+steps need not teach as much; written by hand."""
 
 SIMULATED = "#E07B00"
 """A simulator, in every figure (as in the paper's Fig. 3)."""

@@ -31,7 +31,7 @@ def improvement(
     Rows that were in no simulator are compared with both, for the settings are none of theirs.
     """
     scores = {method: np.array(row.measures()[score.measure]) for method, row in rows.items()}
-    compared = {method: row for method, row in rows.items() if row.role != "ceiling"}
+    compared = {method: row for method, row in rows.items() if row.role in (None, "floor")}
     return {
         ours: {
             other: probability_of_improvement(scores[ours], scores[other], replicates=replicates)

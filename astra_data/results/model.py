@@ -109,7 +109,7 @@ class MethodResults(Part):
 
     title: str
     role: str | None
-    """"floor" or "ceiling" for the rows that bound the others."""
+    """"floor", "ceiling" or "trained there", in the target, of the rows that others are seen against."""
     seeds: list[int]
     """Those that are finished."""
     success: list[float]

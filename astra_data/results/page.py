@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from astra_data.figures import method_title
+from astra_data.figures import ROLES, method_title
 from astra_data.results.cells import duration, interval, mean_std, spread, table
 from astra_data.results.making import cost, machine, origin
 from astra_data.results.model import BandMeans, Results
@@ -166,6 +166,8 @@ def _table(results: Results) -> str:
         f"{EXPLAINED[results.headline.measure]} Floor and ceiling bound the other rows; the best of those is "
         "bold."
     )
+    if any(row.role == ROLES["target"] for row in rows.values()):
+        note += " Rows that were trained there learned in the target itself, for as long as the recipe says."
     if any(map(is_plus, rows)):
         note += " A plus marks the same method trained with the recipe's `[plus]` settings."
     paper = results.paper_success

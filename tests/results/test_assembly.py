@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, edit_json, write_iql, write_runs
+from fake_runs import ROWS, SEEDS, edit_json, write_elsewhere, write_runs
 from safetensors.numpy import load_file, save_file
 from scipy.stats import pearsonr
 
@@ -174,7 +174,7 @@ def test_astra_is_compared_with_rows_that_are_trained_alike(root: Path) -> None:
         for made in ("evaluate", "train"):
             folder = root / made / "direct_transfer"
             shutil.copytree(folder / f"seed_{seed}", root / made / f"direct_transfer_plus/seed_{seed}")
-    write_iql(root)
+    write_elsewhere(root, "iql")
     found = assembled(root, (*ROWS, "direct_transfer_plus", "iql")).probability_of_improvement
     probabilities = {
         ours: {other: comparison.probability for other, comparison in over.items()}
@@ -189,7 +189,7 @@ def test_astra_is_compared_with_rows_that_are_trained_alike(root: Path) -> None:
 
 
 def test_a_row_that_was_in_no_simulator_has_no_success_there(root: Path) -> None:
-    write_iql(root)
+    write_elsewhere(root, "iql")
     row = assembled(root, ("iql",)).methods["iql"]
     assert row.simulated_success is None and "simulated_success" not in row.summary
     assert np.isnan(row.learning[0].score).all()

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, edit_json, write_iql, write_runs
+from fake_runs import ROWS, SEEDS, edit_json, write_elsewhere, write_runs
 
 from astra_data.errors import BadInputError, MissingStageError
 from astra_data.results.assembly import assemble
@@ -40,7 +40,7 @@ def remove(root: Path, method: str, seed: int) -> None:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     root = write_runs(tmp_path)
-    write_iql(root)
+    write_elsewhere(root, "iql")
     for seed in SEEDS:
         edit_json(root / f"evaluate/astra/seed_{seed}/evaluation.json", wall_seconds=10.0 + 3 * seed)
     return root

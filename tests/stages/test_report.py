@@ -15,8 +15,8 @@ from fake_runs import (
     FakeRecipe,
     edit_json,
     outcomes,
+    write_elsewhere,
     write_evaluation,
-    write_iql,
     write_runs,
 )
 
@@ -206,12 +206,22 @@ def test_rows_that_were_not_tested_in_simulators_are_named(root: Path) -> None:
 
 
 def test_a_row_that_was_in_no_simulator_is_reported(root: Path) -> None:
-    write_iql(root)
+    write_elsewhere(root, "iql")
     make(root, recipe=FakeRecipe(methods=("iql", "follower")))
     page = (root / "report/results.md").read_text()
     assert "| IQL | 3 | **0.17 ± 0.14** |" in page
     assert "| IQL | - | 3 s | - | 10 s | 13 s | - |" in page
     assert not (root / "report/learning.png").exists()
+
+
+def test_who_was_trained_in_the_target_is_set_apart(root: Path) -> None:
+    write_elsewhere(root, "target", like="astra_plus")
+    make(root, recipe=FakeRecipe(methods=("astra", "target", "follower")))
+    page = (root / "report/results.md").read_text()
+    assert "| ASTRA | 3 | **0.50 ± 0.25** |" in page
+    assert "| Target (trained there) | 3 | 0.92 ± 0.14 |" in page
+    assert "learned in the target itself" in page
+    assert "| ASTRA | Target |" not in page
 
 
 def test_the_table_says_how_many_seeds_each_row_has(root: Path) -> None:
