@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from astra_data.models.history import HistoryEncoder, PositionFeatures
+from astra_data.models.history import HistoryEncoder, PositionFeatures, normalised
 
 
 class TargetEncoder(nn.Module):
@@ -54,8 +54,8 @@ class TargetEncoder(nn.Module):
         self.state_std[list(unseen)] = torch.inf
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
-        """Assemble [s_i, its position's features, goal, a_{i-1}] (..., I), states within ±5 deviations."""
-        normal_state = ((state - self.state_mean) / self.state_std).clamp(-5.0, 5.0)
+        """Assemble [s_i, its position's features, goal, a_{i-1}] (..., I)."""
+        normal_state = normalised(state, self.state_mean, self.state_std)
         waves = self.position_features(state[..., :2])
         return torch.cat(
             [normal_state, waves, (goal - self.goal_mean) / self.goal_std, previous_action], dim=-1

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from astra_data.models.history import HistoryEncoder, PositionFeatures, mlp
+from astra_data.models.history import HistoryEncoder, PositionFeatures, mlp, normalised
 
 TargetKind = Literal["ema", "detach", "online"]
 
@@ -129,7 +129,7 @@ class GroundingModel(nn.Module):
 
     def state_features(self, state: Tensor) -> Tensor:
         """Normalise abstract states (..., X) and append the features of their position."""
-        normal = (state - self.state_mean) / self.state_std
+        normal = normalised(state, self.state_mean, self.state_std)
         return torch.cat([normal, self.position_features(state[..., :2])], dim=-1)
 
     def normal_goal(self, goal: Tensor) -> Tensor:

@@ -15,6 +15,15 @@ def mlp(sizes: tuple[int, ...], activation: type[nn.Module] = nn.ELU) -> nn.Sequ
     return nn.Sequential(*layers[:-1])
 
 
+def normalised(state: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Return states (..., S) in deviations from the data's mean, cut off at ±5.
+
+    What is farther away was never seen: a network that is shown more of it answers with anything, and a
+    simulator that it corrects flies away.
+    """
+    return ((state - mean) / std).clamp(-5.0, 5.0)
+
+
 class PositionFeatures(nn.Module):
     """Sines and cosines of planar positions, so that a smooth network can place sharp walls.
 

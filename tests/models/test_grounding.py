@@ -92,6 +92,18 @@ def test_untrained_it_is_the_raw_simulator() -> None:
     assert torch.equal(corrected, HELD_OUT.state[:7, 0])
 
 
+def test_far_from_the_data_corrections_are_those_at_its_edge() -> None:
+    model = untrained()
+    for parameter in model.correction[-1].parameters():
+        torch.nn.init.normal_(parameter)
+    deviations = torch.tensor([[1.0], [5.0], [100.0]])
+    states = model.state_mean + deviations * model.state_std
+    latent, action = torch.randn(1, SIZE).expand(3, -1), torch.randn(1, 2).expand(3, -1)
+    near, edge, far = (model.correct(latent, action, states) - states).detach()
+    torch.testing.assert_close(far, edge, atol=1e-4, rtol=0)
+    assert (near - edge).abs().max() > 0.01
+
+
 def test_it_learns_what_only_the_history_tells() -> None:
     wrong = (HELD_OUT.next_state - HELD_OUT.simulated_next).flatten(0, 1)
     seen = torch.cat([HELD_OUT.state, HELD_OUT.action, torch.ones(64, 30, 1)], dim=-1).flatten(0, 1)
