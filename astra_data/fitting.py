@@ -44,6 +44,9 @@ class GroundConfig(Config):
     position_octaves: Number = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
     where a task has no positions."""
+    correction_heads: Count = 1
+    """Heads that correct the state, each of which learns from windows of its own; their mean corrects, and
+    `doubt_penalty` keeps policies from where they disagree."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes on which nothing is fitted but the residual's scatter, unless the dataset sets
     some aside itself."""
@@ -95,6 +98,7 @@ class HistoryFit:
                 goal_size=windows.goal.shape[-1],
                 latent_size=config.latent_size,
                 position_octaves=config.position_octaves if fitting.task.plane else 0,
+                correction_heads=config.correction_heads,
             ),
             config.target,
         ).to(fitting.device)
@@ -226,11 +230,11 @@ def _explained(residual: Tensor, total: Tensor) -> float | None:
 
 @torch.no_grad()
 def _fit_residual(model: GroundingModel, held_out: PairedEpisodes) -> None:
-    """Fit the Gaussian scatter of the target around the correction, on episodes not trained on."""
+    """Fit the scatter of the target around the correction, and of its heads, on episodes not trained on."""
     windows = held_out.windows
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
     latent, _ = model.encoder(inputs)
-    residual = held_out.steps(
-        windows.next_state - model.correct(latent, windows.action, windows.simulated_next)
-    )
-    model.residual_factor.copy_(scatter_factor(residual))
+    opinions = model.opinions(latent, windows.action, windows.simulated_next)
+    model.residual_factor.copy_(scatter_factor(held_out.steps(windows.next_state - opinions.mean(0))))
+    if len(opinions) > 1:
+        model.usual_disagreement.copy_(held_out.steps(model.doubt(opinions)).mean())

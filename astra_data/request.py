@@ -198,6 +198,12 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
+    def _has_heads_to_disagree(self) -> Self:
+        if (self.train.doubt_penalty or self.plus.doubt_penalty) and self.ground.correction_heads < 2:
+            raise ValueError("doubt_penalty: expected ground.correction_heads of 2 or more, got 1")
+        return self
+
+    @model_validator(mode="after")
     def _limits_all_commands(self) -> Self:
         rows = {row: METHODS[base_method(row)] for row in self.methods}
         elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]

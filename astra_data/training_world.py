@@ -47,6 +47,9 @@ class WorldConfig(Config):
     """Taken from the reward of a step to where there is no data; less where there is some."""
     support_density: Positive = 0.3
     """Data is thin where its density is below this share of the median density of the free space."""
+    doubt_penalty: NotNegative = 0.0
+    """Taken from the reward of a step for each time by which the heads of the correction disagree more than
+    usual; `[ground] correction_heads` has to be 2 or more."""
     command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: Share = 0.0
@@ -150,6 +153,7 @@ def training_world(
         risk_weight=config.risk_weight,
         command_limit_m_s=config.command_limit_m_s,
         thinness=None if parts.thinness is None else config.support_penalty * parts.thinness,
+        doubt_penalty=config.doubt_penalty,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,
         tells_parameters=tells_parameters,

@@ -56,7 +56,7 @@ class SimulatorWorld:
         latent_size: Z, of the latents in the observations; 0 where there are none.
         parameter_count: P, of the parameters in the observations; 0 where they are not told.
         failed: which episodes ended badly in the last step, (B,) bool.
-        caution: factor on the penalties for thin data and for risk; 1 unless the training ramps it up.
+        caution: factor on the penalties for thin data, doubt and risk; 1 unless the training ramps it up.
     """
 
     def __init__(
@@ -69,6 +69,7 @@ class SimulatorWorld:
         risk_weight: float = 1.0,
         command_limit_m_s: float = 2.0,
         thinness: Tensor | None = None,
+        doubt_penalty: float = 0.0,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
         tells_parameters: bool = False,
@@ -84,6 +85,7 @@ class SimulatorWorld:
             command_limit_m_s: longer velocity commands are shortened to this.
             thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width);
                 only where there is a maze.
+            doubt_penalty: taken from the reward for the grounded simulator's doubt.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
             tells_parameters: end observations with the parameters of a simulator that varies, normalised.
@@ -101,6 +103,7 @@ class SimulatorWorld:
             self.free = FreeSpace.of_maze(objective.maze, radius_m=0.0, device=str(simulator.state.device))
             self._ends_at_walls = objective.ends_at_walls
         self.thinness = thinness
+        self.doubt_penalty = doubt_penalty
         self.starts = starts
         self.data_start_share = data_start_share
         self.device = simulator.state.device
@@ -161,6 +164,8 @@ class SimulatorWorld:
         penalty = torch.zeros(self.num_envs, device=self.device)
         if self.thinness is not None and self.free is not None:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
+        if self.grounded is not None and self.doubt_penalty:
+            penalty = penalty - self.doubt_penalty * self.grounded.doubt
         if self.grounded is not None and latent is not None and (self.topple or self.reward == "blend"):
             with torch.no_grad():
                 risk = self.grounded.model.topple_risk(latent, action, after)

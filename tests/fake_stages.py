@@ -34,6 +34,8 @@ class FakeConfig(Config):
     fails: bool = False
     learner: str = "ppo"
     limits_commands: bool = False
+    doubt_penalty: float = 0.0
+    correction_heads: int = 1
 
 
 class FakeCollectConfig(FakeConfig):

@@ -90,7 +90,7 @@ def test_a_constant_correction_closes_a_constant_gap() -> None:
     error = (one.windows.next_state - one.windows.simulated_next)[0]
     assert error.std(0).max() < 1e-4
     with torch.no_grad():
-        list(model.correction.parameters())[-1].copy_(error.mean(0))
+        list(model.corrections.parameters())[-1].copy_(error.mean(0))
     report = gap_report(TASK, model, one, seed=0)
     assert report["raw"]["position_m"]["mean"][-1] > 0.5
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=2e-3)

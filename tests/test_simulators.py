@@ -16,7 +16,7 @@ STEPS, COUNT = 11, 3
 def history_model() -> GroundingModel:
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     with torch.no_grad():
-        list(model.correction.parameters())[-2].normal_(std=0.05)
+        list(model.corrections.parameters())[-2].normal_(std=0.05)
     return model
 
 

@@ -61,6 +61,29 @@ def test_thin_data_costs_what_it_is_said_to() -> None:
     assert (steps[1].reward - steps[0].reward).tolist() == pytest.approx([-0.25, 0.0])
 
 
+def test_doubt_costs_what_it_is_said_to() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=3))
+    with torch.no_grad():
+        for offset, head in zip((0.0, 0.0, 0.9), model.corrections, strict=True):
+            list(head.parameters())[-1][2:].fill_(offset)
+    # The heads differ in two of four entries, by sqrt(0.27 / 2) over all.
+    disagreement = (0.9**2 / 3 / 2) ** 0.5
+    rewards = []
+    for penalty in (0.0, 0.5):
+        model.usual_disagreement.fill_(disagreement / 3)
+        grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), model)
+        one = SimulatorWorld(TASK, grounded, doubt_penalty=penalty)
+        torch.manual_seed(1)
+        one.reset()
+        rewards.append(one.step(torch.zeros(2, 2)).reward)
+        assert grounded.doubt.tolist() == pytest.approx([2.0, 2.0])
+        model.usual_disagreement.fill_(2 * disagreement)
+        one.step(torch.zeros(2, 2))
+        assert not grounded.doubt.any()  # less than usual
+    assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-1.0, -1.0])
+
+
 def test_episodes_may_start_from_recorded_moments() -> None:
     moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
     starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)

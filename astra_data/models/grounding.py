@@ -37,6 +37,7 @@ class GroundingShape:
     Attributes:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
         position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
+        correction_heads: of f_abs, whose mean corrects.
     """
 
     state_size: int
@@ -46,6 +47,7 @@ class GroundingShape:
     embedding_size: int = 64
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4
+    correction_heads: int = 1
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
 
 
@@ -95,11 +97,13 @@ class GroundingModel(nn.Module):
         heads = shape.head_sizes
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
         self.reward_head = mlp((latent + actions, *heads, 2))
-        self.correction = mlp((latent + actions + features, *heads, states))
+        sizes = (latent + actions + features, *heads, states)
+        self.corrections = nn.ModuleList(mlp(sizes) for _ in range(shape.correction_heads))
         self.topple_head = mlp((latent + actions + features, *heads, 1))
         # An untrained correction is the identity: the raw simulator.
-        for parameter in self.correction[-1].parameters():
-            nn.init.zeros_(parameter)
+        for head in self.corrections:
+            for parameter in list(head.parameters())[-2:]:
+                nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
         for name, size in {
             "state": states,
@@ -110,6 +114,7 @@ class GroundingModel(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("residual_factor", torch.zeros(states, states))
+        self.register_buffer("usual_disagreement", torch.ones(()))
         self.state_mean: Tensor
         self.state_std: Tensor
         self.goal_mean: Tensor
@@ -118,6 +123,7 @@ class GroundingModel(nn.Module):
         self.reward_mean: Tensor
         self.reward_std: Tensor
         self.residual_factor: Tensor
+        self.usual_disagreement: Tensor
 
     def set_scales(self, columns: Mapping[str, Tensor]) -> None:
         """Take means and deviations from training steps: state, goal, correction, reward (N, ...)."""
@@ -157,9 +163,17 @@ class GroundingModel(nn.Module):
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
+        return self.opinions(latent, action, simulated_next).mean(0)
+
+    def opinions(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return the next abstract state as each head corrects it, (K, ..., X)."""
         inputs = torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
-        correction: Tensor = self.correction(inputs)
-        return simulated_next + correction * self.correction_std
+        return torch.stack([simulated_next + head(inputs) * self.correction_std for head in self.corrections])
+
+    def doubt(self, opinions: Tensor) -> Tensor:
+        """Return how many times as much as on the data `opinions` (K, ..., X) differ, (...)."""
+        spread = (opinions / self.correction_std).std(0).square().mean(-1).sqrt()
+        return spread / self.usual_disagreement
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
         """Return the log-odds (...) of a topple within `RISK_STEPS`, on the way to `next_state`."""
@@ -195,14 +209,21 @@ class GroundingModel(nn.Module):
             error = (self.predict_reward_parts(latent, action) - windows.reward) / self.reward_std
             parts["reward"] = _masked_mean(error.square().mean(-1), mask)
             total = total + weights.reward * parts["reward"]
-        corrected = self.correct(latent, action, windows.simulated_next)
-        error = (corrected - windows.next_state) / self.correction_std
-        parts["state"] = _masked_mean(error.square().mean(-1), mask)
+        parts["state"] = self._correction_loss(latent, windows)
         total = total + weights.state * parts["state"]
         logit = self.topple_logit(latent.detach(), action, windows.next_state)
         entropy = functional.binary_cross_entropy_with_logits(logit, windows.topples_soon, reduction="none")
         parts["topple"] = _masked_mean(entropy, mask)
         return total + parts["topple"], parts
+
+    def _correction_loss(self, latent: Tensor, windows: Windows) -> Tensor:
+        opinions = self.opinions(latent, windows.action, windows.simulated_next)
+        error = ((opinions - windows.next_state) / self.correction_std).square().mean(-1)
+        mask = windows.mask.expand_as(error)
+        if len(opinions) > 1:
+            # Each head learns from windows of its own, so that heads differ in what the data leaves open.
+            mask = mask * (torch.rand(*error.shape[:2], 1, device=error.device) < 0.5)
+        return (error * mask).sum() / mask.sum()
 
     def _following_latent(self, inputs: Tensor, latent: Tensor) -> Tensor:
         if self.target == "online":

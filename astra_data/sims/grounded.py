@@ -13,6 +13,8 @@ class GroundedSimulator:
     Attributes:
         state: corrected abstract states, (B, X). latent: z, (B, Z).
         blocked: (B,) bool, the last step or its correction was stopped at a wall.
+        doubt: (B,), by how much more than usual the correction's heads disagreed on the last step; zero if
+            there is but one.
     """
 
     def __init__(
@@ -36,6 +38,7 @@ class GroundedSimulator:
         shape = model.shape
         self.hidden = torch.zeros(count, shape.latent_size, device=device)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
+        self.doubt = torch.zeros(count, device=device)
 
     @property
     def state(self) -> Tensor:
@@ -85,7 +88,10 @@ class GroundedSimulator:
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the corrected state (B, X)."""
         before = self.simulator.state
-        corrected = self.model.correct(self.latent, action, self.simulator.step(action))
+        opinions = self.model.opinions(self.latent, action, self.simulator.step(action))
+        corrected = opinions.mean(0)
+        if len(opinions) > 1:
+            self.doubt = (self.model.doubt(opinions) - 1.0).clamp_min(0.0)
         if self.scatter is not None:
             corrected = corrected + torch.randn_like(corrected) @ self.scatter.T
         state = self.simulator.settle(before, corrected)

@@ -39,9 +39,10 @@ def lagging_world(episodes: int, steps: int, seed: int) -> Windows:
 TRAINING, HELD_OUT = lagging_world(32, 30, seed=0), lagging_world(64, 30, seed=1)
 
 
-def untrained(target: TargetKind = "ema") -> GroundingModel:
+def untrained(target: TargetKind = "ema", heads: int = 1) -> GroundingModel:
     torch.manual_seed(0)
     sizes = {"latent_size": SIZE, "embedding_size": 32, "head_sizes": (32,), "position_octaves": 0}
+    sizes |= {"correction_heads": heads}
     model = GroundingModel(GroundingShape(2, 2, 2, **sizes), target)  # type: ignore[arg-type]
     model.set_scales(
         {
@@ -94,7 +95,7 @@ def test_untrained_it_is_the_raw_simulator() -> None:
 
 def test_far_from_the_data_corrections_are_those_at_its_edge() -> None:
     model = untrained()
-    for parameter in model.correction[-1].parameters():
+    for parameter in list(model.corrections.parameters())[-2:]:
         torch.nn.init.normal_(parameter)
     deviations = torch.tensor([[1.0], [5.0], [100.0]])
     states = model.state_mean + deviations * model.state_std
@@ -102,6 +103,23 @@ def test_far_from_the_data_corrections_are_those_at_its_edge() -> None:
     near, edge, far = (model.correct(latent, action, states) - states).detach()
     torch.testing.assert_close(far, edge, atol=1e-4, rtol=0)
     assert (near - edge).abs().max() > 0.01
+
+
+def test_heads_agree_where_there_is_data_and_nowhere_else() -> None:
+    model = untrained(heads=4)
+    fit(model, NAS)
+    assert error_left(model) < 0.05
+    latent, action, landed = latents(model), HELD_OUT.action, HELD_OUT.simulated_next
+    with torch.no_grad():
+        opinions = model.opinions(latent, action, landed)
+        model.usual_disagreement.copy_(model.doubt(opinions).mean())
+        torch.testing.assert_close(opinions.mean(0), model.correct(latent, action, landed))
+        assert float(model.doubt(opinions).mean()) == pytest.approx(1.0)
+        # The world is linear: far states and commands are not like any in the data.
+        elsewhere = model.opinions(
+            latent, 4.0 * action, model.state_mean - 4.0 * model.state_std + 0 * landed
+        )
+        assert float(model.doubt(elsewhere).mean()) > 3.0
 
 
 def test_it_learns_what_only_the_history_tells() -> None:
@@ -161,7 +179,7 @@ def test_only_the_slow_target_gives_no_gradient() -> None:
 
 def test_masked_steps_do_not_count() -> None:
     model = untrained()
-    torch.nn.init.normal_(list(model.correction.parameters())[-1])
+    torch.nn.init.normal_(list(model.corrections.parameters())[-1])
     mask = TRAINING.mask.clone()
     mask[:, 20:] = 0.0
     cut = Windows(**{name: values[:, :20] for name, values in vars(TRAINING).items()})
