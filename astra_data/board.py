@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from rich.table import Table
 
 from astra_data.figures import method_title
-from astra_data.request import Point
+from astra_data.points import Point
 from astra_data.schedule import Item
 from astra_data.score import Score
 

@@ -17,8 +17,9 @@ from typing import Any
 
 from astra_data.errors import RecipeError
 from astra_data.methods import METHODS
+from astra_data.points import Point
 from astra_data.recipe import did_you_mean, load_tables, validated
-from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Point, Recipe
+from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Recipe
 from astra_data.results.files import read_published
 from astra_data.results.sizes import by_size
 from astra_data.rows import base_method

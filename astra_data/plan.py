@@ -18,8 +18,9 @@ from pydantic import JsonValue
 
 from astra_data.dataset.edit import share
 from astra_data.methods import METHODS
+from astra_data.points import Part
 from astra_data.recipe import Config
-from astra_data.request import METHOD_TABLES, WHOLE, Part, Recipe
+from astra_data.request import METHOD_TABLES, WHOLE, Recipe
 from astra_data.rows import base_method, is_plus, place, reference_of
 from astra_data.schedule import Item
 from astra_data.stages.align import align

@@ -18,8 +18,9 @@ from astra_data.errors import BadInputError, MissingStageError
 from astra_data.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.lock import held
 from astra_data.plan import grounded_as, plan, stage_of
+from astra_data.points import Part
 from astra_data.recipe import did_you_mean
-from astra_data.request import STAGES, Part, Recipe
+from astra_data.request import STAGES, Recipe
 from astra_data.rows import base_method
 from astra_data.schedule import Item, Watcher, execute
 

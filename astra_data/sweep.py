@@ -21,7 +21,8 @@ from astra_data.errors import BadInputError
 from astra_data.experiment import Experiment, load_experiment
 from astra_data.extras import optional
 from astra_data.plan import plan, stage_of
-from astra_data.request import WHOLE, Part, Point
+from astra_data.points import Part, Point
+from astra_data.request import WHOLE
 from astra_data.results.artefacts import EVALUATION, Artefact, Evaluation, read_json
 from astra_data.run import RUNS, finished, make
 from astra_data.schedule import Item, Watcher

@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from astra_data.board import Board
-from astra_data.request import Point
+from astra_data.points import Point
 from astra_data.schedule import Item
 from astra_data.score import SUCCESS, SURVIVED_STEPS
 

@@ -6,8 +6,9 @@ from fake_stages import FakeConfig
 
 from astra_data.errors import RecipeError
 from astra_data.plan import plan
+from astra_data.points import Part
 from astra_data.recipe import load_recipe
-from astra_data.request import Part, Recipe
+from astra_data.request import Recipe
 
 HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
 
