@@ -17,6 +17,6 @@ learning    task  antmaze_tasks  nao_tasks  humanoid_tasks  tasks  simulators  w
 methods     methods/ (one file each: what is different about it)
 prediction  prediction/ (open-loop prediction of a real robot's recorded walk)
 stages      stages/ (one file per step: collect augment pair subset ground train align evaluate report)
-roof        request  plan  experiment  schedule  cluster  display  board  inspection_page  run  sweep
+roof        request  points  plan  experiment  schedule  cluster  display  board  inspection_page  run  sweep
             walk_gap  commands/  cli
 """
