@@ -223,7 +223,7 @@ class GroundingModel(nn.Module):
         if len(opinions) > 1:
             # Each head learns from windows of its own, so that heads differ in what the data leaves open.
             mask = mask * (torch.rand(*error.shape[:2], 1, device=error.device) < 0.5)
-        return (error * mask).sum() / mask.sum()
+        return _masked_mean(error, mask)
 
     def _following_latent(self, inputs: Tensor, latent: Tensor) -> Tensor:
         if self.target == "online":
