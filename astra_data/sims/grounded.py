@@ -13,8 +13,6 @@ class GroundedSimulator:
     Attributes:
         state: corrected abstract states, (B, X). latent: z, (B, Z).
         blocked: (B,) bool, the last step or its correction was stopped at a wall.
-        doubt: (B,), by how much more than usual the correction's heads disagreed on the last step; zero if
-            there is but one.
     """
 
     def __init__(
@@ -38,7 +36,7 @@ class GroundedSimulator:
         shape = model.shape
         self.hidden = torch.zeros(count, shape.latent_size, device=device)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
-        self.doubt = torch.zeros(count, device=device)
+        self._opinions = torch.zeros(1, count, shape.state_size, device=device)
 
     @property
     def state(self) -> Tensor:
@@ -54,6 +52,14 @@ class GroundedSimulator:
     def latent(self) -> Tensor:
         """The latents (B, Z) of the histories so far."""
         return self.model.encoder.latent(self.hidden)
+
+    @property
+    def doubt(self) -> Tensor:
+        """By how much more than usual the correction's heads disagreed on the last step, (B,).
+
+        There have to be two heads or more.
+        """
+        return (self.model.doubt(self._opinions) - 1.0).clamp_min(0.0)
 
     @torch.no_grad()
     def reset_to(
@@ -88,10 +94,8 @@ class GroundedSimulator:
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the corrected state (B, X)."""
         before = self.simulator.state
-        opinions = self.model.opinions(self.latent, action, self.simulator.step(action))
-        corrected = opinions.mean(0)
-        if len(opinions) > 1:
-            self.doubt = (self.model.doubt(opinions) - 1.0).clamp_min(0.0)
+        self._opinions = self.model.opinions(self.latent, action, self.simulator.step(action))
+        corrected = self._opinions.mean(0)
         if self.scatter is not None:
             corrected = corrected + torch.randn_like(corrected) @ self.scatter.T
         state = self.simulator.settle(before, corrected)

@@ -259,7 +259,7 @@ def _copied(
         {name: values[:length] for name, values in columns.items()} | judged,
         {
             "success": bool(judged[SUCCESS][-1]),
-            "toppled": bool(judged[TERMINATED][-1] and not judged[SUCCESS][-1]),
+            "failed": bool(judged[TERMINATED][-1] and not judged[SUCCESS][-1]),
             "return": float(judged[REWARD].sum(dtype=np.float64)),
             "held_out": False,
             "source_episode": episode.uid,

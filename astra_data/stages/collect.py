@@ -285,7 +285,7 @@ def _episode(uid: int, values: dict[str, Array], seed: int) -> Episode:
     success = bool(values[SUCCESS].any())
     metadata = {
         "success": success,
-        "toppled": bool(values[TERMINATED][-1]) and not success,
+        "failed": bool(values[TERMINATED][-1]) and not success,
         "return": float(values[REWARD].sum(dtype=np.float64)),
         "seed": seed,
     }

@@ -204,7 +204,7 @@ def test_copies_are_judged_with_a_goal_of_their_own(collected: Path, augmented: 
         np.testing.assert_allclose(columns[REWARD], metres + 10.0 * near - 10.0 * toppled, atol=1e-4)
         assert copy.metadata["return"] == pytest.approx(columns[REWARD].sum(), abs=1e-4)
         assert copy.metadata["success"] == near.any()
-        assert copy.metadata["toppled"] == (toppled.any() and not near.any())
+        assert copy.metadata["failed"] == (toppled.any() and not near.any())
     assert len(goals) == CONFIG.episodes - len(Dataset.open(collected))  # type: ignore[operator]
 
 
