@@ -110,7 +110,7 @@ class Minari:
         """Sample episodes, and cut a window out of each."""
         rng = np.random.default_rng()
         cut = []
-        for episode in self._dataset.sample_episodes(BATCH // 2):
+        for episode in self._dataset.sample_episodes(min(BATCH // 2, self._dataset.total_episodes)):
             first = rng.integers(len(episode.actions) - LENGTH)
             cut.append(
                 [a[first : first + LENGTH] for a in (episode.observations, episode.actions, episode.rewards)]
