@@ -84,6 +84,15 @@ def test_doubt_costs_what_it_is_said_to() -> None:
     assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-1.0, -1.0])
 
 
+@pytest.mark.parametrize(("heads", "steps"), [(1, 0), (1, 1), (3, 0)])
+def test_without_other_heads_or_a_step_there_is_no_doubt(heads: int, steps: int) -> None:
+    shape = GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=heads)
+    grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), GroundingModel(shape))
+    for _ in range(steps):
+        grounded.step(torch.zeros(2, 2))
+    assert grounded.doubt.tolist() == [0.0, 0.0]
+
+
 def test_episodes_may_start_from_recorded_moments() -> None:
     moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
     starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)

@@ -57,8 +57,10 @@ class GroundedSimulator:
     def doubt(self) -> Tensor:
         """By how much more than usual the correction's heads disagreed on the last step, (B,).
 
-        There have to be two heads or more.
+        Zero before the first step, and where there is but one head.
         """
+        if len(self._opinions) == 1:
+            return torch.zeros_like(self._opinions[0, :, 0])
         return (self.model.doubt(self._opinions) - 1.0).clamp_min(0.0)
 
     @torch.no_grad()
