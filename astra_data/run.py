@@ -183,8 +183,9 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
     if missing:
         stage, root = missing.partition("/")[0], experiment.folder.parent
         maker = experiment.maker(stage)
-        # Of the base, `run` makes what comes before the stage as well.
-        command = f"astra-data {stage if maker is experiment or not STAGES[stage] else 'run'} {maker.path}"
+        # Of the base, `run` makes what comes before the stage as well; the command `augment` takes no recipe.
+        alone = stage != "augment" and (maker is experiment or not STAGES[stage])
+        command = f"astra-data {stage if alone else 'run'} {maker.path}"
         option = "" if root == RUNS else f" --root {root}"
         raise MissingStageError(f"{experiment.place(missing)} is missing: run `{command}{option}` first")
 

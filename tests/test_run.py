@@ -137,6 +137,15 @@ def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> Non
     )
 
 
+def test_moved_copies_are_made_by_running_the_recipe(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text() + "[augment]\nsteps = 4\n")
+    run_stage(recipe, "collect", root=tmp_path)
+    missing = tmp_path / "r/augment/seed_0"
+    message = f"{missing} is missing: run `astra-data run {recipe} --root {tmp_path}` first"
+    with pytest.raises(MissingStageError, match=f"^{re.escape(message)}$"):
+        run_stage(recipe, "pair", root=tmp_path)
+
+
 def test_a_report_does_not_wait_for_every_seed(recipe: Path, tmp_path: Path) -> None:
     run_stage(recipe, "report", root=tmp_path)
     assert asked(tmp_path / "r/report")["seeds"] == [0]
