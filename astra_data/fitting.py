@@ -107,9 +107,9 @@ class HistoryFit:
                 "state": training.steps(windows.state),
                 "goal": training.steps(windows.goal),
                 "correction": training.steps(windows.next_state - windows.simulated_next),
-                "reward": training.steps(windows.reward),
             }
         )
+        model.set_reward_scales(training.steps(windows.reward))
         metrics = _optimise(model, self.weights, fitting)
         _fit_residual(model, fitting.held_out)
         return model, metrics

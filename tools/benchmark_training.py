@@ -265,8 +265,8 @@ def step_by_step(episodes: PairedEpisodes, window: int) -> Stretch:
                 surprise = (latent - mean).square() / log_variance.exp() + log_variance
                 loss = loss + WEIGHTS.latent * 0.5 * surprise.mean()
             expected = model.predict_latent(latent, action)
-            reward = model.predict_reward_parts(latent, action)
-            loss = loss + WEIGHTS.reward * (reward - windows.reward[:, step]).square().mean()
+            reward = model.predict_reward(latent, action)
+            loss = loss + WEIGHTS.reward * (reward - windows.reward[:, step].sum(-1)).square().mean()
             corrected = model.correct(latent, action, windows.simulated_next[:, step])
             loss = loss + WEIGHTS.state * (corrected - windows.next_state[:, step]).square().mean()
         optimizer.zero_grad()

@@ -109,10 +109,13 @@ class GroundingModel(nn.Module):
             "state": states,
             "goal": shape.goal_size,
             "correction": states,
-            "reward": 2,
         }.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
+        self.register_buffer("reward_mean", torch.zeros(()))
+        self.register_buffer("reward_std", torch.ones(()))
+        self.register_buffer("failure_reward", torch.zeros(()))
+        self.register_buffer("failure_weight", torch.zeros(()))
         self.register_buffer("residual_factor", torch.zeros(states, states))
         self.register_buffer("usual_disagreement", torch.ones(()))
         self.state_mean: Tensor
@@ -122,16 +125,31 @@ class GroundingModel(nn.Module):
         self.correction_std: Tensor
         self.reward_mean: Tensor
         self.reward_std: Tensor
+        self.failure_reward: Tensor
+        self.failure_weight: Tensor
         self.residual_factor: Tensor
         self.usual_disagreement: Tensor
 
     def set_scales(self, columns: Mapping[str, Tensor]) -> None:
-        """Take means and deviations from training steps: state, goal, correction, reward (N, ...)."""
+        """Take means and deviations from training steps: state, goal, correction (N, ...)."""
         for name, values in columns.items():
             if not values.numel():
                 continue  # no goals
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+
+    @torch.no_grad()
+    def set_reward_scales(self, reward: Tensor) -> None:
+        """Take the scales of `reward` (N, 2) from training steps, in its two parts: see `Windows`."""
+        going_on, failing = reward.unbind(-1)
+        self.reward_mean.copy_(going_on.mean())
+        self.reward_std.copy_(going_on.std().clamp_min(1e-3))
+        fails = failing != 0
+        if fails.any():
+            rate = fails.float().mean()
+            self.failure_reward.copy_(failing[fails].mean())
+            self.failure_weight.copy_(1.0 / functional.binary_cross_entropy(rate, rate))
+            list(self.reward_head.parameters())[-1][1] = rate.logit()
 
     def state_features(self, state: Tensor) -> Tensor:
         """Normalise abstract states (..., X) and append the features of their position."""
@@ -152,14 +170,24 @@ class GroundingModel(nn.Module):
         low, high = self.shape.log_variance_bounds
         return mean, low + (high - low) * torch.sigmoid(raw)
 
-    def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Return both parts of the target's reward (..., 2); their scales differ a hundredfold."""
-        normal: Tensor = self.reward_head(torch.cat([latent, action], dim=-1))
-        return normal * self.reward_std + self.reward_mean
-
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
         """R_pred: return the target's reward (...)."""
         return self.predict_reward_parts(latent, action).sum(-1)
+
+    def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Return both parts of the target's reward (..., 2): see `Windows`.
+
+        The second is how probably the step fails, times what failing costs: it is rare and large, and as a
+        number of its own it pays as easily as it costs where there is no data, which policies find.
+        """
+        going_on, fails = self._reward_outputs(latent, action)
+        parts = [going_on * self.reward_std + self.reward_mean, fails.sigmoid() * self.failure_reward]
+        return torch.stack(parts, dim=-1)
+
+    def _reward_outputs(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the normalised reward of a step that goes on, and the log-odds that it fails, (...) each."""
+        going_on, fails = self.reward_head(torch.cat([latent, action], dim=-1)).unbind(-1)
+        return going_on, fails
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
@@ -206,8 +234,7 @@ class GroundingModel(nn.Module):
             parts["latent"] = (nll * both).sum() / both.sum()
             total = total + weights.latent * parts["latent"]
         if weights.reward > 0:
-            error = (self.predict_reward_parts(latent, action) - windows.reward) / self.reward_std
-            parts["reward"] = _masked_mean(error.square().mean(-1), mask)
+            parts["reward"] = self._reward_loss(latent, windows)
             total = total + weights.reward * parts["reward"]
         parts["state"] = self._correction_loss(latent, windows)
         total = total + weights.state * parts["state"]
@@ -215,6 +242,15 @@ class GroundingModel(nn.Module):
         entropy = functional.binary_cross_entropy_with_logits(logit, windows.topples_soon, reduction="none")
         parts["topple"] = _masked_mean(entropy, mask)
         return total + parts["topple"], parts
+
+    def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
+        """Return the mean of both parts' losses, each of which is one where the average is predicted."""
+        going_on, fails = self._reward_outputs(latent, windows.action)
+        reward, failing = windows.reward.unbind(-1)
+        error = going_on - (reward - self.reward_mean) / self.reward_std
+        failed = (failing != 0).float()
+        surprise = functional.binary_cross_entropy_with_logits(fails, failed, reduction="none")
+        return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
 
     def _correction_loss(self, latent: Tensor, windows: Windows) -> Tensor:
         opinions = self.opinions(latent, windows.action, windows.simulated_next)

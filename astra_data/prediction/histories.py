@@ -41,9 +41,9 @@ class HistoryModel(Predictor):
                 "state": stretch.past_motion.flatten(0, 1),
                 "goal": bounded(stretch.past_ball).flatten(0, 1),
                 "correction": (stretch.motion - stretch.simulated)[walked],
-                "reward": torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1),
             }
         )
+        model.set_reward_scales(torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1))
         # Left and right, the mean is that of the walks that happen to be there.
         model.state_mean[1:] = 0.0
         model.goal_mean[1:] = 0.0

@@ -49,9 +49,9 @@ def untrained(target: TargetKind = "ema", heads: int = 1) -> GroundingModel:
             "state": TRAINING.state.flatten(0, 1),
             "goal": TRAINING.goal.flatten(0, 1),
             "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
-            "reward": TRAINING.reward.flatten(0, 1),
         }
     )
+    model.set_reward_scales(TRAINING.reward.flatten(0, 1))
     return model
 
 
@@ -148,6 +148,29 @@ def test_all_heads_learn_together() -> None:
         predicted = model.predict_reward(latents(model), HELD_OUT.action)
     unexplained = (predicted - HELD_OUT.reward[..., 0]).square().mean() / HELD_OUT.reward[..., 0].var()
     assert float(unexplained) < 0.2
+
+
+def test_failing_is_predicted_as_often_as_it_happens_and_never_pays() -> None:
+    """Whoever walks to the right fails in a tenth of the steps, others never; failing costs 10."""
+    torch.manual_seed(0)
+    falls = (TRAINING.action[..., 0] > 0) & (torch.rand(TRAINING.mask.shape) < 0.1)
+    going_on = TRAINING.reward[..., 0] * ~falls
+    windows = replace(TRAINING, reward=torch.stack([going_on, -10.0 * falls], dim=-1))
+    model = untrained()
+    model.set_reward_scales(windows.reward.flatten(0, 1))
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-3)
+    for _ in range(100):
+        loss, _ = model.losses(windows, LossWeights(latent=0.0))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with torch.no_grad():
+        parts = model.predict_reward_parts(latents(model), HELD_OUT.action)
+        right = HELD_OUT.action[..., 0] > 0
+        assert float(parts[right][:, 1].mean()) == pytest.approx(-1.0, abs=0.3)
+        assert float(parts[~right][:, 1].mean()) == pytest.approx(0.0, abs=0.2)
+        anywhere, any_action = 100 * torch.randn(1000, SIZE), 100 * torch.randn(1000, 2)
+        assert float(model.predict_reward_parts(anywhere, any_action)[:, 1].max()) <= 0.0
 
 
 def test_the_printed_latent_loss_collapses_and_a_slow_target_does_not() -> None:
