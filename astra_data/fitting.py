@@ -98,6 +98,7 @@ class HistoryFit:
                 goal_size=windows.goal.shape[-1],
                 latent_size=config.latent_size,
                 position_octaves=config.position_octaves if fitting.task.plane else 0,
+                ball_index=fitting.task.ball_index,
                 correction_heads=config.correction_heads,
             ),
             config.target,

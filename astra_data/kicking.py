@@ -5,7 +5,7 @@ the robot comes closer to the place behind the ball, +10 for a goal, -10 for a b
 elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League at small distances.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.objective import PlanarObjective
+
+_NEAR_M = (0.25, 0.6)
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Kicking(PlanarObjective):
     ball_x_m: tuple[float, float] = (-0.5, 0.0)
     ball_y_m: tuple[float, float] = (-0.6, 0.6)
     distance_m: tuple[float, float] = (0.4, 1.0)
-    bearing_rad: float = np.pi / 3
+    bearing_rad: float = np.pi
     behind_m: float = 0.25
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -55,8 +57,8 @@ class Kicking(PlanarObjective):
         return np.concatenate([robot, rest, ball, rest], axis=1)
 
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states (count, 8) at rest as the task does: a robot far from its ball learns nothing of it."""
-        return self.draw_starts(rng, count)
+        """Draw states (count, 8) at rest with the robot near its ball: from afar it rarely meets it."""
+        return replace(self, distance_m=_NEAR_M).draw_starts(rng, count)
 
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Return the middle of the goal line, (count, 2)."""
@@ -67,7 +69,7 @@ class Kicking(PlanarObjective):
         robot, velocity, ball, rolling = state.split(2, dim=-1)
         behind = self._behind(ball, goal) - robot
         places = [robot / 2, ball / 2, (goal - ball) / 2]
-        return torch.cat([*places, 4 * velocity, rolling, ball - robot, behind], dim=-1)
+        return torch.cat([*places, 4 * velocity, rolling, 4 * (ball - robot), 4 * behind], dim=-1)
 
     def _behind(self, ball: Tensor, goal: Tensor) -> Tensor:
         to_goal = goal - ball

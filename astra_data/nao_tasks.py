@@ -29,7 +29,7 @@ Level = Literal["mujoco", "surrogate"]
 _RADIUS_M = 0.1
 """Of the disc that the robot is at walls in its simulators: as in AntMaze, and less than the robot's 0.14."""
 _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
-_CONTACT: dict[str, Any] = {"reach_m": 0.19, "knock_m_s": 1.0}
+_CONTACT: dict[str, Any] = {"reach_m": 0.22, "knock_m_s": 1.0}
 
 KICK_RANGES = BallVariation(
     **WIDE_RANGES.model_dump(),

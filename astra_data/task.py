@@ -139,6 +139,12 @@ class Task:
         )
 
     @property
+    def ball_index(self) -> int | None:
+        """Where in abstract states the position of a ball begins; None where there is none."""
+        places = [group.start for role, group in self.abstract_state.roles if role == "position"]
+        return places[1] if len(places) > 1 else None
+
+    @property
     def fps(self) -> int:
         """Control steps per second, rounded: LeRobot's are whole numbers."""
         return round(1.0 / self.timestep_s)

@@ -26,9 +26,17 @@ def test_starts_are_where_the_task_says() -> None:
     apart = np.linalg.norm(robot - ball, axis=1)[inside]
     assert apart.min() >= 0.4 - 1e-9
     assert apart.max() <= 1.0 + 1e-9
-    # Never between the ball and the goal.
+    # All around the ball.
     to_goal = np.array([1.5, 0.0]) - ball
-    assert (((robot - ball) * to_goal).sum(axis=1)[inside] <= 1e-9).all()
+    ahead = ((robot - ball) * to_goal).sum(axis=1) > 0
+    assert ahead.mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_recorded_episodes_begin_near_the_ball() -> None:
+    starts = TASK.draw_anywhere(np.random.default_rng(0), 4000)
+    apart = np.linalg.norm(starts[:, :2] - starts[:, 4:6], axis=1)
+    assert apart.min() == pytest.approx(0.25, abs=0.01)
+    assert apart.max() == pytest.approx(0.6, abs=0.01)
 
 
 @pytest.mark.parametrize(

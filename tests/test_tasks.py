@@ -102,3 +102,8 @@ def test_names_tell_rewards_apart(name: str, metres: float) -> None:
     after = start + torch.tensor([[0.0, -0.5]])
     reward = task.objective.reward(start, after, goal, torch.zeros(1))
     assert float(reward) == pytest.approx(metres, abs=0.04)
+
+
+def test_only_the_kicking_tasks_have_a_ball() -> None:
+    balls = {name: task.ball_index for name, task in TASKS.items() if task.ball_index is not None}
+    assert balls == {"nao-kick": 4, "nao-kick-surrogate": 4}

@@ -20,6 +20,9 @@ RISK_STEPS = 20
 """The topple head learns from so many steps before each topple: the last step alone is too rare, and by then
 the robot moves as it never does in a simulator that has no topples."""
 
+_BALL_M = 0.1
+"""Unit of where the ball lies from the robot: whether it is touched is decided by less than that."""
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -37,6 +40,7 @@ class GroundingShape:
     Attributes:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
         position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
+        ball_index: where in the state the position of a ball begins; None where there is none.
         correction_heads: of f_abs, whose mean corrects.
     """
 
@@ -47,6 +51,7 @@ class GroundingShape:
     embedding_size: int = 64
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4
+    ball_index: int | None = None
     correction_heads: int = 1
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
 
@@ -88,7 +93,7 @@ class GroundingModel(nn.Module):
         self.target = target
         states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
         self.position_features = PositionFeatures(shape.position_octaves)
-        features = states + self.position_features.size
+        features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
         self.encoder = HistoryEncoder(
             features + shape.goal_size + actions,
             embedding_size=shape.embedding_size,
@@ -152,9 +157,14 @@ class GroundingModel(nn.Module):
             list(self.reward_head.parameters())[-1][1] = rate.logit()
 
     def state_features(self, state: Tensor) -> Tensor:
-        """Normalise abstract states (..., X) and append the features of their position."""
-        normal = normalised(state, self.state_mean, self.state_std)
-        return torch.cat([normal, self.position_features(state[..., :2])], dim=-1)
+        """Normalise abstract states (..., X) and append the features of their position, and of the ball's."""
+        position, index = state[..., :2], self.shape.ball_index
+        features = [normalised(state, self.state_mean, self.state_std), self.position_features(position)]
+        if index is not None:
+            apart = state[..., index : index + 2] - position
+            near = torch.cat([apart, apart.norm(dim=-1, keepdim=True)], dim=-1) / _BALL_M
+            features.append(near.clamp(-5.0, 5.0))
+        return torch.cat(features, dim=-1)
 
     def normal_goal(self, goal: Tensor) -> Tensor:
         """Normalise goals (..., G)."""

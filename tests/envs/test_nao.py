@@ -52,7 +52,7 @@ def test_robots_turn_to_where_they_are_to_go_and_go_there() -> None:
 def test_robots_with_a_ball_keep_facing_it() -> None:
     one = env("nao-kick", 8, errors=NO_ERRORS)
     away = torch.nn.functional.normalize(one.truth[:, :2] - one.truth[:, 4:6])
-    for _ in range(25):
+    for _ in range(40):
         one.step(0.5 * away)
     apart = one.robots.ball - one.robots.pose[:, :2]
     assert np.linalg.norm(apart, axis=1).min() > 0.5

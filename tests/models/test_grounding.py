@@ -150,6 +150,13 @@ def test_all_heads_learn_together() -> None:
     assert float(unexplained) < 0.2
 
 
+def test_where_the_ball_lies_from_the_robot_is_seen_to_the_centimetre_and_not_from_afar() -> None:
+    model = GroundingModel(GroundingShape(8, 2, 2, position_octaves=0, ball_index=4))
+    state = torch.tensor([[1.0, 2.0, 0, 0, 1.03, 1.96, 0, 0], [1.0, 2.0, 0, 0, -4.0, 2.0, 0, 0]])
+    seen = model.state_features(state)[:, -3:]
+    torch.testing.assert_close(seen, torch.tensor([[0.3, -0.4, 0.5], [-5.0, 0.0, 5.0]]))
+
+
 def test_failing_is_predicted_as_often_as_it_happens_and_never_pays() -> None:
     """Whoever walks to the right fails in a tenth of the steps, others never; failing costs 10."""
     torch.manual_seed(0)
