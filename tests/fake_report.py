@@ -1,0 +1,51 @@
+"""A report over the runs of `fake_runs`: what it is given, and the making of it."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from fake_runs import FakeRecipe
+
+from astra_data.mazes import U_MAZE
+from astra_data.mismatch import CommandReplay
+from astra_data.results.page import HOW_TO_READ
+from astra_data.score import SUCCESS
+from astra_data.stages.report import ReportConfig, report
+
+REPLAY = CommandReplay(
+    np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4))
+)
+
+LASTING_FIGURES = {"steps", "return", "learning_steps"}
+FIGURES = {*HOW_TO_READ} - LASTING_FIGURES - {"strips"}
+
+CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
+
+
+def task(**changes: object) -> SimpleNamespace:
+    usual = {"photograph": None, "maze": U_MAZE, "plane": object(), "facts": {}}
+    return SimpleNamespace(**usual | {"objective": SimpleNamespace(scores=(SUCCESS,))} | changes)
+
+
+def images(folder: Path) -> set[str]:
+    return {path.stem for path in folder.glob("*.png")}
+
+
+def make(
+    root: Path,
+    publish: Path | None = None,
+    recipe: FakeRecipe | None = None,
+    add_to: Path | None = None,
+    note: str = "best: Careful follower  success 1.00",
+) -> None:
+    notes: list[tuple[float, str]] = []
+    report(
+        recipe or FakeRecipe(),
+        root=root,
+        command="astra-data run recipes/antmaze_u.toml",
+        publish=publish,
+        add_to=add_to,
+        progress=lambda fraction, note: notes.append((fraction, note)),
+        config=CONFIG,
+    )
+    assert notes[-1] == (1.0, note) or recipe
