@@ -186,9 +186,10 @@ def telemetry(
     corrected = model.correct(latent, windows.action, windows.simulated_next)
     figures = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
     if weights.reward > 0:
-        predicted = model.predict_reward_parts(latent, windows.action)[mask]
-        for part, name in enumerate(("r2_reward", "r2_final_reward")):
-            figures[name] = _r2(predicted[:, part], windows.reward[mask][:, part])
+        going_on, failing = model.predict_reward_parts(latent, windows.action)[mask].unbind(-1)
+        reward, failed = windows.reward[mask][:, 0], windows.reward[mask][:, 1] != 0
+        figures["r2_reward"] = _r2(going_on[~failed], reward[~failed])
+        figures["r2_final_reward"] = _r2(failing, failed * model.failure_cost)
     if weights.latent > 0:
         mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
         both = mask[:, :-1] & mask[:, 1:]

@@ -15,6 +15,7 @@ from torch import Tensor
 from astra_data.objective import PlanarObjective
 
 _NEAR_M = (0.25, 0.6)
+"""From the ball, where recorded episodes begin: farther than a robot reaches."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,6 @@ class Kicking(PlanarObjective):
         side_line_m: |y| of the side lines. back_line_m: x of the line behind.
         ball_x_m, ball_y_m: where balls lie at the start.
         distance_m: of the robot from the ball at the start.
-        bearing_rad: largest angle at the ball between the robot and the place behind the ball, at the start.
         behind_m: distance from the ball of the place behind it, which the shaping reward leads to.
     """
 
@@ -40,19 +40,13 @@ class Kicking(PlanarObjective):
     ball_x_m: tuple[float, float] = (-0.5, 0.0)
     ball_y_m: tuple[float, float] = (-0.6, 0.6)
     distance_m: tuple[float, float] = (0.4, 1.0)
-    bearing_rad: float = np.pi
     behind_m: float = 0.25
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, 8) at rest: the ball in front of the goal, the robot around it."""
         ball = np.stack([rng.uniform(*self.ball_x_m, count), rng.uniform(*self.ball_y_m, count)], axis=1)
-        to_goal = np.array([self.goal_line_m, 0.0]) - ball
-        angle = np.arctan2(to_goal[:, 1], to_goal[:, 0]) + np.pi
-        angle += rng.uniform(-self.bearing_rad, self.bearing_rad, count)
-        distance = rng.uniform(*self.distance_m, count)
+        angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*self.distance_m, count)
         robot = ball + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        edge = self.side_line_m - 0.1
-        robot = robot.clip(-edge, edge)
         rest = np.zeros_like(robot)
         return np.concatenate([robot, rest, ball, rest], axis=1)
 

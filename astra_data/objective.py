@@ -91,7 +91,7 @@ class PlanarObjective(Objective):
 
     @abstractmethod
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states (count, X), at rest, anywhere in the free space."""
+        """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
         """Shorten velocity commands (..., 2), ±1 m/s per axis, to at most `limit` m/s."""

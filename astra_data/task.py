@@ -141,8 +141,8 @@ class Task:
     @property
     def ball_index(self) -> int | None:
         """Where in abstract states the position of a ball begins; None where there is none."""
-        places = [group.start for role, group in self.abstract_state.roles if role == "position"]
-        return places[1] if len(places) > 1 else None
+        ball = self.quantities.get("ball_position_m")
+        return ball[0] if ball else None
 
     @property
     def fps(self) -> int:

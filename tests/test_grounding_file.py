@@ -22,7 +22,8 @@ def test_a_grounding_comes_back_frozen(tmp_path: Path) -> None:
     shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
     model = GroundingModel(shape, "detach")
     model.set_scales({"state": torch.randn(50, 4)})
-    model.set_reward_scales(torch.randn(50, 2))
+    model.set_reward_scales(torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1))
+    assert torch.isfinite(model.failure_weight)
     episodes = no_episodes()
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, model, episodes)

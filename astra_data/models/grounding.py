@@ -84,7 +84,8 @@ class Windows:
 class GroundingModel(nn.Module):
     """ψ^s, P_lat, R_pred and f_abs on one GRU backbone, plus a topple head that does not shape the latent.
 
-    Scales are buffers, set from the training episodes by `set_scales`, so a checkpoint carries them.
+    Scales are buffers, so a checkpoint carries them; `set_scales` and `set_reward_scales` take them from the
+    training episodes.
     """
 
     def __init__(self, shape: GroundingShape, target: TargetKind = "ema") -> None:
@@ -119,7 +120,7 @@ class GroundingModel(nn.Module):
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("reward_mean", torch.zeros(()))
         self.register_buffer("reward_std", torch.ones(()))
-        self.register_buffer("failure_reward", torch.zeros(()))
+        self.register_buffer("failure_cost", torch.zeros(()))
         self.register_buffer("failure_weight", torch.zeros(()))
         self.register_buffer("residual_factor", torch.zeros(states, states))
         self.register_buffer("usual_disagreement", torch.ones(()))
@@ -130,7 +131,7 @@ class GroundingModel(nn.Module):
         self.correction_std: Tensor
         self.reward_mean: Tensor
         self.reward_std: Tensor
-        self.failure_reward: Tensor
+        self.failure_cost: Tensor
         self.failure_weight: Tensor
         self.residual_factor: Tensor
         self.usual_disagreement: Tensor
@@ -145,14 +146,19 @@ class GroundingModel(nn.Module):
 
     @torch.no_grad()
     def set_reward_scales(self, reward: Tensor) -> None:
-        """Take the scales of `reward` (N, 2) from training steps, in its two parts: see `Windows`."""
+        """Take the scales of `reward` (N, 2) from training steps, in its two parts: see `Windows`.
+
+        The reward head begins where it predicts as many failures as there are, and their loss is weighed by
+        how rare they are.
+        """
         going_on, failing = reward.unbind(-1)
-        self.reward_mean.copy_(going_on.mean())
-        self.reward_std.copy_(going_on.std().clamp_min(1e-3))
-        fails = failing != 0
-        if fails.any():
-            rate = fails.float().mean()
-            self.failure_reward.copy_(failing[fails].mean())
+        failed = failing != 0
+        if not failed.all():
+            self.reward_mean.copy_(going_on[~failed].mean())
+            self.reward_std.copy_(going_on[~failed].std(correction=0).clamp_min(1e-3))
+        if failed.any():
+            rate = failed.float().mean().clamp(max=0.5)
+            self.failure_cost.copy_((failing[failed].mean() - self.reward_mean).clamp_max(0.0))
             self.failure_weight.copy_(1.0 / functional.binary_cross_entropy(rate, rate))
             list(self.reward_head.parameters())[-1][1] = rate.logit()
 
@@ -162,8 +168,8 @@ class GroundingModel(nn.Module):
         features = [normalised(state, self.state_mean, self.state_std), self.position_features(position)]
         if index is not None:
             apart = state[..., index : index + 2] - position
-            near = torch.cat([apart, apart.norm(dim=-1, keepdim=True)], dim=-1) / _BALL_M
-            features.append(near.clamp(-5.0, 5.0))
+            near = torch.cat([apart, apart.norm(dim=-1, keepdim=True)], dim=-1)
+            features.append(normalised(near, 0.0, _BALL_M))
         return torch.cat(features, dim=-1)
 
     def normal_goal(self, goal: Tensor) -> Tensor:
@@ -185,19 +191,19 @@ class GroundingModel(nn.Module):
         return self.predict_reward_parts(latent, action).sum(-1)
 
     def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Return both parts of the target's reward (..., 2): see `Windows`.
+        """Return both parts of the target's reward (..., 2): of going on, and what failing takes from it.
 
         The second is how probably the step fails, times what failing costs: it is rare and large, and as a
         number of its own it pays as easily as it costs where there is no data, which policies find.
         """
-        going_on, fails = self._reward_outputs(latent, action)
-        parts = [going_on * self.reward_std + self.reward_mean, fails.sigmoid() * self.failure_reward]
+        going_on, log_odds = self._reward_outputs(latent, action)
+        parts = [going_on * self.reward_std + self.reward_mean, log_odds.sigmoid() * self.failure_cost]
         return torch.stack(parts, dim=-1)
 
     def _reward_outputs(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the normalised reward of a step that goes on, and the log-odds that it fails, (...) each."""
-        going_on, fails = self.reward_head(torch.cat([latent, action], dim=-1)).unbind(-1)
-        return going_on, fails
+        going_on, log_odds = self.reward_head(torch.cat([latent, action], dim=-1)).unbind(-1)
+        return going_on, log_odds
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
@@ -254,12 +260,15 @@ class GroundingModel(nn.Module):
         return total + parts["topple"], parts
 
     def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
-        """Return the mean of both parts' losses, each of which is one where the average is predicted."""
-        going_on, fails = self._reward_outputs(latent, windows.action)
+        """Return the mean of both parts' losses; where the average is predicted, each is about one.
+
+        Without any failures in the data the second is zero.
+        """
+        going_on, log_odds = self._reward_outputs(latent, windows.action)
         reward, failing = windows.reward.unbind(-1)
-        error = going_on - (reward - self.reward_mean) / self.reward_std
         failed = (failing != 0).float()
-        surprise = functional.binary_cross_entropy_with_logits(fails, failed, reduction="none")
+        error = (1.0 - failed) * (going_on - (reward - self.reward_mean) / self.reward_std)
+        surprise = functional.binary_cross_entropy_with_logits(log_odds, failed, reduction="none")
         return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
 
     def _correction_loss(self, latent: Tensor, windows: Windows) -> Tensor:

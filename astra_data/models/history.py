@@ -15,7 +15,7 @@ def mlp(sizes: tuple[int, ...], activation: type[nn.Module] = nn.ELU) -> nn.Sequ
     return nn.Sequential(*layers[:-1])
 
 
-def normalised(state: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+def normalised(state: Tensor, mean: Tensor | float, std: Tensor | float) -> Tensor:
     """Return states (..., S) in deviations from the data's mean, cut off at ±5.
 
     What is farther away was never seen: a network that is shown more of it answers with anything, and a

@@ -59,7 +59,7 @@ class CollectConfig(Config):
     num_envs: Count = 200
     """Episodes recorded side by side; decides which random numbers an episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
-    """Where episodes start: anywhere in the free space, or where the task does."""
+    """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does."""
     hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
     clearance_m: NotNegative = 0.0

@@ -157,14 +157,18 @@ def test_where_the_ball_lies_from_the_robot_is_seen_to_the_centimetre_and_not_fr
     torch.testing.assert_close(seen, torch.tensor([[0.3, -0.4, 0.5], [-5.0, 0.0, 5.0]]))
 
 
-def test_failing_is_predicted_as_often_as_it_happens_and_never_pays() -> None:
-    """Whoever walks to the right fails in a tenth of the steps, others never; failing costs 10."""
+@pytest.mark.parametrize(("paid", "cost"), [(-10.0, -10.0), (0.5, -4.5)])
+def test_failing_is_predicted_as_often_as_it_happens_and_never_pays(paid: float, cost: float) -> None:
+    """Whoever walks to the right fails in a tenth of the steps, others never; going on pays 0 or 5."""
     torch.manual_seed(0)
     falls = (TRAINING.action[..., 0] > 0) & (torch.rand(TRAINING.mask.shape) < 0.1)
-    going_on = TRAINING.reward[..., 0] * ~falls
-    windows = replace(TRAINING, reward=torch.stack([going_on, -10.0 * falls], dim=-1))
+    going_on = (paid - cost) * ~falls
+    windows = replace(TRAINING, reward=torch.stack([going_on, paid * falls], dim=-1))
     model = untrained()
     model.set_reward_scales(windows.reward.flatten(0, 1))
+    with torch.no_grad():
+        start = model.predict_reward_parts(torch.zeros(1, SIZE), torch.zeros(1, 2))[0, 1]
+    assert float(start) == pytest.approx(cost * float(falls.float().mean()), rel=0.5)
     optimizer = torch.optim.Adam(model.parameters(), lr=3e-3)
     for _ in range(100):
         loss, _ = model.losses(windows, LossWeights(latent=0.0))
@@ -174,8 +178,8 @@ def test_failing_is_predicted_as_often_as_it_happens_and_never_pays() -> None:
     with torch.no_grad():
         parts = model.predict_reward_parts(latents(model), HELD_OUT.action)
         right = HELD_OUT.action[..., 0] > 0
-        assert float(parts[right][:, 1].mean()) == pytest.approx(-1.0, abs=0.3)
-        assert float(parts[~right][:, 1].mean()) == pytest.approx(0.0, abs=0.2)
+        assert float(parts[right][:, 1].mean()) == pytest.approx(0.1 * cost, abs=0.03 * -cost)
+        assert float(parts[~right][:, 1].mean()) == pytest.approx(0.0, abs=0.02 * -cost)
         anywhere, any_action = 100 * torch.randn(1000, SIZE), 100 * torch.randn(1000, 2)
         assert float(model.predict_reward_parts(anywhere, any_action)[:, 1].max()) <= 0.0
 

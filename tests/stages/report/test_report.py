@@ -139,7 +139,7 @@ def test_a_cut_off_trajectory_file_is_refused(root: Path) -> None:
         make(root)
 
 
-def test_sizes_are_set_side_by_side(tmp_path: Path) -> None:
+def test_sizes_are_set_side_by_side(tasks: None, tmp_path: Path) -> None:
     root = tmp_path / "runs" / "sizes"
     for percent in (50, 100):
         for seed in SEEDS:
