@@ -1,4 +1,4 @@
-"""A ball on a carpet: how it rolls, and how it leaves a planar body that walks into it. Batched torch."""
+"""A ball on a carpet: how it rolls, and how planar bodies kick it and walk into it. Batched torch."""
 
 import torch
 from torch import Tensor
@@ -9,6 +9,13 @@ ROLLING_M_S2 = 0.30
 """Deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)."""
 BALL_RADIUS_M = 0.05
 """Likewise."""
+_KICKS_ABOVE = 0.5
+"""Third entry of the commands of robots that have a ball."""
+
+
+def asks_to_kick(command: Tensor) -> Tensor:
+    """Tell which commands (B, 3), planar velocity and a wish, ask for a kick: (B, 1) bool."""
+    return command[:, 2:] > _KICKS_ABOVE
 
 
 def roll(
@@ -47,9 +54,7 @@ def knock(
     Returns:
         positions and velocities (B, 2) of the balls.
     """
-    apart = ball - after
-    distance = apart.norm(dim=-1, keepdim=True)
-    direction = apart / distance.clamp_min(1e-9)
+    direction, distance = _seen_from(after, ball)
     approaches = ((after - before) * direction).sum(-1, keepdim=True) > 0
     touched = (distance < reach_m) & approaches
     leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
@@ -57,3 +62,39 @@ def knock(
         torch.where(touched, after + direction * reach_m, ball),
         torch.where(touched, leaving * speed_m_s, velocity),
     )
+
+
+def kick_away(
+    body: Tensor,
+    ball: Tensor,
+    velocity: Tensor,
+    asked: Tensor,
+    *,
+    reach_m: float,
+    speed_m_s: Tensor | float,
+    turn_rad: Tensor | float = 0.0,
+) -> Tensor:
+    """Kick the balls that bodies are `asked` (B, 1) to and can reach.
+
+    Args:
+        body: where the bodies are, (B, 2).
+        ball: where the balls are, (B, 2).
+        velocity: of the balls, (B, 2).
+        asked: which are to kick, (B, 1) bool.
+        reach_m: between the centres of a body and a ball that it can kick.
+        speed_m_s: at which a ball leaves along the line between the centres, (B, 1) or one for all.
+        turn_rad: the ball leaves turned by this, (B,) or one for all.
+
+    Returns:
+        velocities (B, 2) of the balls.
+    """
+    direction, distance = _seen_from(body, ball)
+    leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
+    return torch.where(asked & (distance < reach_m), leaving * speed_m_s, velocity)
+
+
+def _seen_from(body: Tensor, ball: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the direction (B, 2) and distance (B, 1) of balls from bodies, both (B, 2)."""
+    apart = ball - body
+    distance = apart.norm(dim=-1, keepdim=True)
+    return apart / distance.clamp_min(1e-9), distance

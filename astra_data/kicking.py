@@ -14,8 +14,8 @@ from torch import Tensor
 
 from astra_data.objective import PlanarObjective
 
-_NEAR_M = (0.25, 0.6)
-"""From the ball, where recorded episodes begin: farther than a robot reaches."""
+_NEAR_M = (0.18, 0.5)
+"""From the ball, where recorded episodes begin: from where a foot reaches it on."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Kicking(PlanarObjective):
     """Knock the ball through the goal at the right end of `maze`, an empty field, within `horizon` steps.
 
     Abstract states begin with robot position and velocity, ball position and velocity, (..., 8). The goal
-    (..., 2) is the middle of the goal line.
+    (..., 2) is the middle of the goal line. Actions (..., 3) end with whether to kick.
 
     Attributes:
         goal_line_m: x of the goal line. goal_half_width_m: of the goal on it.
@@ -33,14 +33,16 @@ class Kicking(PlanarObjective):
         behind_m: distance from the ball of the place behind it, which the shaping reward leads to.
     """
 
+    action_size = 3
+
     goal_line_m: float = 1.5
     goal_half_width_m: float = 0.75
     side_line_m: float = 2.0
     back_line_m: float = -2.0
-    ball_x_m: tuple[float, float] = (-0.5, 0.0)
+    ball_x_m: tuple[float, float] = (0.0, 0.5)
     ball_y_m: tuple[float, float] = (-0.6, 0.6)
     distance_m: tuple[float, float] = (0.4, 1.0)
-    behind_m: float = 0.25
+    behind_m: float = 0.2
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, 8) at rest: the ball in front of the goal, the robot around it."""

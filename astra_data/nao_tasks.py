@@ -29,12 +29,15 @@ Level = Literal["mujoco", "surrogate"]
 _RADIUS_M = 0.1
 """Of the disc that the robot is at walls in its simulators: as in AntMaze, and less than the robot's 0.14."""
 _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
+_KICK = {"kick_reach_m": 0.35, "kick_m_s": 1.0}
+"""The first is that of the paper's group's published simulator of an attacking NAO (AbstractSim 2023). A foot
+really reaches 0.22 m far."""
 _CONTACT: dict[Level, dict[str, Any]] = {
-    "mujoco": {"reach_m": 0.22, "knock_m_s": 1.0},
-    "surrogate": {"reach_m": 0.19, "knock_m_s": 1.0},
+    "mujoco": _KICK | {"reach_m": 0.22, "knock_m_s": 0.7},
+    "surrogate": _KICK | {"reach_m": 0.19, "knock_m_s": 0.7},
 }
 """Of the robot with its ball. Walking bodies touch it with feet and shins, at a median of 0.22 m between the
-centres in episodes of random commands; the surrogate at its own reach."""
+centres in episodes of random commands; it leaves at a median of 0.7 m/s. The surrogate has its own reach."""
 
 KICK_RANGES = BallVariation(
     **WIDE_RANGES.model_dump(),
@@ -83,6 +86,14 @@ _BALL_ROLES: Roles = (
     ["position"] * 2 + ["vector"] * 2 + ["invariant"],
     [""] * 4 + ["ball_unseen"],
 )
+_COMMAND_ROLES: Roles = (
+    ("command_vx", "command_vy"),
+    ["0.25 m/s"] * 2,
+    ["world"] * 2,
+    ["vector"] * 2,
+    [""] * 2,
+)
+_KICK_ROLES: Roles = (("kick",), ["1"], ["body"], ["invariant"], [""])
 _PLANAR_ROLES: Roles = (
     ("x", "y", "vx", "vy"),
     ["m"] * 2 + ["m/s"] * 2,
@@ -94,26 +105,30 @@ _PLANAR_ROLES: Roles = (
 
 def _columns(*, ball: bool) -> tuple[Column, ...]:
     size = STATE_SIZE + BALL_SIZE * ball
-    told = roles(*(_with_ball(_STATE_ROLES) if ball else _STATE_ROLES))
+    told = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
     goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
-    command = roles(("command_vx", "command_vy"), ["0.25 m/s"] * 2, ["world"] * 2, ["vector"] * 2)
+    command_roles = _with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES
+    command = roles(*command_roles[:4])
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
+    wish = ", and above 0.5 to stand and kick" if ball else ""
     return (
         Column(STATE, size=size, meaning=meaning, **told),
         Column(GOAL, size=2, meaning="the middle of the goal line" if ball else "where to go", **goal),
-        Column(ACTION, size=2, meaning="commanded planar velocity, ±1 per axis", **command),
+        Column(ACTION, size=2 + ball, meaning=f"commanded planar velocity, ±1 per axis{wish}", **command),
         Column(NEXT_STATE, size=size, meaning=f"{meaning}, one control step later", **told),
     )
 
 
-def _with_ball(known: Roles, count: int = BALL_SIZE) -> Roles:
-    (names, *told), (ball_names, *ball_told) = known, _BALL_ROLES
-    units, frames, entries, mirror = (mine + its[:count] for mine, its in zip(told, ball_told, strict=True))
-    return (*names, *ball_names[:count]), units, frames, entries, mirror
+def _with(known: Roles, more: Roles, count: int | None = None) -> Roles:
+    (names, *told), (further, *further_told) = known, more
+    units, frames, entries, mirror = (
+        mine + its[:count] for mine, its in zip(told, further_told, strict=True)
+    )
+    return (*names, *further[:count]), units, frames, entries, mirror
 
 
 def _abstract(*, ball: bool) -> Column:
-    names, units, frames, entries, _ = _with_ball(_PLANAR_ROLES, 4) if ball else _PLANAR_ROLES
+    names, units, frames, entries, _ = _with(_PLANAR_ROLES, _BALL_ROLES, 4) if ball else _PLANAR_ROLES
     told = roles(names, units, frames, entries)
     meaning = "abstract state of the target before the action"
     return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **told)

@@ -76,7 +76,7 @@ class Objective(ABC):
 
 @dataclass(frozen=True)
 class PlanarObjective(Objective):
-    """An objective in a maze; states begin with x and y of the robot in m, actions are velocities.
+    """An objective in a maze; states begin with x and y of the robot in m, actions with its velocity.
 
     Attributes:
         maze: where it happens.
@@ -94,11 +94,11 @@ class PlanarObjective(Objective):
         """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
-        """Shorten velocity commands (..., 2), ±1 m/s per axis, to at most `limit` m/s."""
-        command = super().limit_command(action, limit)
+        """Shorten the velocities in m/s that actions (..., A) begin with, ±1 per axis, to at most `limit`."""
+        command, rest = super().limit_command(action, limit).tensor_split([2], dim=-1)
         speed = command.norm(dim=-1, keepdim=True)
         shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
-        return command * shorten
+        return torch.cat([command * shorten, rest], dim=-1)
 
     def places(self, state: Tensor) -> Tensor:
         """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""

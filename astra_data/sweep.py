@@ -138,11 +138,11 @@ class Table:
     def _line(self, point: Point) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
         means = evaluation.target.means()
-        seconds = [
-            read_json(Artefact, self.folder / key / TIMED[key.partition("/")[0]]).wall_seconds or 0.0
-            for key in sorted(set(needed(point.key, self._items)))
-            if key.partition("/")[0] in TIMED
-        ]
+        stages = {key: key.partition("/")[0] for key in sorted(set(needed(point.key, self._items)))}
+        timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
+        # What a point was made of may have been deleted since.
+        is_complete = all(file.is_file() for file in timed)
+        seconds = [read_json(Artefact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
         simulated = evaluation.simulated
         return {
             "method": point.method,
@@ -156,7 +156,7 @@ class Table:
             "dataset_version": evaluation.dataset_version,
             "dataset_hash": evaluation.dataset_hash,
             "commit": evaluation.git_commit,
-            "wall_seconds": round(sum(seconds), 3),
+            "wall_seconds": round(sum(seconds), 3) if is_complete else None,
         }
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from astra_data.ball import ROLLING_M_S2, knock, roll
+from astra_data.ball import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
 
 
 def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
@@ -46,3 +46,17 @@ def test_other_balls_are_left_alone(after: list[float], ball: list[float]) -> No
     )
     assert torch.equal(place, torch.tensor([ball]))
     assert torch.equal(velocity, rolling)
+
+
+def test_a_kick_sends_balls_within_reach_straight_away() -> None:
+    bodies = torch.zeros(4, 2)
+    ball = torch.tensor([[0.18, 0.24], [0.18, 0.24], [0.3, 0.4], [-0.3, 0.0]])
+    rolling = torch.tensor([[0.1, 0.2]]).expand(4, 2)
+    asked = asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
+    velocity = kick_away(bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0)
+    # Kicked; not asked to; out of reach; behind, which a body without a heading kicks as well.
+    torch.testing.assert_close(velocity, torch.tensor([[1.2, 1.6], [0.1, 0.2], [0.1, 0.2], [-2.0, 0.0]]))
+    turned = kick_away(
+        bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0, turn_rad=torch.full((4,), torch.pi / 2)
+    )
+    torch.testing.assert_close(turned[[0, 3]], torch.tensor([[-1.6, 1.2], [0.0, -2.0]]))

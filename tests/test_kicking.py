@@ -19,8 +19,8 @@ def test_starts_are_where_the_task_says() -> None:
     assert starts.shape == (4000, 8)
     assert (starts[:, 2:4] == 0).all()
     assert (starts[:, 6:] == 0).all()
-    assert ball.min(axis=0) == pytest.approx([-0.5, -0.6], abs=0.01)
-    assert ball.max(axis=0) == pytest.approx([0.0, 0.6], abs=0.01)
+    assert ball.min(axis=0) == pytest.approx([0.0, -0.6], abs=0.01)
+    assert ball.max(axis=0) == pytest.approx([0.5, 0.6], abs=0.01)
     assert (np.abs(robot) <= 1.9).all()
     apart = np.linalg.norm(robot - ball, axis=1)
     assert apart.min() >= 0.4 - 1e-9
@@ -34,8 +34,8 @@ def test_starts_are_where_the_task_says() -> None:
 def test_recorded_episodes_begin_near_the_ball() -> None:
     starts = TASK.draw_anywhere(np.random.default_rng(0), 4000)
     apart = np.linalg.norm(starts[:, :2] - starts[:, 4:6], axis=1)
-    assert apart.min() == pytest.approx(0.25, abs=0.01)
-    assert apart.max() == pytest.approx(0.6, abs=0.01)
+    assert apart.min() == pytest.approx(0.18, abs=0.01)
+    assert apart.max() == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -74,3 +74,8 @@ def test_policies_are_shown_everything_that_matters() -> None:
     moved = states.clone()
     moved[..., 4] += 0.1
     assert (TASK.observe(moved, goals) != seen).any(-1).all()
+
+
+def test_a_speed_limit_leaves_the_wish_to_kick_as_it_is() -> None:
+    limited = TASK.limit_command(torch.tensor([[0.6, 0.8, 0.9], [0.0, 0.1, -3.0]]), 0.5)
+    torch.testing.assert_close(limited, torch.tensor([[0.3, 0.4, 0.9], [0.0, 0.1, -1.0]]))

@@ -1,6 +1,7 @@
 import csv
 import sys
 from pathlib import Path
+from shutil import rmtree
 from types import SimpleNamespace
 from typing import Any
 
@@ -73,6 +74,15 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
     ]
     assert {line["simulated_success"] for line in lines(folder) if line["method"] == "follower"} == {""}
     assert {line["wall_seconds"] for line in lines(folder) if line["method"] == "astra"} == {"24.75"}
+
+
+def test_points_outlive_what_they_were_made_of(recipe: Path, tmp_path: Path) -> None:
+    folder = sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+    rmtree(folder / "train")
+    sweep(recipe, methods=["follower"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+    times = {line["method"]: line["wall_seconds"] for line in lines(folder)}
+    assert times["nas"] == ""
+    assert float(times["follower"]) > 0
 
 
 def publish(recipe: Path, points: dict[int, dict[str, list[int]]]) -> Path:

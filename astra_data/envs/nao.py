@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.abstraction import NAO_STATE_SIZE
+from astra_data.ball import asks_to_kick
 from astra_data.batched import Step
 from astra_data.errors import BadInputError
 from astra_data.geometry import wrapped
@@ -41,7 +42,9 @@ BALL_SIZE = 5
 class NaoEnv:
     """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
 
-    A control step lasts 0.192 s. The robots turn by themselves to where they go, or to their ball. They act
+    Where there is a ball, a third entry above 0.5 asks for a kick: the robot steps on the spot, and swings
+    the foot nearer to the ball. A control step lasts 0.192 s. The robots turn by themselves to where they go,
+    or to their ball. They act
     on what they believe, which is also all that their state (B, S) holds; rewards, success and failure go by
     the truth. Success, falling, and what the task counts as failure end an episode.
 
@@ -49,8 +52,6 @@ class NaoEnv:
         goal: (B, 2) float32. failed: (B,) bool, ended badly in the last step.
         robots: the robots themselves.
     """
-
-    action_size = 2
 
     def __init__(
         self,
@@ -84,7 +85,7 @@ class NaoEnv:
         if leg_scale != 1.0:
             raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
         self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
-        self.has_ball = ball
+        self.has_ball, self.action_size = ball, objective.action_size
         kind = BatchedNao if level == "mujoco" else SurrogateNao
         self.robots = kind(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
         errors = errors or PerceptionErrors()
@@ -161,11 +162,11 @@ class NaoEnv:
         self.failed[rows] = False
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Follow the commands `action` (B, 2) for 0.192 s; rows outside `active` (B,) stand frozen."""
+        """Follow the commands `action` (B, A) for 0.192 s; rows outside `active` (B,) stand frozen."""
         moving = np.ones(self.num_envs, dtype=bool) if active is None else active.numpy()
         before = self.truth
-        kick = np.ones(self.num_envs, dtype=bool) if self.has_ball else None
-        self.robots.step(self._body_command(action), moving, kick)
+        kick = asks_to_kick(action).squeeze(-1).numpy() if self.has_ball else None
+        self.robots.step(self._body_command(action[:, :2], kick), moving, kick)
         self.localisation.update(self.robots.pose, self._rng, moving)
         if self.has_ball:
             believed = self.localisation.pose
@@ -183,13 +184,13 @@ class NaoEnv:
             success=success,
         )
 
-    def _body_command(self, action: Tensor) -> Floats:
+    def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None = None) -> Floats:
         """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3), as believed.
 
         Robots turn to where they go. With a ball they turn to it, and walk the slower the farther it is
-        aside; when it is lost they look around.
+        aside, or not at all while they `kick` (B,); when it is lost they look around.
         """
-        command = action.clamp(-1.0, 1.0).double().numpy()
+        command = velocity.clamp(-1.0, 1.0).double().numpy()
         x, y = (SPEED_M_S * command).T
         heading = self.localisation.pose[:, 2]
         cos, sin = np.cos(heading), np.sin(heading)
@@ -199,10 +200,11 @@ class NaoEnv:
             ahead = np.arctan2(apart[:, 1], apart[:, 0])
         astray = wrapped(ahead - heading)
         turn = (TURN_GAIN_PER_S * astray).clip(-TURN_LIMIT_RAD_S, TURN_LIMIT_RAD_S)
-        turn *= np.linalg.norm(command, axis=1) > _STANDING
-        if self.has_ball:
+        called = np.linalg.norm(command, axis=1) > _STANDING
+        turn *= called if kick is None else called | kick
+        if kick is not None:
             turn = np.where(self.sight.unseen_s > SEARCH_AFTER_S, TURN_LIMIT_RAD_S, turn)
-            facing = np.cos(astray).clip(0.0) ** 2
+            facing = ~kick * np.cos(astray).clip(0.0) ** 2
             x, y = facing * x, facing * y
         return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
 

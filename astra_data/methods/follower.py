@@ -67,36 +67,44 @@ class CarefulFollower:
 
 @dataclass(frozen=True)
 class CarefulKicker:
-    """Walk to the place behind the ball, around the ball where it is near, and from there through it.
+    """Walk to the place behind the ball, around the ball where it is near, from there up to it, and kick.
 
     Attributes:
         clear_m: distance from the ball on the way around it.
-        cone_rad: it walks through the ball where the way to it and on to the goal bends by less than this.
+        cone_rad: it walks up to the ball where the way to it and on to the goal bends by less than this.
+        kick_m: from how near it kicks. brake_m: how far before that it begins to slow down.
         rolls_m_s: balls that seem slower than this are taken to lie still.
         speed: of the faster axis, in units of commands.
     """
 
-    clear_m: float = 0.35
+    clear_m: float = 0.3
     cone_rad: float = np.pi / 7
+    kick_m: float = 0.2
+    brake_m: float = 0.05
     rolls_m_s: float = 0.3
     speed: float = 0.85
 
     def command(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return velocity commands (B, 2) at abstract states (B, 8) for goals (B, 2)."""
+        """Return commands (B, 3) at abstract states (B, 8) for goals (B, 2)."""
         robot, _, ball, rolling = state.split(2, dim=-1)
         rolls = rolling.norm(dim=-1, keepdim=True) > self.rolls_m_s
         ball = ball + rolls * rolling  # Where it will be in a second.
         to_goal = torch.nn.functional.normalize(goal - ball, dim=-1)
         distance = (robot - ball).norm(dim=-1, keepdim=True).clamp_min(1e-6)
         outward = (robot - ball) / distance
-        kicks = -(outward * to_goal).sum(-1, keepdim=True) > np.cos(self.cone_rad)
+        is_behind = -(outward * to_goal).sum(-1, keepdim=True) > np.cos(self.cone_rad)
+        kicks = is_behind & (distance < self.kick_m)
         # Along a circle about the ball, the shorter way.
         left = torch.stack([-outward[:, 1], outward[:, 0]], dim=-1)
         shorter = -(left * to_goal).sum(-1, keepdim=True).sign()
         around = shorter * left + 2 * (1 - distance / self.clear_m) * outward
         behind = ball - self.clear_m * to_goal
         way = torch.where(distance < 1.5 * self.clear_m, around, behind - robot)
-        return _at_speed(torch.where(kicks, -outward, way), self.speed)
+        slower = ((distance - self.kick_m) / self.brake_m).clamp(0.3, 1.0)
+        velocity = torch.where(
+            is_behind, slower * _at_speed(-outward, self.speed), _at_speed(way, self.speed)
+        )
+        return torch.cat([velocity, kicks.float()], dim=-1)
 
 
 def _at_speed(heading: Tensor, speed: float) -> Tensor:

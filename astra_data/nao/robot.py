@@ -18,10 +18,12 @@ from astra_data.nao.links import HIP_OFFSET_Z_M
 from astra_data.nao.robots import Robots, Senses
 from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, put_rows
 from astra_data.nao.traits import Traits, Variation
-from astra_data.nao.walk import LEFT_KICKS, NO_KICK, RIGHT_KICKS, WalkEngine, WalkStyle
+from astra_data.nao.walk import WalkEngine, WalkStyle
 
 CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS
+_MIDDLE_M = 0.03
+"""A ball that is less far aside is either foot's: from step to step the torso sways as far."""
 
 
 class BatchedNao(Robots):
@@ -116,7 +118,7 @@ class BatchedNao(Robots):
         Args:
             command: velocities forward and to the left in m/s, turn in rad/s, (B, 3).
             active: which robots, (B,); all others, and those that have fallen, stay as they are.
-            kick: which are to kick with the foot nearer to the ball when it next swings, (B,).
+            kick: which are to kick with the foot on the ball's side when it next swings, (B,).
 
         Raises:
             BadInputError: `command` has another shape or is not finite.
@@ -135,13 +137,14 @@ class BatchedNao(Robots):
         self._steps += 1
         self.gait = targets.reached(self.bodies.step(rows, targets, noise))
 
-    def _kicking_feet(self, kick: Bools | None) -> NDArray[np.intp] | None:
+    def _kicking_feet(self, kick: Bools | None) -> Bools | None:
         if kick is None or not self.has_ball:
             return None
         x, y = (self.ball - self.pose[:, :2]).T
         yaw = self.pose[:, 2]
         to_the_left = np.cos(yaw) * y - np.sin(yaw) * x
-        return np.where(kick, np.where(to_the_left > 0, LEFT_KICKS, RIGHT_KICKS), NO_KICK)
+        sides = np.stack([to_the_left > -_MIDDLE_M, to_the_left < _MIDDLE_M], axis=1)
+        return np.asarray(kick[:, None] & sides)
 
     @property
     @override

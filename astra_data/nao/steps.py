@@ -120,14 +120,18 @@ class StepPlanner:
         x, y = x / excess, y / excess
         return np.stack([x, y, turn], axis=1)
 
-    def advance(self, gait: Gait, command: Floats, seconds: float) -> Bools:
+    def advance(self, gait: Gait, command: Floats, seconds: float, on_the_spot: Bools | None = None) -> Bools:
         """Let time pass, in place; where a step ends, plan the next one by `command` (B, 3).
+
+        A command of zero lets robots come to rest, but for those that are to walk `on_the_spot` (B,).
 
         Returns:
             Which robots began a step, (B,) bool.
         """
         gait.phase = np.where(gait.walking, gait.phase + seconds / gait.duration_s, 0.0)
         called = (command != 0).any(axis=1)
+        if on_the_spot is not None:
+            called |= on_the_spot
         landed = gait.walking & (gait.phase >= 1)
         rests = landed & ~called & (gait.kind == STOP)
         begins = (landed & ~rests) | (~gait.walking & called)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from astra_data.ball import BALL_RADIUS_M, ROLLING_M_S2, knock, roll
+from astra_data.ball import BALL_RADIUS_M, ROLLING_M_S2, kick_away, knock, roll
 from astra_data.free_space import FreeSpace
 from astra_data.mazes import Maze
 from astra_data.nao.robot import CONTROL_STEP_S
@@ -21,6 +21,8 @@ from astra_data.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, p
 
 BODY_RADIUS_M = 0.2
 """Of the disc that touches walls."""
+_KICK_REACH_M = 0.22
+"""Between the centres of a robot and a ball that it can kick."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,10 @@ class SurrogateVariation:
     """Probability that a step slips, and so loses up to 0.4 of its length or more."""
     delay_steps: float = 0.6
     """Control steps from a command to the planner."""
-    knock_m_s: tuple[float, float] = (0.6, 1.4)
+    knock_m_s: tuple[float, float] = (0.45, 0.95)
     """Speed of a ball that is walked into."""
+    kick_m_s: tuple[float, float] = (0.4, 1.2)
+    """Speed of a ball that is kicked."""
     knock_rad: float = float(np.radians(15.0))
     """Standard deviation of its direction."""
 
@@ -129,10 +133,9 @@ class SurrogateNao(Robots):
     def step(self, command: Floats, active: Bools | None = None, kick: Bools | None = None) -> None:
         """Walk for one control step of 0.192 s: forward and left in m/s, turn in rad/s, (B, 3).
 
-        Rows outside `active` (B,) stay as they are. Whoever walks into a ball knocks it away, whether it
-        was asked to `kick` or not.
+        Rows outside `active` (B,) stay as they are. Whoever walks into a ball knocks it away; those in `kick`
+        (B,) kick it where they can reach it.
         """
-        del kick
         robots, varied = self._robots, self.variation
         rows = np.flatnonzero(np.ones(self.num_robots, dtype=bool) if active is None else active)
         rng = np.random.default_rng([self._seed, self._steps])
@@ -159,18 +162,28 @@ class SurrogateNao(Robots):
         if self._free is not None:
             slid, stopped = self._free.slide(torch.from_numpy(before), torch.from_numpy(after))
             after, touching = slid.numpy(), stopped.numpy()
-        ball, rolling = self._ball_after(before, after, rng)
+        ball, rolling = self._ball_after(before, after, kick, rng)
         world = np.concatenate([(after - before) / CONTROL_STEP_S, motion[:, 2:] / CONTROL_STEP_S], axis=1)
         turned = robots.pose[:, 2:] + motion[:, 2:]
         self._put(rows, gait, np.concatenate([after, turned], axis=1), world, touching, ball, rolling)
         robots.sent[rows] = command[rows]
 
-    def _ball_after(self, before: Floats, after: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    def _ball_after(
+        self, before: Floats, after: Floats, kicks: Bools | None, rng: np.random.Generator
+    ) -> tuple[Floats, Floats]:
         varied, robots = self.variation, self._robots
         tensors = [torch.from_numpy(v) for v in (before, after, robots.ball, robots.ball_velocity)]
         turn = torch.from_numpy(varied.knock_rad * rng.normal(size=self.num_robots))
-        speed = torch.from_numpy(rng.uniform(*varied.knock_m_s, self.num_robots)).unsqueeze(-1)
-        ball, rolling = knock(*tensors, reach_m=0.14 + BALL_RADIUS_M, speed_m_s=speed, turn_rad=turn)
+        knocked, kicked = (
+            torch.from_numpy(rng.uniform(*speeds, self.num_robots)).unsqueeze(-1)
+            for speeds in (varied.knock_m_s, varied.kick_m_s)
+        )
+        ball, rolling = knock(*tensors, reach_m=0.14 + BALL_RADIUS_M, speed_m_s=knocked, turn_rad=turn)
+        if kicks is not None:
+            asked = torch.from_numpy(kicks).unsqueeze(-1)
+            rolling = kick_away(
+                tensors[1], ball, rolling, asked, reach_m=_KICK_REACH_M, speed_m_s=kicked, turn_rad=turn
+            )
         ball, rolling = roll(ball, rolling, CONTROL_STEP_S, ROLLING_M_S2)
         return ball.numpy(), rolling.numpy()
 

@@ -16,9 +16,6 @@ from astra_data.nao.kinematics import leg_angles
 from astra_data.nao.links import HIP_OFFSET_Y_M, HIP_OFFSET_Z_M
 from astra_data.nao.steps import START, STRIDE, Bools, Floats, Gait, StepPlanner
 
-NO_KICK, LEFT_KICKS, RIGHT_KICKS = -1, 0, 1
-"""Values of `kick`."""
-
 
 @dataclass(frozen=True)
 class WalkStyle:
@@ -88,22 +85,22 @@ class WalkEngine:
     planner: StepPlanner
     style: WalkStyle
 
-    def advance(
-        self, gait: Gait, command: Floats, ticks: int, kick: NDArray[np.intp] | None = None
-    ) -> Targets:
+    def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools | None = None) -> Targets:
         """Walk on for `ticks` of 12 ms, changing `gait` in place.
 
         Args:
             gait: where the robots are in their steps.
             command: velocities, m/s forward, m/s to the left, rad/s, (B, 3).
             ticks: how many.
-            kick: which foot is to kick when it swings next, (B,), by default none.
+            kick: which feet, left and right, are to kick when they swing next, (B, 2), by default none. Who
+                is to kick does not stand still.
         """
         feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
+        steps_on = None if kick is None else np.asarray(kick.any(axis=1))
         for _ in range(ticks):
-            begins = self.planner.advance(gait, command, TICK_S)
+            begins = self.planner.advance(gait, command, TICK_S, steps_on)
             if kick is not None:
-                kicks = np.where(gait.left_swings, kick == LEFT_KICKS, kick == RIGHT_KICKS)
+                kicks = np.where(gait.left_swings, kick[:, 0], kick[:, 1])
                 gait.kicking = np.where(begins, kicks & (gait.kind == STRIDE), gait.kicking)
             feet.append(self.feet(gait))
             supports.append(gait.walking[:, None] & np.stack([~gait.left_swings, gait.left_swings], axis=1))

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from astra_data.ball import ROLLING_M_S2, knock, roll
+from astra_data.ball import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
 from astra_data.mazes import Maze
 from astra_data.planar import VariedStates
 from astra_data.variation import BallVariation, Variation, planar_command
@@ -17,7 +17,7 @@ class VariedBallAgent(VariedStates):
     """
 
     state_size = 8
-    action_size = 2
+    action_size = 3
 
     def __init__(
         self,
@@ -30,6 +30,8 @@ class VariedBallAgent(VariedStates):
         speed_m_s: float,
         reach_m: float,
         knock_m_s: float,
+        kick_reach_m: float,
+        kick_m_s: float,
         device: str = "cpu",
     ) -> None:
         """Build B of them, as `BallAgent` does; ranges that `variation` does not have are plain."""
@@ -37,13 +39,15 @@ class VariedBallAgent(VariedStates):
         super().__init__(maze, num_envs, self.state_size, ranges, radius_m=radius_m, device=device)
         self.timestep_s, self.speed_m_s = timestep_s, speed_m_s
         self.reach_m, self.knock_m_s = reach_m, knock_m_s
+        self.kick_reach_m, self.kick_m_s = kick_reach_m, kick_m_s
 
     def step(self, action: Tensor) -> Tensor:
-        """Apply commands `action` (B, 2); return what is shown of the new state (B, 8)."""
+        """Apply commands `action` (B, 3); return what is shown of the new state (B, 8)."""
         of = self.variation.by_name(self.parameters)
         period = self.timestep_s * of["timestep_scale"]
         position, _, ball, rolling = self.true_state.split(2, dim=-1)
-        way = planar_command(of, action) * self.speed_m_s * period.unsqueeze(-1)
+        kicks, turn = asks_to_kick(action), torch.deg2rad(of["contact_direction_deg"])
+        way = ~kicks * planar_command(of, action[:, :2]) * self.speed_m_s * period.unsqueeze(-1)
         moved, self.blocked = self.free.slide(position, position + way)
         ball, rolling = knock(
             position,
@@ -52,7 +56,16 @@ class VariedBallAgent(VariedStates):
             rolling,
             reach_m=self.reach_m,
             speed_m_s=self.knock_m_s,
-            turn_rad=torch.deg2rad(of["contact_direction_deg"]),
+            turn_rad=turn,
+        )
+        rolling = kick_away(
+            moved,
+            ball,
+            rolling,
+            kicks,
+            reach_m=self.kick_reach_m,
+            speed_m_s=self.kick_m_s,
+            turn_rad=turn,
         )
         ball, rolling = roll(ball, rolling, period, ROLLING_M_S2 * of["ball_friction"])
         velocity = (moved - position) / period.unsqueeze(-1)

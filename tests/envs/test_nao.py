@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.envs.nao import NaoEnv
+from astra_data.envs.nao import Floats, NaoEnv
 from astra_data.errors import BadInputError
 from astra_data.nao.perception import NO_ERRORS
 from astra_data.tasks import TASKS
@@ -53,7 +53,7 @@ def test_robots_with_a_ball_keep_facing_it() -> None:
     one = env("nao-kick", 8, errors=NO_ERRORS)
     away = torch.nn.functional.normalize(one.truth[:, :2] - one.truth[:, 4:6])
     for _ in range(40):
-        one.step(0.5 * away)
+        one.step(torch.nn.functional.pad(0.5 * away, (0, 1)))
     apart = one.robots.ball - one.robots.pose[:, :2]
     assert np.linalg.norm(apart, axis=1).min() > 0.5
     bearing = np.arctan2(apart[:, 1], apart[:, 0]) - one.robots.pose[:, 2]
@@ -66,9 +66,13 @@ def test_robots_turn_to_their_ball_before_they_walk() -> None:
     one.robots.reset(np.arange(4), place, np.random.default_rng(0))
     one.localisation.reset(np.arange(4), place, np.random.default_rng(0))
     one.sight.reset(np.arange(4), np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    command = one._body_command(torch.tensor([[1.0, 0.0]]).expand(4, 2))
+    ahead = torch.tensor([[1.0, 0.0]]).expand(4, 2)
+    command = one._body_command(ahead, np.zeros(4, dtype=bool))
     np.testing.assert_allclose(command[:, 0] / command[0, 0], [1.0, 0.5, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(np.sign(command[:, 2]), [0.0, 1.0, 1.0, -1.0])
+    kicking = one._body_command(0 * ahead, np.ones(4, dtype=bool))
+    assert (kicking[:, :2] == 0).all()
+    np.testing.assert_array_equal(kicking[:, 2], command[:, 2])
 
 
 def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
@@ -81,11 +85,31 @@ def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
     one.sight.errors = replace(NO_ERRORS, ball_seen_rad=np.pi / 2)
     heading = []
     for _ in range(40):
-        one.step(torch.zeros(2, 2))
+        one.step(torch.zeros(2, 3))
         heading.append(one.robots.pose[:, 2])
     assert np.abs(heading)[:, 0].max() > np.pi / 2
     assert np.abs(heading)[:, 1].max() < 0.2
     np.testing.assert_allclose(one.sight.position, ball, atol=0.1)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_kick_reaches_a_foot_far_and_moves_no_robot(level: str) -> None:
+    one = env("nao-kick", 8, level, errors=NO_ERRORS)
+    place, angle = np.zeros((8, 3)), np.linspace(-np.pi, np.pi, 8)
+    place[:, 2] = angle
+    distance = np.array([0.17, 0.3] * 4)[:, None]
+    ball = distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    one.robots.reset(np.arange(8), place, np.random.default_rng(0), ball)
+    one.localisation.reset(np.arange(8), place, np.random.default_rng(0))
+    one.sight.reset(np.arange(8), ball)
+    fastest: Floats = np.zeros(8)
+    for _ in range(10):
+        one.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(8, 3))
+        fastest = np.maximum(fastest, np.linalg.norm(one.robots.ball_velocity, axis=1))
+    assert fastest[::2].min() > 0.35
+    assert fastest[1::2].max() == pytest.approx(0.0, abs=0.02)
+    assert np.abs(one.robots.pose[:, :2]).max() < 0.1
+    assert not one.robots.fallen.any()
 
 
 def test_touching_a_wall_fails() -> None:
@@ -110,7 +134,7 @@ def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
     ended = torch.zeros(2, dtype=torch.bool)
     success = ended.clone()
     for _ in range(40):
-        step = one.step(torch.tensor([[1.0, 0.0]]).expand(2, 2), ~ended)
+        step = one.step(torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), ~ended)
         success |= step.success & ~ended
         ended |= step.terminated
     assert ended.all()
@@ -120,7 +144,7 @@ def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed(level: str) -> None:
     one, other = (env("nao-kick", 2, level) for _ in range(2))
-    action = torch.tensor([[0.7, 0.2], [-0.5, 0.9]])
+    action = torch.tensor([[0.7, 0.2, 0.0], [-0.5, 0.9, 1.0]])
     for _ in range(3):
         assert torch.equal(one.step(action).observation, other.step(action).observation)
     fresh = env("nao-kick", 2, level)
@@ -133,7 +157,7 @@ def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed(level: str
 def test_robots_can_be_stood_where_a_state_believes_them(level: str) -> None:
     one = env("nao-kick", 2, level)
     state = one.state.double().numpy()
-    one.step(torch.ones(2, 2))
+    one.step(torch.ones(2, 3))
     one.reset_to(np.arange(2), state)
     np.testing.assert_allclose(one.robots.pose[:, :2], state[:, :2], atol=1e-6)
     np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), state[:, 2], atol=1e-6)

@@ -154,6 +154,14 @@ def test_a_kick_sends_the_ball_ahead() -> None:
     assert (speeds[True] > speeds[False] + 0.3).all()
 
 
+def test_a_ball_dead_ahead_is_kicked_too() -> None:
+    nao = BatchedNao(1, seed=0, ball=True, variation=IDENTICAL, num_threads=1)
+    nao.reset(np.arange(1), np.zeros((1, 3)), np.random.default_rng(0), np.array([[0.17, 0.0]]))
+    for _ in range(8):
+        nao.step(np.zeros((1, 3)), kick=np.array([True]))
+    assert nao.ball[0, 0] > 0.4
+
+
 def test_bad_input_is_told() -> None:
     nao = BatchedNao(2, seed=0, num_threads=1)
     with pytest.raises(BadInputError, match=r"shape \(2, 3\); got \(3, 3\)"):

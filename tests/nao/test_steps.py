@@ -97,6 +97,15 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
     assert (gait.after == 0).all()
 
 
+def test_robots_that_are_called_to_step_on_the_spot_do() -> None:
+    gait = Gait.standing(2, LIMITS)
+    for _ in range(round(2.0 / TICK_S)):
+        StepPlanner(np.ones(2)).advance(gait, np.zeros((2, 3)), TICK_S, np.array([True, False]))
+    assert gait.walking.tolist() == [True, False]
+    assert gait.kind[0] == STRIDE
+    assert (gait.velocity() == 0).all()
+
+
 def test_robots_do_not_disturb_each_other() -> None:
     rng = np.random.default_rng(0)
     commands = rng.uniform(-1, 1, (100, 5, 3)) * [0.25, 0.2, 2.0]

@@ -7,7 +7,7 @@ from astra_data.nao.robot import CONTROL_STEP_S
 from astra_data.nao.surrogate import BODY_RADIUS_M, SurrogateNao, SurrogateVariation
 
 EXACT = SurrogateVariation(
-    (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0), 0.0, 0.0, 0.0, 0.0, 0.0, (1.0, 1.0), 0.0
+    (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0), 0.0, 0.0, 0.0, 0.0, 0.0, (1.0, 1.0), (1.0, 1.0), 0.0
 )
 
 
@@ -55,6 +55,18 @@ def test_walls_stop_robots_and_are_told() -> None:
     assert not touched[0]
     assert touched[-1]
     assert robots.pose[0, 1] - start[0, 1] == pytest.approx(0.5 - BODY_RADIUS_M, abs=0.051)
+
+
+def test_a_ball_within_reach_is_kicked_and_others_are_not() -> None:
+    robots = SurrogateNao(3, seed=0, ball=True, variation=EXACT)
+    robots.reset(
+        np.arange(3),
+        np.zeros((3, 3)),
+        np.random.default_rng(0),
+        np.array([[0.2, 0.0], [0.2, 0.0], [0.3, 0.0]]),
+    )
+    robots.step(np.zeros((3, 3)), kick=np.array([True, False, True]))
+    assert robots.ball_velocity[:, 0] == pytest.approx([1.0 - 0.3 * CONTROL_STEP_S, 0.0, 0.0])
 
 
 def test_a_ball_that_is_walked_into_rolls_away() -> None:
