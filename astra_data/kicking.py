@@ -39,7 +39,7 @@ class Kicking(PlanarObjective):
     goal_half_width_m: float = 0.75
     side_line_m: float = 2.0
     back_line_m: float = -2.0
-    ball_x_m: tuple[float, float] = (0.0, 0.5)
+    ball_x_m: tuple[float, float] = (-0.5, 0.0)
     ball_y_m: tuple[float, float] = (-0.6, 0.6)
     distance_m: tuple[float, float] = (0.4, 1.0)
     behind_m: float = 0.2

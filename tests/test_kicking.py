@@ -19,8 +19,8 @@ def test_starts_are_where_the_task_says() -> None:
     assert starts.shape == (4000, 8)
     assert (starts[:, 2:4] == 0).all()
     assert (starts[:, 6:] == 0).all()
-    assert ball.min(axis=0) == pytest.approx([0.0, -0.6], abs=0.01)
-    assert ball.max(axis=0) == pytest.approx([0.5, 0.6], abs=0.01)
+    assert ball.min(axis=0) == pytest.approx([-0.5, -0.6], abs=0.01)
+    assert ball.max(axis=0) == pytest.approx([0.0, 0.6], abs=0.01)
     assert (np.abs(robot) <= 1.9).all()
     apart = np.linalg.norm(robot - ball, axis=1)
     assert apart.min() >= 0.4 - 1e-9

@@ -91,7 +91,7 @@ def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target
 
     Args:
         time_s: at the end of each step, (T,).
-        command: the velocities commanded in m/s, (T, 2).
+        command: the velocities commanded, ±1 per axis, (T, 2).
         simulated: x, y, vx, vy in m and m/s, (T, 4).
         target: the same for each repetition in the target, (N, T, 4); NaN after an episode's end.
     """
@@ -112,7 +112,7 @@ def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target
             axes.set_ylabel(label)
         for part, dashes in ((0, "-"), (1, ":")):
             grid[1, 1].step(time_s, command[:, part], dashes, where="pre", color=INK, lw=1.2)
-        grid[1, 1].set_ylabel("command (m/s)")
+        grid[1, 1].set_ylabel("command")
         figure.align_ylabels(grid)
         for axes in grid[1]:
             axes.set_xlabel("time (s)")
