@@ -46,8 +46,8 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
 class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
-    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for the
-    step that reaches the goal: this simulator decides that by itself, so the task's own reward is paid;
+    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for steps
+    that reach the goal or miss it: this simulator decides that by itself, so the task's own reward is paid;
     "blend", the task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the
     topple head and ends the episode; so does touching a wall, where the task says so. All randomness comes
     from torch's global generator.
@@ -158,7 +158,8 @@ class SimulatorWorld:
         latent = None if self.grounded is None else self.grounded.latent
         after = self.simulator.step(action)
         success = self.objective.reached(after, self.goal)
-        self.failed = self.objective.missed(after, self.goal)
+        missed = self.objective.missed(after, self.goal)
+        self.failed = missed
         if self._ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
         penalty = torch.zeros(self.num_envs, device=self.device)
@@ -177,7 +178,7 @@ class SimulatorWorld:
         if self.reward == "predicted" and self.grounded is not None and latent is not None:
             with torch.no_grad():
                 predicted = self.grounded.model.predict_reward(latent, action)
-            reward = torch.where(success, reward, predicted)
+            reward = torch.where(success | missed, reward, predicted)
         return Step(
             observation=self._observe(),
             reward=reward + self.caution * penalty,

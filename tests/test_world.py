@@ -7,6 +7,7 @@ from astra_data.navigation import Navigation
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.varied_point_mass import VariedPointMass
+from astra_data.tasks import TASKS
 from astra_data.variation import PlanarVariation
 from astra_data.world import DataStarts, SimulatorWorld, policy_observation
 
@@ -136,6 +137,28 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
     assert (risk > 0).all()
     torch.testing.assert_close(rewards[1] - rewards[0], -10.0 * risk)
     torch.testing.assert_close(rewards[2] - rewards[0], -30.0 * risk)
+
+
+def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() -> None:
+    torch.manual_seed(0)
+    task = TASKS["nao-kick"]
+    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, position_octaves=0, ball_index=4))
+    one = SimulatorWorld(task.objective, GroundedSimulator(task.simulator(3), model), reward="predicted")
+    # Balls that roll on in the field, into the goal, and over the side line.
+    balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
+    state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
+    goal = torch.tensor([[1.5, 0.0]]).expand(3, 2)
+    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+    latent = one.simulator.latent  # type: ignore[union-attr]
+    action = torch.zeros(3, 3)
+    step = one.step(action)
+    own = task.objective.reward(state, one.simulator.state, goal, torch.tensor([False, False, True]))
+    predicted = model.predict_reward(latent, action).detach()
+    assert step.terminated.tolist() == [False, True, True]
+    torch.testing.assert_close(step.reward, torch.cat([predicted[:1], own[1:]]))
+    assert float(own[1]) > 9.0
+    assert float(own[2]) < -9.0
+    assert float(predicted[0]) != pytest.approx(float(own[0]))
 
 
 def test_commands_are_clipped_and_shortened() -> None:
