@@ -93,7 +93,7 @@ _COMMAND_ROLES: Roles = (
     ["vector"] * 2,
     [""] * 2,
 )
-_KICK_ROLES: Roles = (("kick",), ["1"], ["body"], ["invariant"], [""])
+_KICK_ROLES: Roles = (("kick",), ["1"], ["body"], ["invariant"], ["kick"])
 _PLANAR_ROLES: Roles = (
     ("x", "y", "vx", "vy"),
     ["m"] * 2 + ["m/s"] * 2,
@@ -108,7 +108,7 @@ def _columns(*, ball: bool) -> tuple[Column, ...]:
     told = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
     goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
     command_roles = _with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES
-    command = roles(*command_roles[:4])
+    command = roles(*command_roles)
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
     wish = ", and above 0.5 to stand and kick" if ball else ""
     return (
