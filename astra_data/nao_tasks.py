@@ -107,8 +107,7 @@ def _columns(*, ball: bool) -> tuple[Column, ...]:
     size = STATE_SIZE + BALL_SIZE * ball
     told = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
     goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
-    command_roles = _with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES
-    command = roles(*command_roles)
+    command = roles(*(_with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES[:4]))
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
     wish = ", and above 0.5 to stand and kick" if ball else ""
     return (
