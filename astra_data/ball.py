@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from astra_data.errors import BadInputError
 from astra_data.geometry import turned
 
 ROLLING_M_S2 = 0.30
@@ -14,7 +15,16 @@ _KICKS_ABOVE = 0.5
 
 
 def asks_to_kick(command: Tensor) -> Tensor:
-    """Tell which commands (B, 3), planar velocity and a wish, ask for a kick: (B, 1) bool."""
+    """Tell which commands (B, 3), planar velocity and a wish, ask for a kick: (B, 1) bool.
+
+    Raises:
+        BadInputError: the commands say nothing of kicks, as before there was such a wish.
+    """
+    if command.shape[-1] != 3:
+        raise BadInputError(
+            f"expected commands of 3 values, a planar velocity and whether to kick, got {command.shape[-1]}: "
+            "collect the episodes and train the policies of this task anew"
+        )
     return command[:, 2:] > _KICKS_ABOVE
 
 

@@ -37,7 +37,7 @@ class WallWatch:
         self._task, self._maze = task, task.maze
 
     def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the least clearance in m (B, K) on the ways of `commands` (B, K, 2) from `state` (B, S)."""
+        """Return the least clearance in m (B, K) on the ways of `commands` (B, K, A) from `state` (B, S)."""
         task, (count, choices, _) = self._task, commands.shape
         simulator = task.simulator(count * choices)
         simulator.reset_to(task.abstraction(state).repeat_interleave(choices, dim=0))

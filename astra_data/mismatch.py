@@ -18,8 +18,8 @@ class CommandReplay:
     """What T steps of the same commands do in both worlds.
 
     Attributes:
-        time_s: (T,). command: velocities, ±1 per axis, (T, 2). simulated: abstract states after each step,
-            (T, X). target: the same of N robots that start with random headings, (N, T, X).
+        time_s: (T,). command: ±1 per axis, (T, 2). simulated: [x, y, vx, vy] after each step, (T, 4).
+        target: the same of N robots that start with random headings, (N, T, 4).
     """
 
     time_s: NDArray[np.float64]
@@ -33,9 +33,6 @@ def replay_commands(task: Task) -> CommandReplay:
     command = np.concatenate(
         [np.tile(velocity, (round(seconds * task.fps), 1)) for velocity, seconds in _COMMANDS]
     )
-    # What follows the velocity in an action is not asked for.
-    action = torch.zeros(len(command), task.objective.action_size)
-    action[:, :2] = torch.from_numpy(command)
     robots = task.target(_ROBOTS, seed=0)
     robots.reset()
     states = robots.state.double().numpy()
@@ -44,9 +41,9 @@ def replay_commands(task: Task) -> CommandReplay:
     simulator = task.simulator(1)
     simulator.reset_to(task.abstraction(robots.state[:1]))
     simulated, target = [], []
-    for row in action:
-        simulated.append(simulator.step(row[None])[0])
-        robots.step(row.expand(_ROBOTS, -1))
+    for velocity in torch.from_numpy(command).float():
+        simulated.append(simulator.step(velocity.expand(1, 2))[0])
+        robots.step(velocity.expand(_ROBOTS, 2))
         target.append(task.abstraction(robots.state))
     return CommandReplay(
         time_s=np.arange(1, len(command) + 1, dtype=np.float64) * task.timestep_s,

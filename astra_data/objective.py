@@ -94,7 +94,7 @@ class PlanarObjective(Objective):
         """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
-        """Shorten the velocities in m/s that actions (..., A) begin with, ±1 per axis, to at most `limit`."""
+        """Shorten the velocities that actions (..., A) begin with, ±1 per axis, to at most `limit`."""
         command, rest = super().limit_command(action, limit).tensor_split([2], dim=-1)
         speed = command.norm(dim=-1, keepdim=True)
         shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)

@@ -135,7 +135,7 @@ class BallVariation(PlanarVariation):
     ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)
     """Half width of the uniform noise on shown velocities of the ball."""
     contact_direction_deg: Range = (0.0, 0.0)
-    """The ball leaves a contact turned by this angle."""
+    """The ball leaves a contact or a kick turned by this angle."""
 
 
 class JointVariation(Variation):

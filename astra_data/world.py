@@ -47,10 +47,10 @@ class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for steps
-    that reach the goal or miss it: this simulator decides that by itself, so the task's own reward is paid;
-    "blend", the task's own plus the predicted risk of toppling. With `topple`, toppling is drawn from the
-    topple head and ends the episode; so does touching a wall, where the task says so. All randomness comes
-    from torch's global generator.
+    after which the task itself sees the goal reached, or out of reach (a ball beside it, a fallen body):
+    these pay the task's own reward, while what walls cost is left to R_pred; "blend", the task's own plus the
+    predicted risk of toppling. With `topple`, toppling is drawn from the topple head and ends the episode; so
+    does touching a wall, where the task says so. All randomness comes from torch's global generator.
 
     Attributes:
         latent_size: Z, of the latents in the observations; 0 where there are none.

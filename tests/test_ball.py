@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from astra_data.ball import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
+from astra_data.errors import BadInputError
 
 
 def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
@@ -60,3 +61,8 @@ def test_a_kick_sends_balls_within_reach_straight_away() -> None:
         bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0, turn_rad=torch.full((4,), torch.pi / 2)
     )
     torch.testing.assert_close(turned[[0, 3]], torch.tensor([[-1.6, 1.2], [0.0, -2.0]]))
+
+
+def test_commands_without_a_wish_to_kick_are_refused() -> None:
+    with pytest.raises(BadInputError, match=r"expected commands of 3 values, .*, got 2: collect"):
+        asks_to_kick(torch.zeros(4, 2))

@@ -203,7 +203,7 @@ def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:
     figure = dynamics_mismatch(time_s, np.zeros((5, 2)), simulated, target)
     x, y, speed, command = figure.axes
     labels = [axes.get_ylabel() for axes in (x, y, speed, command)]
-    assert labels == ["x (m)", "y (m)", "speed (m/s)", "command"]
+    assert labels == ["x (m)", "y (m)", "speed (m/s)", "command (±1 per axis)"]
     for axes in (x, y, speed):
         assert len(axes.collections) == 2
         assert len(axes.lines) == 2

@@ -4,15 +4,14 @@ from astra_data.mismatch import replay_commands
 from astra_data.tasks import TASKS
 
 
-@pytest.mark.parametrize("name", ["nao-navigation-surrogate", "nao-kick-surrogate"])
-def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place(name: str) -> None:
-    task = TASKS[name]
+def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -> None:
+    task = TASKS["nao-navigation-surrogate"]
     replay = replay_commands(task)
     steps = len(replay.time_s)
     assert replay.time_s[0] == pytest.approx(task.timestep_s)
     assert replay.command.shape == (steps, 2)
-    assert replay.simulated.shape == (steps, task.abstract_state.size)
-    assert replay.target.shape == (60, steps, task.abstract_state.size)
+    assert replay.simulated.shape == (steps, 4)
+    assert replay.target.shape == (60, steps, 4)
     start = task.maze.cell_centre(*task.maze.start)
     # 0.8 of 0.25 m/s for ten control steps of 0.192 s, and back again in the end.
     way = replay.simulated[:, :2] - replay.simulated[0, :2]

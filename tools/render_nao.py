@@ -24,6 +24,8 @@ SECONDS = 5.4
 SPEED_M_S = 0.2
 BALL_M = 0.7
 """Ahead of the robot at the start."""
+KICK_M = 0.18
+"""How far ahead it is when the robot kicks."""
 UPPER_BODY = (
     ((0.0, -0.02, 0.17), (0.0, 0.02, 0.17), 0.055),
     ((0.0, 0.098, 0.1), (0.02, 0.12, 0.0), 0.025),
@@ -69,8 +71,9 @@ def render(seed: int, width: int) -> list[Image.Image]:
     frames = []
     with mujoco.Renderer(model, 3 * width // 4, width) as renderer:
         for _ in range(round(SECONDS / CONTROL_STEP_S)):
-            _, y, yaw = robots.pose[0]
-            robots.step(np.array([[SPEED_M_S, -y, -2.0 * yaw]]), kick=np.array([True]))
+            x, y, yaw = robots.pose[0]
+            kicks = robots.ball[0, 0] - x < KICK_M
+            robots.step(np.array([[0.0 if kicks else SPEED_M_S, -y, -2.0 * yaw]]), kick=np.array([kicks]))
             data.qpos[:] = robots.bodies.qpos[0]
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)

@@ -42,9 +42,9 @@ BALL_SIZE = 5
 class NaoEnv:
     """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
 
-    Where there is a ball, a third entry above 0.5 asks for a kick: the robot steps on the spot, and swings
-    the foot nearer to the ball. A control step lasts 0.192 s. The robots turn by themselves to where they go,
-    or to their ball. They act
+    Where there is a ball, a third entry above 0.5 asks for a kick, however far the ball is: the robot steps
+    on the spot, and swings forward the foot on the ball's side, or either where it lies straight ahead. A
+    control step lasts 0.192 s. The robots turn by themselves to where they go, or to their ball. They act
     on what they believe, which is also all that their state (B, S) holds; rewards, success and failure go by
     the truth. Success, falling, and what the task counts as failure end an episode.
 
@@ -195,7 +195,7 @@ class NaoEnv:
         heading = self.localisation.pose[:, 2]
         cos, sin = np.cos(heading), np.sin(heading)
         ahead = np.arctan2(y, x)
-        if self.has_ball:
+        if kick is not None:
             apart = self.sight.position - self.localisation.pose[:, :2]
             ahead = np.arctan2(apart[:, 1], apart[:, 0])
         astray = wrapped(ahead - heading)

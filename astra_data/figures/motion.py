@@ -112,7 +112,7 @@ def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target
             axes.set_ylabel(label)
         for part, dashes in ((0, "-"), (1, ":")):
             grid[1, 1].step(time_s, command[:, part], dashes, where="pre", color=INK, lw=1.2)
-        grid[1, 1].set_ylabel("command")
+        grid[1, 1].set_ylabel("command (±1 per axis)")
         figure.align_ylabels(grid)
         for axes in grid[1]:
             axes.set_xlabel("time (s)")

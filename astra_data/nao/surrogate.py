@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from astra_data.ball import BALL_RADIUS_M, ROLLING_M_S2, kick_away, knock, roll
 from astra_data.free_space import FreeSpace
+from astra_data.geometry import wrapped
 from astra_data.mazes import Maze
 from astra_data.nao.robot import CONTROL_STEP_S
 from astra_data.nao.robots import Robots, Senses
@@ -23,6 +24,8 @@ BODY_RADIUS_M = 0.2
 """Of the disc that touches walls."""
 _KICK_REACH_M = 0.22
 """Between the centres of a robot and a ball that it can kick."""
+_KICK_WITHIN_RAD = float(np.radians(45.0))
+"""Largest bearing of such a ball: feet swing forward."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class SurrogateVariation:
     kick_m_s: tuple[float, float] = (0.4, 1.2)
     """Speed of a ball that is kicked."""
     knock_rad: float = float(np.radians(15.0))
-    """Standard deviation of its direction."""
+    """Standard deviation of the direction of both."""
 
 
 @dataclass
@@ -142,7 +145,7 @@ class SurrogateNao(Robots):
         self._steps += 1
         late = varied.delay_steps * robots.sent + (1 - varied.delay_steps) * command
         gait = Gait(**{name: value.copy() for name, value in vars(self.gait).items()})
-        StepPlanner(robots.quality, self._limits).advance(gait, late, CONTROL_STEP_S)
+        StepPlanner(robots.quality, self._limits).advance(gait, late, CONTROL_STEP_S, kick)
         shape = (self.num_robots, 3)
         share = np.sqrt(CONTROL_STEP_S / self._limits.step_s)
         scatter = np.array([varied.scatter_m, varied.scatter_m, varied.scatter_rad]) * share
@@ -180,7 +183,9 @@ class SurrogateNao(Robots):
         )
         ball, rolling = knock(*tensors, reach_m=0.14 + BALL_RADIUS_M, speed_m_s=knocked, turn_rad=turn)
         if kicks is not None:
-            asked = torch.from_numpy(kicks).unsqueeze(-1)
+            apart = robots.ball - after
+            bearing = wrapped(np.arctan2(apart[:, 1], apart[:, 0]) - robots.pose[:, 2])
+            asked = torch.from_numpy(kicks & (np.abs(bearing) <= _KICK_WITHIN_RAD)).unsqueeze(-1)
             rolling = kick_away(
                 tensors[1], ball, rolling, asked, reach_m=_KICK_REACH_M, speed_m_s=kicked, turn_rad=turn
             )

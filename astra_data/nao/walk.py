@@ -96,12 +96,13 @@ class WalkEngine:
                 is to kick does not stand still.
         """
         feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
-        steps_on = None if kick is None else np.asarray(kick.any(axis=1))
+        if kick is None:
+            kick = np.zeros((len(command), 2), dtype=bool)
+        steps_on = np.asarray(kick.any(axis=1))
         for _ in range(ticks):
             begins = self.planner.advance(gait, command, TICK_S, steps_on)
-            if kick is not None:
-                kicks = np.where(gait.left_swings, kick[:, 0], kick[:, 1])
-                gait.kicking = np.where(begins, kicks & (gait.kind == STRIDE), gait.kicking)
+            kicks = np.where(gait.left_swings, kick[:, 0], kick[:, 1])
+            gait.kicking = np.where(begins, kicks & (gait.kind == STRIDE), gait.kicking)
             feet.append(self.feet(gait))
             supports.append(gait.walking[:, None] & np.stack([~gait.left_swings, gait.left_swings], axis=1))
             lifts_off.append((begins & (gait.kind == STRIDE)) * np.where(gait.left_swings, 1, -1))

@@ -8,7 +8,8 @@ from astra_data.mazes import Maze
 from astra_data.planar import PlanarStates
 
 _LIES_M_S = 0.15
-"""Balls that are slower lie still: they would roll 4 cm, and a robot's estimate is never quite zero."""
+"""Corrected balls that a step leaves slower lie where they lay before it: they would roll on for 4 cm, and a
+robot's estimate is never quite zero."""
 
 
 class BallAgent(PlanarStates):

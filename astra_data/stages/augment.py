@@ -193,6 +193,8 @@ def _check(source: Dataset, world: Task, config: AugmentConfig) -> None:
         faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")
+    if world.ball_index is not None:
+        faults.append("it has a ball: what becomes of a moved episode is judged by the robot's place alone")
     if config.reflections and not world.planar.is_mirrorable:
         faults.append("its controller does not act in mirror images: leave out --reflections")
     change = PlanarMap(reflected=config.reflections)

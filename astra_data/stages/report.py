@@ -145,7 +145,8 @@ def report(
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
         )
-        if task.plane is not None:
+        # Robots with a ball turn to it, wherever it lies.
+        if task.plane is not None and task.ball_index is None:
             replay = replay_commands(task)
             figures["mismatch"] = dynamics_mismatch(
                 replay.time_s, replay.command, replay.simulated, replay.target

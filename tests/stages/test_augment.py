@@ -27,6 +27,7 @@ from astra_data.errors import BadInputError
 from astra_data.navigation import Navigation
 from astra_data.progress import silent
 from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.tasks import TASKS
 
@@ -270,6 +271,16 @@ def test_datasets_that_do_not_fit_are_refused(
     ):
         with pytest.raises(BadInputError, match=told):
             augment(task, CONFIG, dataset=dataset, seed=0, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "out").exists()
+
+
+def test_episodes_with_a_ball_are_refused(tmp_path: Path) -> None:
+    kicking = tmp_path / "kicking"
+    collect(
+        "nao-kick-surrogate", CollectConfig(episodes=2, max_steps=4), seed=0, out=kicking, progress=silent
+    )
+    with pytest.raises(BadInputError, match="it has a ball"):
+        augment(None, CONFIG, dataset=kicking, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()
 
 

@@ -150,10 +150,16 @@ def test_page_holds_the_table_and_only_figures_that_exist(folder: Path) -> None:
     assert {name for name in FIGURES if f"]({name}.png)" in page} == FIGURES
 
 
-def test_without_a_maze_there_is_nothing_to_draw_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(plane=None)})
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [({"plane": None}, {"trajectories", "mismatch"}), ({"ball_index": 4}, {"mismatch"})],
+)
+def test_without_a_maze_or_with_a_ball_some_figures_make_no_sense(
+    root: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], missing: set[str]
+) -> None:
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(**changes)})
     make(root)
-    assert images(root / "report") == FIGURES - {"trajectories", "mismatch"}
+    assert images(root / "report") == FIGURES - missing
 
 
 def test_of_lasting_tasks_the_page_tells_survived_steps_and_return(
