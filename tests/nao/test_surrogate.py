@@ -58,15 +58,15 @@ def test_walls_stop_robots_and_are_told() -> None:
 
 
 def test_a_ball_within_reach_is_kicked_and_others_are_not() -> None:
-    robots = SurrogateNao(3, seed=0, ball=True, variation=EXACT)
-    robots.reset(
-        np.arange(3),
-        np.zeros((3, 3)),
-        np.random.default_rng(0),
-        np.array([[0.2, 0.0], [0.2, 0.0], [0.3, 0.0]]),
-    )
-    robots.step(np.zeros((3, 3)), kick=np.array([True, False, True]))
-    assert robots.ball_velocity[:, 0] == pytest.approx([1.0 - 0.3 * CONTROL_STEP_S, 0.0, 0.0])
+    balls = np.array([[0.2, 0.0], [0.2, 0.0], [0.3, 0.0], [-0.2, 0.0], [0.0, 0.2]])
+    robots = SurrogateNao(5, seed=0, ball=True, variation=EXACT)
+    robots.reset(np.arange(5), np.zeros((5, 3)), np.random.default_rng(0), balls)
+    robots.step(np.zeros((5, 3)), kick=np.array([True, False, True, True, True]))
+    # Kicked; not asked to; too far; behind; beside.
+    speed = np.linalg.norm(robots.ball_velocity, axis=1)
+    assert speed == pytest.approx([1.0 - 0.3 * CONTROL_STEP_S, 0.0, 0.0, 0.0, 0.0])
+    assert robots.ball_velocity[0, 0] == pytest.approx(speed[0])
+    assert robots.gait.walking.tolist() == [True, False, True, True, True]
 
 
 def test_a_ball_that_is_walked_into_rolls_away() -> None:
