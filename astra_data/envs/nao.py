@@ -184,7 +184,7 @@ class NaoEnv:
             success=success,
         )
 
-    def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None = None) -> Floats:
+    def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
         """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3), as believed.
 
         Robots turn to where they go. With a ball they turn to it, and walk the slower the farther it is
