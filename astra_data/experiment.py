@@ -22,7 +22,7 @@ from astra_data.recipe import did_you_mean, load_tables, validated
 from astra_data.request import DERIVED, METHOD_TABLES, STAGES, WHOLE, Recipe
 from astra_data.results.files import read_published
 from astra_data.results.sizes import by_size
-from astra_data.rows import base_method
+from astra_data.rows import base_method, is_plus
 from astra_data.tasks import TASKS
 
 ALWAYS_NEW = {"report"}
@@ -31,6 +31,8 @@ ALWAYS_NEW = {"report"}
 
 _SIMULATOR = "simulator"
 """What differs between two tasks that have the same target."""
+_ROWS_TABLES = METHOD_TABLES.keys() | {"plus"}
+"""Tables of a recipe that only some rows read."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +110,14 @@ class Experiment:
         if not record.is_file():
             return
         changed = _differences(json.loads(record.read_text()), self.recipe)
-        whole = _stale_stages(changed - METHOD_TABLES.keys())
+        whole = _stale_stages(changed - _ROWS_TABLES)
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
         own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
         present = [str(self.folder / stage) for stage in STAGES if stage in whole & own]
-        for table in sorted(changed & METHOD_TABLES.keys()):
-            for stage in sorted((_stale_stages({table}) - whole) & own):
-                present += map(str, self._rows_of(table, stage))
+        for table in sorted(changed & _ROWS_TABLES):
+            reached = (_stale_stages({table}) - whole) & own
+            for stage in STAGES:
+                present += map(str, self._rows_of(table, stage)) if stage in reached else ()
         if present:
             raise RecipeError(
                 f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
@@ -142,7 +145,7 @@ class Experiment:
         for percent, found in by_size(read_published(self.published_in)).items():
             changed = _differences(found.settings, self.recipe) - ALWAYS_NEW
             changed -= {
-                table for table in METHOD_TABLES if not any(_reads(row, table) for row in found.methods)
+                table for table in _ROWS_TABLES if not any(_reads(row, table) for row in found.methods)
             }
             if changed:
                 raise RecipeError(
@@ -184,6 +187,8 @@ def load_experiment(path: Path, root: Path) -> Experiment:
 
 def _reads(row: str, table: str) -> bool:
     """Tell whether a row, or the one whose policy it goes on from, has its settings from `table`."""
+    if table == "plus":
+        return is_plus(row)
     base = base_method(row)
     method = METHODS.get(base)
     if method is None:

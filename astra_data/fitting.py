@@ -14,7 +14,7 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind, Windows
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, Number, Positive, Share
+from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
@@ -44,9 +44,17 @@ class GroundConfig(Config):
     position_octaves: Number = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
     where a task has no positions."""
+    wall_range_m: NotNegative = 0.0
+    """The networks are told how near the nearest wall is and where, from so far before it on; 0: not. Without
+    effect where a task has no maze."""
     correction_heads: Count = 1
     """Heads that correct the state, each of which learns from windows of its own; their mean corrects, and
     `doubt_penalty` keeps policies from where they disagree."""
+    reward_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the latent that R_pred does not see while it learns, so that it learns no failure by heart."""
+    failure_weight: Positive = 1.0
+    """Of the failures in the loss of the reward. With 1, predicting their average costs as much as predicting
+    that of the rest does."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes on which nothing is fitted but the residual's scatter, unless the dataset sets
     some aside itself."""
@@ -91,6 +99,7 @@ class HistoryFit:
         config, training = fitting.config, fitting.training
         torch.manual_seed(derive(fitting.seed, "grounding"))
         windows = training.windows
+        sees_walls = fitting.task.plane is not None and config.wall_range_m > 0
         model = GroundingModel(
             GroundingShape(
                 state_size=windows.state.shape[-1],
@@ -98,11 +107,15 @@ class HistoryFit:
                 goal_size=windows.goal.shape[-1],
                 latent_size=config.latent_size,
                 position_octaves=config.position_octaves if fitting.task.plane else 0,
+                wall_grid=fitting.task.maze.fine_shape if sees_walls else None,
                 ball_index=fitting.task.ball_index,
                 correction_heads=config.correction_heads,
+                reward_dropout=config.reward_dropout,
             ),
             config.target,
         ).to(fitting.device)
+        if sees_walls:
+            model.position_features.set_walls(fitting.task.maze, config.wall_range_m)
         model.set_scales(
             {
                 "state": training.steps(windows.state),
@@ -110,7 +123,7 @@ class HistoryFit:
                 "correction": training.steps(windows.next_state - windows.simulated_next),
             }
         )
-        model.set_reward_scales(training.steps(windows.reward))
+        model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
         metrics = _optimise(model, self.weights, fitting)
         _fit_residual(model, fitting.held_out)
         return model, metrics

@@ -47,9 +47,9 @@ class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for steps
-    after which the task itself sees the goal reached, or out of reach (a ball beside it, a fallen body):
-    these pay the task's own reward, while what walls cost is left to R_pred; "blend", the task's own plus the
-    predicted risk of toppling. With `topple`, toppling is drawn from the topple head and ends the episode; so
+    in which the task itself sees the episode decided (goal reached, a ball beside it, a fallen body, a wall
+    that must not be touched): these pay the task's own reward; "blend", the task's own plus the predicted
+    risk of toppling. With `topple`, toppling is drawn from the topple head and ends the episode; so
     does touching a wall, where the task says so. All randomness comes from torch's global generator.
 
     Attributes:
@@ -158,10 +158,10 @@ class SimulatorWorld:
         latent = None if self.grounded is None else self.grounded.latent
         after = self.simulator.step(action)
         success = self.objective.reached(after, self.goal)
-        missed = self.objective.missed(after, self.goal)
-        self.failed = missed
+        self.failed = self.objective.missed(after, self.goal)
         if self._ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
+        decided = success | self.failed
         penalty = torch.zeros(self.num_envs, device=self.device)
         if self.thinness is not None and self.free is not None:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
@@ -178,7 +178,7 @@ class SimulatorWorld:
         if self.reward == "predicted" and self.grounded is not None and latent is not None:
             with torch.no_grad():
                 predicted = self.grounded.model.predict_reward(latent, action)
-            reward = torch.where(success | missed, reward, predicted)
+            reward = torch.where(decided, reward, predicted)
         return Step(
             observation=self._observe(),
             reward=reward + self.caution * penalty,

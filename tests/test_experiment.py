@@ -43,6 +43,23 @@ def attempts(folder: Path) -> int:
     return sum(len(path.read_text()) for path in folder.rglob("attempts"))
 
 
+def test_what_only_some_rows_read_leaves_the_others_alone(base: Path, tmp_path: Path) -> None:
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(BASE + "[plus]\nrate = 2.0\n")
+    with pytest.raises(RecipeError) as caught:
+        run(base, root=tmp_path)
+    rows = [folder / stage / "astra_plus" for stage in ("train", "evaluate")]
+    assert str(caught.value) == (
+        f"plus changed in the recipe since {folder} was made: give the recipe another name, or remove "
+        f"{rows[0]} {rows[1]}"
+    )
+    made = attempts(folder)
+    for row in rows:
+        shutil.rmtree(row)
+    run(base, root=tmp_path, jobs=2)
+    assert attempts(folder) == made
+
+
 def test_the_base_has_published_what_is_borrowed_of_it(base: Path, longer: Path) -> None:
     part = base.with_name("part.toml")
     part.write_text('based_on = "base"\nmethods = ["astra"]\n')

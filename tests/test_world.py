@@ -161,6 +161,24 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     assert float(predicted[0]) != pytest.approx(float(own[0]))
 
 
+def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
+    torch.manual_seed(0)
+    task = TASKS["nao-navigation"]
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0))
+    one = SimulatorWorld(task.objective, GroundedSimulator(task.simulator(2), model), reward="predicted")
+    # The one in the middle of a corridor, the other just before the wall at x = -2.
+    state = torch.tensor([[0.0, 2.0, 0.0, 0.0], [-1.999, 2.0, 0.0, 0.0]])
+    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)]).float().expand(2, 2)
+    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(2, 8)})
+    latent = one.simulator.latent  # type: ignore[union-attr]
+    action = torch.tensor([[0.0, 0.0], [-1.0, 0.0]])
+    step = one.step(action)
+    assert step.terminated.tolist() == one.failed.tolist() == [False, True]
+    predicted = model.predict_reward(latent, action).detach()
+    torch.testing.assert_close(step.reward[:1], predicted[:1])
+    assert float(step.reward[1]) == pytest.approx(task.objective.failure_reward, abs=0.01)
+
+
 def test_commands_are_clipped_and_shortened() -> None:
     commands = torch.tensor([[3.0, 0.0], [0.6, 0.8], [1.0, 1.0], [0.1, -0.2], [0.0, 0.0]])
     limited = TASK.limit_command(commands, 0.5)

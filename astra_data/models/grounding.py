@@ -40,8 +40,10 @@ class GroundingShape:
     Attributes:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
         position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
+        wall_grid: likewise; None where walls are not seen.
         ball_index: where in the state the position of a ball begins; None where there is none.
         correction_heads: of f_abs, whose mean corrects.
+        reward_dropout: share of the latent that R_pred does not see while it learns.
     """
 
     state_size: int
@@ -51,8 +53,10 @@ class GroundingShape:
     embedding_size: int = 64
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4
+    wall_grid: tuple[int, int] | None = None
     ball_index: int | None = None
     correction_heads: int = 1
+    reward_dropout: float = 0.0
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
 
 
@@ -93,7 +97,7 @@ class GroundingModel(nn.Module):
         self.shape = shape
         self.target = target
         states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
-        self.position_features = PositionFeatures(shape.position_octaves)
+        self.position_features = PositionFeatures(shape.position_octaves, wall_grid=shape.wall_grid)
         features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
         self.encoder = HistoryEncoder(
             features + shape.goal_size + actions,
@@ -145,11 +149,11 @@ class GroundingModel(nn.Module):
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
 
     @torch.no_grad()
-    def set_reward_scales(self, reward: Tensor) -> None:
+    def set_reward_scales(self, reward: Tensor, failure_weight: float = 1.0) -> None:
         """Take the scales of `reward` (N, 2) from training steps, in its two parts: see `Windows`.
 
         The reward head begins where it predicts as many failures as there are, and their loss is weighed by
-        how rare they are.
+        how rare they are, times `failure_weight`.
         """
         going_on, failing = reward.unbind(-1)
         failed = failing != 0
@@ -159,7 +163,7 @@ class GroundingModel(nn.Module):
         if failed.any():
             rate = failed.float().mean().clamp(max=0.5)
             self.failure_cost.copy_((failing[failed].mean() - self.reward_mean).clamp_max(0.0))
-            self.failure_weight.copy_(1.0 / functional.binary_cross_entropy(rate, rate))
+            self.failure_weight.copy_(failure_weight / functional.binary_cross_entropy(rate, rate))
             list(self.reward_head.parameters())[-1][1] = rate.logit()
 
     def state_features(self, state: Tensor) -> Tensor:
@@ -260,10 +264,12 @@ class GroundingModel(nn.Module):
         return total + parts["topple"], parts
 
     def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
-        """Return the mean of both parts' losses; where the average is predicted, each is about one.
+        """Return the mean of both parts' losses, each about one where the average is predicted.
 
         Without any failures in the data the second is zero.
         """
+        if self.shape.reward_dropout:
+            latent = functional.dropout(latent, self.shape.reward_dropout)
         going_on, log_odds = self._reward_outputs(latent, windows.action)
         reward, failing = windows.reward.unbind(-1)
         failed = (failing != 0).float()

@@ -184,6 +184,48 @@ def test_failing_is_predicted_as_often_as_it_happens_and_never_pays(paid: float,
         assert float(model.predict_reward_parts(anywhere, any_action)[:, 1].max()) <= 0.0
 
 
+def failing(share: float) -> Windows:
+    """Return the training windows where `share` of the steps fail, whatever is done."""
+    torch.manual_seed(0)
+    fails = -10.0 * (torch.rand(TRAINING.mask.shape) < share)
+    return replace(TRAINING, reward=torch.stack([torch.zeros_like(fails), fails], dim=-1))
+
+
+def test_failures_count_as_much_as_they_are_told_to() -> None:
+    model, windows, losses = untrained(), failing(0.02), []
+    for weight in (1.0, 0.1):
+        model.set_reward_scales(windows.reward.flatten(0, 1), weight)
+        with torch.no_grad():
+            last_weight, last_bias = list(model.reward_head.parameters())[-2:]
+            last_weight.zero_()
+            last_bias[0] = 0.0
+            losses.append(float(model.losses(windows, LossWeights())[1]["reward"]))
+    # The average is predicted: the failures alone are left to lose, and they make up one half of the loss.
+    assert losses == pytest.approx([0.5, 0.05], rel=1e-3)
+
+
+def test_without_half_of_the_latent_chance_failures_are_not_learned_by_heart() -> None:
+    windows = failing(0.02)
+    failed = windows.reward[..., 1] != 0
+
+    def learned(dropout: float) -> float:
+        model = untrained()
+        model.shape = replace(model.shape, reward_dropout=dropout)
+        model.set_reward_scales(windows.reward.flatten(0, 1))
+        optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
+        for _ in range(300):
+            optimizer.zero_grad()
+            model.losses(windows, LossWeights(latent=0.0))[0].backward()
+            optimizer.step()
+        with torch.no_grad():
+            latent, _ = model.encoder(
+                model.encoder_input(windows.state, windows.goal, windows.previous_action)
+            )
+            return float(model.predict_reward_parts(latent, windows.action)[failed][:, 1].mean())
+
+    assert learned(0.5) > 0.5 * learned(0.0)  # both negative: what steps cost that failed by chance
+
+
 def test_the_printed_latent_loss_collapses_and_a_slow_target_does_not() -> None:
     """The LayerNorm fixes the length of each latent, but not that different histories differ in theirs.
 
