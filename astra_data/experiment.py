@@ -115,9 +115,8 @@ class Experiment:
         own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
         present = [str(self.folder / stage) for stage in STAGES if stage in whole & own]
         for table in sorted(changed & _ROWS_TABLES):
-            reached = (_stale_stages({table}) - whole) & own
-            for stage in STAGES:
-                present += map(str, self._rows_of(table, stage)) if stage in reached else ()
+            for stage in sorted((_stale_stages({table}) - whole) & own):
+                present += map(str, self._rows_of(table, stage))
         if present:
             raise RecipeError(
                 f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "

@@ -1,9 +1,9 @@
 """Fit: what a method is given to learn about its simulator from pairs, and the way of the history models."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -14,7 +14,7 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind, Windows
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
+from astra_data.recipe import Config, Count, Number, Positive, Share
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
@@ -44,12 +44,12 @@ class GroundConfig(Config):
     position_octaves: Number = 4
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
     where a task has no positions."""
-    wall_range_m: NotNegative = 0.0
-    """The networks are told how near the nearest wall is and where, from so far before it on; 0: not. Without
-    effect where a task has no maze."""
     correction_heads: Count = 1
     """Heads that correct the state, each of which learns from windows of its own; their mean corrects, and
     `doubt_penalty` keeps policies from where they disagree."""
+    reward: Literal["whole", "correction"] = "whole"
+    """What R_pred learns: "whole", the target's reward, as in the paper; "correction", what the task's own
+    reward on recorded abstract states lacks of it, as f_abs corrects the state."""
     reward_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the latent that R_pred does not see while it learns, so that it learns no failure by heart."""
     failure_weight: Positive = 1.0
@@ -98,8 +98,10 @@ class HistoryFit:
         """Return the model and its telemetry."""
         config, training = fitting.config, fitting.training
         torch.manual_seed(derive(fitting.seed, "grounding"))
+        held_out = fitting.held_out
+        if config.reward == "correction":
+            training, held_out = (_lacking(fitting.task, episodes) for episodes in (training, held_out))
         windows = training.windows
-        sees_walls = fitting.task.plane is not None and config.wall_range_m > 0
         model = GroundingModel(
             GroundingShape(
                 state_size=windows.state.shape[-1],
@@ -107,15 +109,13 @@ class HistoryFit:
                 goal_size=windows.goal.shape[-1],
                 latent_size=config.latent_size,
                 position_octaves=config.position_octaves if fitting.task.plane else 0,
-                wall_grid=fitting.task.maze.fine_shape if sees_walls else None,
                 ball_index=fitting.task.ball_index,
                 correction_heads=config.correction_heads,
+                corrects_reward=config.reward == "correction",
                 reward_dropout=config.reward_dropout,
             ),
             config.target,
         ).to(fitting.device)
-        if sees_walls:
-            model.position_features.set_walls(fitting.task.maze, config.wall_range_m)
         model.set_scales(
             {
                 "state": training.steps(windows.state),
@@ -124,9 +124,27 @@ class HistoryFit:
             }
         )
         model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
-        metrics = _optimise(model, self.weights, fitting)
-        _fit_residual(model, fitting.held_out)
+        metrics = _optimise(model, self.weights, replace(fitting, training=training, held_out=held_out))
+        _fit_residual(model, held_out)
         return model, metrics
+
+
+def _lacking(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
+    """Take from the rewards of `episodes` what the task's own reward pays for their abstract states.
+
+    Steps that end an episode keep theirs: in a simulator the task itself decides those.
+    """
+    windows = episodes.windows
+    before, after, goal = (
+        values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal)
+    )
+    own = task.objective.reward(
+        before, after, goal, torch.zeros(len(before), dtype=torch.bool, device=before.device)
+    )
+    goes_on = windows.mask.bool() & ~episodes.terminated
+    own = own.reshape(goes_on.shape) * goes_on
+    reward = torch.stack([windows.reward[..., 0] - own, windows.reward[..., 1]], dim=-1)
+    return replace(episodes, windows=replace(windows, reward=reward))
 
 
 def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:

@@ -73,26 +73,10 @@ class Maze:
         """Distance in m from each fine grid cell to the nearest wall, indexed [y, x]."""
         return np.asarray(distance_transform_edt(~self.fine_walls)) * self.fine_m
 
-    @property
-    def fine_shape(self) -> tuple[int, int]:
-        """Height and width of the fine grid."""
-        height, width = self.fine_walls.shape
-        return height, width
-
-    @cached_property
-    def depth_field(self) -> Floats:
-        """Distance in m from the middle of each fine cell to the nearest face of a wall, indexed [y, x].
-
-        Negative in the free cells, positive within walls.
-        """
-        inside = distance_transform_edt(self.fine_walls)
-        outside = distance_transform_edt(~self.fine_walls)
-        return np.asarray(np.where(self.fine_walls, inside - 0.5, 0.5 - outside)) * self.fine_m
-
     def fine_index(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the fine grid indices (y, x) of `points` (..., 2), clipped to the grid."""
         cells = np.floor((points + self.half_extent) / self.fine_m).astype(np.intp)
-        height, width = self.fine_shape
+        height, width = self.fine_walls.shape
         return cells[..., 1].clip(0, height - 1), cells[..., 0].clip(0, width - 1)
 
     def clearance(self, points: Floats) -> Floats:

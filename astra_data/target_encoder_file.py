@@ -10,15 +10,14 @@ def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
     """Write `encoder` to `path`."""
     embedding = encoder.encoder.embedding
     states, goals = len(encoder.state_mean), len(encoder.goal_mean)
-    place = encoder.position_features
+    waves = encoder.position_features.size
     sizes = {
         "state_size": states,
         "goal_size": goals,
-        "action_size": embedding.in_features - states - place.size - goals,
+        "action_size": embedding.in_features - states - waves - goals,
         "embedding_size": embedding.out_features,
         "latent_size": encoder.encoder.latent_size,
-        "position_octaves": place.octaves,
-        "wall_grid": place.wall_grid,
+        "position_octaves": waves // 4,
     }
     save_tensors(path, encoder.state_dict(), sizes)
 

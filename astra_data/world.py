@@ -46,7 +46,8 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
 class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
-    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), but for steps
+    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), or the task's
+    own and what R_pred adds to it where it was fitted so, but for steps
     in which the task itself sees the episode decided (goal reached, a ball beside it, a fallen body, a wall
     that must not be touched): these pay the task's own reward; "blend", the task's own plus the predicted
     risk of toppling. With `topple`, toppling is drawn from the topple head and ends the episode; so
@@ -178,6 +179,8 @@ class SimulatorWorld:
         if self.reward == "predicted" and self.grounded is not None and latent is not None:
             with torch.no_grad():
                 predicted = self.grounded.model.predict_reward(latent, action)
+            if self.grounded.model.shape.corrects_reward:
+                predicted = reward + predicted
             reward = torch.where(decided, reward, predicted)
         return Step(
             observation=self._observe(),

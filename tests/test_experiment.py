@@ -48,7 +48,7 @@ def test_what_only_some_rows_read_leaves_the_others_alone(base: Path, tmp_path: 
     base.write_text(BASE + "[plus]\nrate = 2.0\n")
     with pytest.raises(RecipeError) as caught:
         run(base, root=tmp_path)
-    rows = [folder / stage / "astra_plus" for stage in ("train", "evaluate")]
+    rows = [folder / stage / "astra_plus" for stage in ("evaluate", "train")]
     assert str(caught.value) == (
         f"plus changed in the recipe since {folder} was made: give the recipe another name, or remove "
         f"{rows[0]} {rows[1]}"

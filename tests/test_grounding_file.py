@@ -7,7 +7,6 @@ from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding, load_history_model, save_grounding
-from astra_data.mazes import U_MAZE
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
 from astra_data.models.residual import ResidualModel, ResidualShape
@@ -20,9 +19,8 @@ def no_episodes() -> PairedEpisodes:
 
 
 def test_a_grounding_comes_back_frozen(tmp_path: Path) -> None:
-    shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), wall_grid=U_MAZE.fine_shape)
+    shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
     model = GroundingModel(shape, "detach")
-    model.position_features.set_walls(U_MAZE, 1.0)
     model.set_scales({"state": torch.randn(50, 4)})
     model.set_reward_scales(torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1))
     assert torch.isfinite(model.failure_weight)

@@ -2,14 +2,12 @@ from pathlib import Path
 
 import torch
 
-from astra_data.mazes import U_MAZE
 from astra_data.models.alignment import TargetEncoder
 from astra_data.target_encoder_file import load_target_encoder, save_target_encoder
 
 
 def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
-    encoder = TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8, wall_grid=U_MAZE.fine_shape)
-    encoder.position_features.set_walls(U_MAZE, 1.0)
+    encoder = TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8)
     state, goal, action = torch.randn(5, 29), torch.randn(5, 2), torch.randn(5, 3)
     encoder.set_scales(3 * state, goal)
     save_target_encoder(tmp_path / "encoder.safetensors", encoder)

@@ -161,6 +161,24 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     assert float(predicted[0]) != pytest.approx(float(own[0]))
 
 
+def test_predicted_corrections_are_added_to_the_tasks_own_reward() -> None:
+    torch.manual_seed(0)
+    rewards = []
+    for corrects in (False, True):
+        torch.manual_seed(1)
+        model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, corrects_reward=corrects))
+        for reward in ("abstract", "predicted"):
+            one = SimulatorWorld(
+                TASK, GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model), reward=reward
+            )
+            state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4)
+            one.load_state_dict({"state": state, "goal": -state[:, :2], "hidden": torch.zeros(3, 8)})
+            rewards.append(one.step(torch.tensor([[1.0, 0.0]]).expand(3, 2)).reward)
+    own, whole, _, corrected = rewards
+    assert (own - whole).abs().min() > 1e-3
+    torch.testing.assert_close(corrected, own + whole)
+
+
 def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
     torch.manual_seed(0)
     task = TASKS["nao-navigation"]

@@ -25,10 +25,9 @@ class TargetEncoder(nn.Module):
         embedding_size: int,
         latent_size: int,
         position_octaves: int = 4,
-        wall_grid: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
-        self.position_features = PositionFeatures(position_octaves, wall_grid=wall_grid)
+        self.position_features = PositionFeatures(position_octaves)
         self.encoder = HistoryEncoder(
             state_size + self.position_features.size + goal_size + action_size,
             embedding_size=embedding_size,

@@ -40,9 +40,9 @@ class GroundingShape:
     Attributes:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
         position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
-        wall_grid: likewise; None where walls are not seen.
         ball_index: where in the state the position of a ball begins; None where there is none.
         correction_heads: of f_abs, whose mean corrects.
+        corrects_reward: R_pred is what the task's own reward lacks, not the whole.
         reward_dropout: share of the latent that R_pred does not see while it learns.
     """
 
@@ -53,9 +53,9 @@ class GroundingShape:
     embedding_size: int = 64
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4
-    wall_grid: tuple[int, int] | None = None
     ball_index: int | None = None
     correction_heads: int = 1
+    corrects_reward: bool = False
     reward_dropout: float = 0.0
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
 
@@ -97,7 +97,7 @@ class GroundingModel(nn.Module):
         self.shape = shape
         self.target = target
         states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
-        self.position_features = PositionFeatures(shape.position_octaves, wall_grid=shape.wall_grid)
+        self.position_features = PositionFeatures(shape.position_octaves)
         features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
         self.encoder = HistoryEncoder(
             features + shape.goal_size + actions,
@@ -191,7 +191,7 @@ class GroundingModel(nn.Module):
         return mean, low + (high - low) * torch.sigmoid(raw)
 
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
-        """R_pred: return the target's reward (...)."""
+        """R_pred: return the target's reward (...), or what the task's own on abstract states lacks of it."""
         return self.predict_reward_parts(latent, action).sum(-1)
 
     def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:

@@ -2,12 +2,9 @@
 
 from itertools import pairwise
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-from astra_data.mazes import Maze
 
 
 def mlp(sizes: tuple[int, ...], activation: type[nn.Module] = nn.ELU) -> nn.Sequential:
@@ -28,46 +25,22 @@ def normalised(state: Tensor, mean: Tensor | float, std: Tensor | float) -> Tens
 
 
 class PositionFeatures(nn.Module):
-    """What a network sees of planar positions, so that it can place walls. Maps (..., 2) in m to (..., F).
+    """Sines and cosines of planar positions, so that a smooth network can place sharp walls.
 
-    Sines and cosines (4 * octaves) of wavelengths from `longest_m` down by halves; then, with the walls that
-    `set_walls` takes, how near the nearest is and where it lies (3), which is alike along all of them.
+    Maps (..., 2) in m to (..., 4 * octaves): wavelengths from `longest_m` down by halves.
     """
 
-    def __init__(
-        self, octaves: int, longest_m: float = 16.0, wall_grid: tuple[int, int] | None = None
-    ) -> None:
-        """Take the size of the maze's fine grid (height, width), if walls are to be seen."""
+    def __init__(self, octaves: int, longest_m: float = 16.0) -> None:
         super().__init__()
         wavelengths = longest_m * 0.5 ** torch.arange(octaves)
         self.register_buffer("frequencies", 2 * torch.pi / wavelengths)
         self.frequencies: Tensor
-        self.octaves, self.wall_grid = octaves, wall_grid
         self.size = 4 * octaves
-        if wall_grid is not None:
-            self.size += 3
-            self.register_buffer("walls", torch.zeros(3, *wall_grid))
-            self.register_buffer("half_extent", torch.ones(2))
-            self.walls: Tensor
-            self.half_extent: Tensor
-
-    def set_walls(self, maze: Maze, range_m: float) -> None:
-        """Show the walls of `maze`, from `range_m` before them on."""
-        depth = maze.depth_field
-        nearness = (2.0 * (1.0 + depth / range_m)).clip(0.0, 3.0)
-        up, right = np.gradient(depth, maze.fine_m)
-        self.walls.copy_(torch.from_numpy(nearness * np.stack([np.ones_like(up), right, up])))
-        self.half_extent.copy_(torch.tensor(maze.half_extent))
 
     def forward(self, position: Tensor) -> Tensor:
         """Return the features of `position` (..., 2)."""
         phases = (position.unsqueeze(-1) * self.frequencies).flatten(-2)
-        waves = torch.cat([phases.sin(), phases.cos()], dim=-1)
-        if self.wall_grid is None:
-            return waves
-        places = (position / self.half_extent).reshape(1, 1, -1, 2)
-        seen = functional.grid_sample(self.walls[None], places, padding_mode="border", align_corners=False)
-        return torch.cat([waves, seen[0, :, 0].T.reshape(*position.shape[:-1], 3)], dim=-1)
+        return torch.cat([phases.sin(), phases.cos()], dim=-1)
 
 
 class HistoryEncoder(nn.Module):

@@ -70,9 +70,7 @@ def align(
         embedding_size=model.shape.embedding_size,
         latent_size=model.shape.latent_size,
         position_octaves=model.shape.position_octaves,
-        wall_grid=model.shape.wall_grid,
     ).to(device)
-    encoder.position_features.load_state_dict(model.position_features.state_dict())
     # Where φ drops the place, latents must not change with the way that a robot has come.
     encoder.set_scales(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place

@@ -3,7 +3,6 @@ import math
 import pytest
 import torch
 
-from astra_data.mazes import Maze
 from astra_data.models.history import HistoryEncoder, PositionFeatures
 
 
@@ -46,19 +45,3 @@ def test_position_features_have_halving_wavelengths() -> None:
     phases = [2 * math.pi * place / wavelength for place in (1.5, -2.0) for wavelength in (16, 8, 4)]
     assert len(values) == features.size == 12
     assert values == pytest.approx([math.sin(p) for p in phases] + [math.cos(p) for p in phases], abs=1e-6)
-
-
-def test_walls_are_seen_from_their_range_on_and_alike_along_all_of_them() -> None:
-    room = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))  # free within ±2 m
-    features = PositionFeatures(0, wall_grid=room.fine_shape)
-    features.set_walls(room, range_m=0.8)
-    before, beside = (
-        2 * (1 - 0.35 / 0.8),
-        torch.tensor([[1.65, 0.3], [1.65, -1.0], [0.3, 1.65], [-1.65, 0.0]]),
-    )
-    seen = [[before, before, 0.0], [before, before, 0.0], [before, 0.0, before], [before, -before, 0.0]]
-    torch.testing.assert_close(features(beside), torch.tensor(seen))
-    touching = features(torch.tensor([[2.0, 0.0], [3.9, 0.0]]))
-    torch.testing.assert_close(touching[:, 0], torch.tensor([2.0, 3.0]))
-    assert not features(torch.tensor([[[1.1, 0.0]], [[0.0, 0.0]]])).any()
-    assert features(torch.zeros(2, 5, 2)).shape == (2, 5, features.size)

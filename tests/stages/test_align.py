@@ -1,13 +1,10 @@
 import json
 from pathlib import Path
 
-import torch
-from small_run import ALIGN, GROUND, TASK, short_task
+from small_run import ALIGN
 
-from astra_data.grounding_file import load_history_model
 from astra_data.progress import silent
 from astra_data.stages.align import align
-from astra_data.stages.ground import ground
 from astra_data.target_encoder_file import load_target_encoder
 
 
@@ -24,22 +21,6 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
     assert 0 < last["mmd"] < first["mmd"]
     assert last["mmd"] == metrics["mmd"]
     assert load_target_encoder(aligned / "target_encoder.safetensors").encoder.latent_size == 16
-
-
-def test_the_target_encoder_sees_the_walls_that_the_source_sees(paired: Path, tmp_path: Path) -> None:
-    sees_walls = GROUND.model_copy(update={"updates": 2, "wall_range_m": 1.0})
-    short = ALIGN.model_copy(update={"updates": 50})
-    grounding, out = tmp_path / "ground", tmp_path / "align"
-    with short_task():
-        ground(
-            TASK, "astra", sees_walls, dataset=paired, seed=0, out=grounding, device="cpu", progress=silent
-        )
-    align(short, dataset=paired, grounding=grounding, seed=0, out=out, device="cpu", progress=silent)
-    encoder = load_target_encoder(out / "target_encoder.safetensors")
-    model = load_history_model(grounding / "grounding.safetensors")
-    assert encoder.position_features.walls.any()
-    assert torch.equal(encoder.position_features.walls, model.position_features.walls)
-    assert torch.equal(encoder.position_features.half_extent, model.position_features.half_extent)
 
 
 def test_the_same_seed_gives_the_same_bytes(

@@ -19,6 +19,23 @@ from astra_data.stages.train import train
 from astra_data.variation import WIDE_RANGES, Variation
 
 
+def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
+    task: str, paired: Path, tmp_path: Path
+) -> None:
+    """The ant's rewards are of its true places, which its abstract states hold."""
+    scales = {}
+    for reward in ("whole", "correction"):
+        config = GROUND.model_copy(update={"updates": 1, "reward": reward})
+        out = tmp_path / reward
+        ground(task, "astra", config, dataset=paired, seed=0, out=out, device="cpu", progress=silent)
+        model = load_history_model(out / "grounding.safetensors")
+        assert model.shape.corrects_reward == (reward == "correction")
+        scales[reward] = float(model.reward_std), float(model.failure_cost)
+    assert scales["whole"][0] > 0.01
+    assert scales["correction"][0] == pytest.approx(1e-3)
+    assert scales["correction"][1] == pytest.approx(scales["whole"][1], abs=0.1)
+
+
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
     ground(task, method, GROUND, dataset=dataset, seed=0, out=out, device="cpu", progress=progress)
     return (out / "grounding.safetensors").read_bytes()
