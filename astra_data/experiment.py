@@ -120,7 +120,7 @@ class Experiment:
         if present:
             raise RecipeError(
                 f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
-                f"give the recipe another name, or remove {' '.join(present)}"
+                f"give the recipe another name, or remove {' '.join(dict.fromkeys(present))}"
             )
 
     @property

@@ -49,7 +49,8 @@ class GroundConfig(Config):
     `doubt_penalty` keeps policies from where they disagree."""
     reward: Literal["whole", "correction"] = "whole"
     """What R_pred learns: "whole", the target's reward, as in the paper; "correction", what the task's own
-    reward on recorded abstract states lacks of it, as f_abs corrects the state."""
+    reward on recorded abstract states lacks of it, as f_abs corrects the state. Only for policies that learn
+    from the predicted reward; augmented copies are judged by abstract states, which lack nothing."""
     reward_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the latent that R_pred does not see while it learns, so that it learns no failure by heart."""
     failure_weight: Positive = 1.0
@@ -100,7 +101,9 @@ class HistoryFit:
         torch.manual_seed(derive(fitting.seed, "grounding"))
         held_out = fitting.held_out
         if config.reward == "correction":
-            training, held_out = (_lacking(fitting.task, episodes) for episodes in (training, held_out))
+            training, held_out = (
+                what_rewards_lack(fitting.task, episodes) for episodes in (training, held_out)
+            )
         windows = training.windows
         model = GroundingModel(
             GroundingShape(
@@ -129,22 +132,29 @@ class HistoryFit:
         return model, metrics
 
 
-def _lacking(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
-    """Take from the rewards of `episodes` what the task's own reward pays for their abstract states.
+def what_rewards_lack(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
+    """Take from the rewards in the windows of `episodes` what the task's own reward pays on abstract states.
 
-    Steps that end an episode keep theirs: in a simulator the task itself decides those.
+    Where abstract states show a goal, or one out of reach, and the target goes on, nothing is lacking: there
+    simulators decide otherwise, and R_pred is not asked.
     """
-    windows = episodes.windows
+    windows, objective = episodes.windows, task.objective
     before, after, goal = (
         values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal)
     )
-    own = task.objective.reward(
-        before, after, goal, torch.zeros(len(before), dtype=torch.bool, device=before.device)
+    decided = objective.reached(after, goal) | objective.missed(after, goal)
+    own = objective.reward(before, after, goal, torch.zeros_like(decided))
+    going_on, failing = windows.reward.unbind(-1)
+    own, decided = own.reshape(going_on.shape), decided.reshape(going_on.shape)
+    asked = windows.mask.bool() & ~decided
+    lacking = torch.stack(
+        [
+            torch.where(asked & ~episodes.terminated, going_on - own, 0.0),
+            torch.where(asked & (failing != 0), failing - own, failing),
+        ],
+        dim=-1,
     )
-    goes_on = windows.mask.bool() & ~episodes.terminated
-    own = own.reshape(goes_on.shape) * goes_on
-    reward = torch.stack([windows.reward[..., 0] - own, windows.reward[..., 1]], dim=-1)
-    return replace(episodes, windows=replace(windows, reward=reward))
+    return replace(episodes, windows=replace(windows, reward=lacking))
 
 
 def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:

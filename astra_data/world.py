@@ -46,12 +46,11 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
 class SimulatorWorld:
     """A batched environment over an abstract simulator.
 
-    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), or the task's
-    own and what R_pred adds to it where it was fitted so, but for steps
-    in which the task itself sees the episode decided (goal reached, a ball beside it, a fallen body, a wall
-    that must not be touched): these pay the task's own reward; "blend", the task's own plus the predicted
-    risk of toppling. With `topple`, toppling is drawn from the topple head and ends the episode; so
-    does touching a wall, where the task says so. All randomness comes from torch's global generator.
+    Rewards: "abstract", the task's own on abstract states; "predicted", R_pred (Algorithm 2), on top of the
+    task's own where it was fitted as its correction; "blend", the task's own plus the predicted risk of
+    toppling. Steps that the task itself sees decided (goal reached, a ball beside it, a fallen body, a wall
+    that must not be touched) pay the task's own reward also where it is predicted. With `topple`, toppling is
+    drawn from the topple head and ends the episode. All randomness comes from torch's global generator.
 
     Attributes:
         latent_size: Z, of the latents in the observations; 0 where there are none.
@@ -180,7 +179,8 @@ class SimulatorWorld:
             with torch.no_grad():
                 predicted = self.grounded.model.predict_reward(latent, action)
             if self.grounded.model.shape.corrects_reward:
-                predicted = reward + predicted
+                goes_on = torch.zeros_like(decided)
+                predicted = predicted + self.objective.reward(before, after, self.goal, goes_on)
             reward = torch.where(decided, reward, predicted)
         return Step(
             observation=self._observe(),

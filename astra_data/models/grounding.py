@@ -264,12 +264,13 @@ class GroundingModel(nn.Module):
         return total + parts["topple"], parts
 
     def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
-        """Return the mean of both parts' losses, each about one where the average is predicted.
+        """Return the mean of both parts' losses, where the average is predicted about one and the weight of
+        failures.
 
         Without any failures in the data the second is zero.
         """
         if self.shape.reward_dropout:
-            latent = functional.dropout(latent, self.shape.reward_dropout)
+            latent = functional.dropout(latent, self.shape.reward_dropout, self.training)
         going_on, log_odds = self._reward_outputs(latent, windows.action)
         reward, failing = windows.reward.unbind(-1)
         failed = (failing != 0).float()
