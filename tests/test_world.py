@@ -162,7 +162,6 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
 
 
 def test_predicted_corrections_are_added_to_the_tasks_own_reward() -> None:
-    torch.manual_seed(0)
     rewards = []
     for corrects in (False, True):
         torch.manual_seed(1)

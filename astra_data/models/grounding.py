@@ -69,8 +69,9 @@ class Windows:
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
         next_state: φ(s_{i+1}), (B, T, X). topples_soon: (B, T), the target ends
             badly within `RISK_STEPS`.
-        reward: r_i in two parts, (B, T, 2): of steps that go on, and of steps that end the task in failure.
-            That the goal is reached is decided, and rewarded, by the simulator itself.
+        reward: r_i, or what the task's own reward lacks of it, in two parts, (B, T, 2): of steps that go on,
+            and of steps that end the task in failure. That the goal is reached is decided, and rewarded, by
+            the simulator itself.
         mask: (B, T), 1 on real steps.
     """
 
@@ -264,8 +265,7 @@ class GroundingModel(nn.Module):
         return total + parts["topple"], parts
 
     def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
-        """Return the mean of both parts' losses, where the average is predicted about one and the weight of
-        failures.
+        """Return the mean of both parts' losses: about one, and its weight, where averages are predicted.
 
         Without any failures in the data the second is zero.
         """

@@ -30,10 +30,9 @@ def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
         ground(task, "astra", config, dataset=paired, seed=0, out=out, device="cpu", progress=silent)
         model = load_history_model(out / "grounding.safetensors")
         assert model.shape.corrects_reward == (reward == "correction")
-        scales[reward] = float(model.reward_std), float(model.failure_cost)
-    assert scales["whole"][0] > 0.01
-    assert scales["correction"][0] == pytest.approx(1e-3)
-    assert scales["correction"][1] == pytest.approx(scales["whole"][1], abs=0.1)
+        scales[reward] = float(model.reward_std)
+    assert scales["whole"] > 0.01
+    assert scales["correction"] == pytest.approx(1e-3)
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
