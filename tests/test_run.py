@@ -159,15 +159,15 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
         check(recipe, root=tmp_path)
     assert str(caught.value) == (
         f"plus changed in the recipe since {folder} was made: "
-        f"give the recipe another name, or remove {folder / 'train'} {folder / 'evaluate'}"
+        "give the recipe another name, or remove "
+        f"{folder / 'evaluate/astra_plus'} {folder / 'train/astra_plus'}"
     )
-    shutil.rmtree(folder / "train")
-    shutil.rmtree(folder / "evaluate")
-    assert [key for key, is_finished in check(recipe, root=tmp_path).items() if is_finished] == [
-        "collect/seed_0",
-        "pair/seed_0",
-        "ground/astra/seed_0",
-        "align/astra/seed_0",
+    shutil.rmtree(folder / "train/astra_plus")
+    shutil.rmtree(folder / "evaluate/astra_plus")
+    assert sorted(key for key, is_finished in check(recipe, root=tmp_path).items() if not is_finished) == [
+        "evaluate/astra_plus/seed_0",
+        "report",
+        "train/astra_plus/seed_0",
     ]
     recipe.write_text(text.replace("seeds = [0]", "seeds = [0, 1]"))
     assert check(recipe, root=tmp_path)["collect/seed_1"] is False

@@ -69,9 +69,8 @@ class Windows:
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
         next_state: φ(s_{i+1}), (B, T, X). topples_soon: (B, T), the target ends
             badly within `RISK_STEPS`.
-        reward: r_i, or what the task's own reward lacks of it, in two parts, (B, T, 2): of steps that go on,
-            and of steps that end the task in failure. That the goal is reached is decided, and rewarded, by
-            the simulator itself.
+        reward: r_i, or what the task's own lacks of it, in two parts, (B, T, 2): of steps that go on, and of
+            steps that end in failure. That the goal is reached is decided, and rewarded, by the simulator.
         mask: (B, T), 1 on real steps.
     """
 
