@@ -97,13 +97,15 @@ class HistoryFit:
 
     def __call__(self, fitting: Fitting) -> tuple[GroundingModel, dict[str, Any]]:
         """Return the model and its telemetry."""
-        config, training = fitting.config, fitting.training
-        torch.manual_seed(derive(fitting.seed, "grounding"))
-        held_out = fitting.held_out
+        config = fitting.config
         if config.reward == "correction":
-            training, held_out = (
-                what_rewards_lack(fitting.task, episodes) for episodes in (training, held_out)
+            fitting = replace(
+                fitting,
+                training=what_rewards_lack(fitting.task, fitting.training),
+                held_out=what_rewards_lack(fitting.task, fitting.held_out),
             )
+        torch.manual_seed(derive(fitting.seed, "grounding"))
+        training = fitting.training
         windows = training.windows
         model = GroundingModel(
             GroundingShape(
@@ -127,8 +129,8 @@ class HistoryFit:
             }
         )
         model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
-        metrics = _optimise(model, self.weights, replace(fitting, training=training, held_out=held_out))
-        _fit_residual(model, held_out)
+        metrics = _optimise(model, self.weights, fitting)
+        _fit_residual(model, fitting.held_out)
         return model, metrics
 
 

@@ -179,8 +179,8 @@ class SimulatorWorld:
             with torch.no_grad():
                 predicted = self.grounded.model.predict_reward(latent, action)
             if self.grounded.model.shape.corrects_reward:
-                goes_on = torch.zeros_like(decided)
-                predicted = predicted + self.objective.reward(before, after, self.goal, goes_on)
+                none_failed = torch.zeros_like(decided)
+                predicted = predicted + self.objective.reward(before, after, self.goal, none_failed)
             reward = torch.where(decided, reward, predicted)
         return Step(
             observation=self._observe(),
