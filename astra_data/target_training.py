@@ -42,5 +42,5 @@ class InTarget:
             device=training.device,
             num_threads=training.num_threads,
         )
-        policy, curve = train_in(env, config, config.memory_size, training)
+        policy, curve = train_in(env, config, config.memory_size, training, training.task.objective.horizon)
         return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve

@@ -112,6 +112,11 @@ class Training:
     progress: Progress
     num_threads: int | None = None
 
+    @property
+    def simulated_steps(self) -> int:
+        """After how many steps simulated episodes start anew."""
+        return self.config.episode_steps or self.task.objective.horizon
+
 
 Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]
 """Returns the policy and its learning curve."""
@@ -146,7 +151,7 @@ class InSimulator:
         """Return the policy and its learning curve."""
         env, simulation = self.world(training)
         memory_size = 0 if env.latent_size else training.config.memory_size
-        policy, curve = train_in(env, training.config, memory_size, training)
+        policy, curve = train_in(env, training.config, memory_size, training, training.simulated_steps)
         episodes = training.episodes
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
@@ -173,12 +178,19 @@ class InSimulator:
 
 
 def train_in(
-    env: ResumableEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training
+    env: ResumableEnv,
+    config: PpoTrainConfig | SacTrainConfig,
+    memory_size: int,
+    training: Training,
+    horizon: int,
 ) -> tuple[Policy, dict[str, Any]]:
-    """Train a new policy in `env`, with a memory of `memory_size`; return it and its learning curve."""
+    """Train a new policy in `env`; return it and its learning curve.
+
+    The policy has a memory of `memory_size`; episodes start anew after `horizon` steps.
+    """
     torch.manual_seed(derive(training.seed, "policy"))
     sizes = env.observation_size, env.action_size, memory_size
-    horizon, seed = training.task.objective.horizon, training.seed
+    seed = training.seed
     learner: Ppo | Sac
     if isinstance(config, SacTrainConfig):
         actor = SoftActor(PolicyShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)

@@ -14,7 +14,7 @@ from astra_data.grounding_file import Grounding
 from astra_data.mazes import Maze
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.residual import ResidualModel
-from astra_data.recipe import Config, NotNegative, Positive, Share
+from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.simulators import hidden_before, simulator_of
 from astra_data.task import Task
 from astra_data.variation import Variation
@@ -56,6 +56,9 @@ class WorldConfig(Config):
     """Share of the training over which the penalties grow from nothing: at once, they teach to stand."""
     data_start_share: Share = 0.0
     """Share of the episodes that start in the midst of a recorded one."""
+    episode_steps: Count | None = None
+    """Start simulated episodes anew after so many steps, beyond which values go on; by default after as many
+    as in the task. Short ones from recorded moments leave errors no time to grow (Janner et al. 2019)."""
 
     @property
     def limits_commands(self) -> bool:

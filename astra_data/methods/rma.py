@@ -43,7 +43,7 @@ class TeacherThenStudent(InSimulator):
             history_length=settings.history_length,
         )
         teacher = Teacher(shape, env.parameter_count).to(training.device)
-        horizon = training.task.objective.horizon
+        horizon = training.simulated_steps
         first = config.total_steps / (config.total_steps + settings.adaptation_steps)
         phase_1 = replace(training, progress=part(training.progress, 0.0, first))
         phase_2 = replace(training, progress=part(training.progress, first, 1.0))

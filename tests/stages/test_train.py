@@ -82,6 +82,16 @@ def test_success_is_null_while_no_episode_has_ended(task: str, paired: Path, tmp
     assert notes[-1].endswith("success of training episodes 0.00")
 
 
+@pytest.mark.parametrize("method", ["direct_transfer", "rma"])
+def test_simulated_episodes_last_as_long_as_asked(
+    method: str, task: str, paired: Path, tmp_path: Path
+) -> None:
+    config = TRAIN.model_copy(update={"episode_steps": 3})
+    make(task, method, paired, None, tmp_path / "train", config)
+    points = json.loads((tmp_path / "train" / "curve.json").read_text())["points"]
+    assert all(point["episodes"] > 0 and point["episode_steps"] <= 3 for point in points)
+
+
 def test_a_raw_simulator_needs_a_memory(task: str, paired: Path, tmp_path: Path) -> None:
     make(task, "direct_transfer", paired, None, tmp_path / "train")
     policy = PolicyFile.load(tmp_path / "train" / "policy.safetensors").policy

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.train import train
 from astra_data.target_training import TargetConfig
 
-CONFIG = TRAIN.model_copy(update={"data_start_share": 0.5})
+CONFIG = TRAIN.model_copy(update={"data_start_share": 0.5, "episode_steps": 1})
 SETTINGS = TargetConfig(num_envs=4, total_steps=4 * 8 * 6)
 
 
@@ -58,6 +59,8 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     seen: list[float] = []
     assert make(task, row, paired, broken, lambda done, note: seen.append(done)) == expected
     assert seen == pytest.approx([5 / 6, 1.0])
+    points = json.loads((whole / "curve.json").read_text())["points"]
+    assert max(point["episode_steps"] or 0 for point in points) > 1  # the task's, not the simulated one
     trained = PolicyFile.load(whole / "policy.safetensors")
     assert trained.simulation is None and trained.observed == observed
     assert trained.policy.shape.observation_size == size
