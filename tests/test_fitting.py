@@ -1,8 +1,7 @@
 import torch
+from toy_episodes import toy_episodes
 
-from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import what_rewards_lack
-from astra_data.models.grounding import Windows
 from astra_data.tasks import TASKS
 
 
@@ -18,23 +17,15 @@ def test_rewards_lack_what_abstract_states_do_not_tell() -> None:
     assert 0.1 < ahead < 2.0
     going_on, failing = torch.tensor([[3.0, 0.0, 0.0, 2.0, 0.0]]), torch.tensor([[0.0, 0.0, -9.0, 0.0, 0.0]])
     still = torch.zeros(1, 5, 2)
-    episodes = PairedEpisodes(
-        target_state=torch.zeros(1, 5, 29),
-        reward=(going_on + failing),
+    episodes = toy_episodes(
+        torch.cat([before[None], still], dim=-1),
+        still,
+        next_state=torch.cat([after[None], still], dim=-1),
+        goal=goal.expand(1, 5, 2),
+        mask=torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]]),
+        parts=torch.stack([going_on, failing], dim=-1),
+        reward=going_on + failing,
         terminated=terminated[None],
-        windows=Windows(
-            state=torch.cat([before[None], still], dim=-1),
-            action=still,
-            previous_action=still,
-            goal=goal.expand(1, 5, 2),
-            simulated_next=torch.zeros(1, 5, 4),
-            next_state=torch.cat([after[None], still], dim=-1),
-            reward=torch.stack([going_on, failing], dim=-1),
-            topples_soon=torch.zeros(1, 5),
-            mask=torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]]),
-        ),
-        reference="toy@data-1.0.0",
-        content_hash="0",
     )
     lacking = what_rewards_lack(task, episodes).windows.reward[0]
     torch.testing.assert_close(lacking[:, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))

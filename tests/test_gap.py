@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from toy_episodes import toy_episodes
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.gap import distances, gap_report
-from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.tasks import TASKS
 
 TASK = TASKS["antmaze-umaze"]
@@ -26,25 +27,7 @@ def episodes(speed: float) -> PairedEpisodes:
     simulated = simulator.step(action.reshape(-1, 2)).reshape(3, STEPS, 4)
     mask = torch.ones(3, STEPS)
     mask[2, 40:] = 0.0
-    windows = Windows(
-        state=state[:, :-1],
-        action=action,
-        previous_action=torch.cat([torch.zeros(3, 1, 2), action[:, :-1]], dim=1),
-        goal=torch.zeros(3, STEPS, 2),
-        simulated_next=simulated,
-        next_state=state[:, 1:],
-        reward=torch.zeros(3, STEPS, 2),
-        topples_soon=torch.zeros(3, STEPS),
-        mask=mask,
-    )
-    return PairedEpisodes(
-        target_state=torch.zeros(3, STEPS, 29),
-        reward=torch.zeros(3, STEPS),
-        terminated=torch.zeros(3, STEPS, dtype=torch.bool),
-        windows=windows,
-        reference="toy@data-1.0.0",
-        content_hash="0",
-    )
+    return toy_episodes(state[:, :-1], action, next_state=state[:, 1:], simulated_next=simulated, mask=mask)
 
 
 def untrained() -> GroundingModel:

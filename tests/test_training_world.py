@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from toy_episodes import toy_episodes
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.free_space import FreeSpace
-from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.point_mass import PointMass
 from astra_data.sims.randomized import RandomizedSimulator
@@ -26,24 +27,13 @@ def episodes() -> PairedEpisodes:
     mask = torch.ones(2, 400)
     mask[1, 300:] = 0.0
     scale = torch.tensor([0.01, 0.02, 0.1, 0.2])
-    windows = Windows(
-        state=state[:, :-1],
-        action=action,
-        previous_action=torch.cat([torch.zeros(2, 1, 2), action[:, :-1]], dim=1),
-        goal=torch.randn(2, 400, 2),
-        simulated_next=state[:, 1:] + scale * torch.randn(2, 400, 4),
+    return toy_episodes(
+        state[:, :-1],
+        action,
         next_state=state[:, 1:],
-        reward=torch.zeros(2, 400, 2),
-        topples_soon=torch.zeros(2, 400),
+        simulated_next=state[:, 1:] + scale * torch.randn(2, 400, 4),
+        goal=torch.randn(2, 400, 2),
         mask=mask,
-    )
-    return PairedEpisodes(
-        target_state=torch.zeros(2, 400, 29),
-        reward=torch.zeros(2, 400),
-        terminated=torch.zeros(2, 400, dtype=torch.bool),
-        windows=windows,
-        reference="toy@data-1.0.0",
-        content_hash="0",
     )
 
 

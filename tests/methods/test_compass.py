@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 import torch
 from spending import SPENT, spend
+from toy_episodes import toy_episodes
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError, RecipeError
 from astra_data.fitting import Fitting, GroundConfig
 from astra_data.methods.compass import CompassConfig, identify
-from astra_data.models.grounding import Windows
 from astra_data.plan import plan
 from astra_data.progress import Progress, silent
 from astra_data.recipe import Config, load_recipe, validated
@@ -48,22 +48,7 @@ def record(task: Task, planted: Variation, seed: int, episodes: int = 16, steps:
     held = torch.rand(episodes, steps // 15, task.objective.action_size) * 2.0 - 1.0
     action = held.repeat_interleave(15, dim=1)
     state = torch.stack([target.state, *(target.step(action[:, step]) for step in range(steps))], dim=1)
-    none = torch.zeros(episodes, steps, 2)
-    windows = Windows(
-        state=state[:, :-1],
-        action=action,
-        previous_action=none,
-        goal=none,
-        simulated_next=state[:, 1:],
-        next_state=state[:, 1:],
-        reward=none,
-        topples_soon=none[..., 0],
-        mask=torch.ones(episodes, steps),
-    )
-    unpaid = none[..., 0]
-    return PairedEpisodes(
-        torch.zeros(episodes, steps, 29), unpaid, unpaid.bool(), windows, "planted@data-1.0.0", "0"
-    )
+    return toy_episodes(state[:, :-1], action, next_state=state[:, 1:])
 
 
 def fitting(

@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 import torch
 from spending import SPENT, spend
+from toy_episodes import toy_episodes
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.learners.iql import IqlConfig
 from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import experience_of, learn_from_episodes
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.grounding import Windows
 from astra_data.policy_file import PolicyFile, deploy
 from astra_data.progress import Progress, silent
 from astra_data.tasks import TASKS
@@ -40,24 +40,17 @@ def episodes() -> PairedEpisodes:
     mask, terminated = torch.ones(6, STEPS), torch.zeros(6, STEPS, dtype=torch.bool)
     mask[5, 20:] = 0.0
     terminated[5, 19] = True
-    windows = Windows(
-        state=state[:, :-1],
-        action=action,
-        previous_action=torch.cat([torch.zeros(6, 1, 2), action[:, :-1]], dim=1),
-        goal=goal,
-        simulated_next=torch.full((6, STEPS, 4), torch.nan),
+    return toy_episodes(
+        state[:, :-1],
+        action,
         next_state=state[:, 1:],
-        reward=torch.full((6, STEPS, 2), torch.nan),
-        topples_soon=torch.zeros(6, STEPS),
+        simulated_next=torch.full((6, STEPS, 4), torch.nan),
+        goal=goal,
         mask=mask,
-    )
-    return PairedEpisodes(
-        target_state=torch.randn(6, STEPS, 29),
+        parts=torch.full((6, STEPS, 2), torch.nan),
         reward=torch.randn(6, STEPS),
         terminated=terminated,
-        windows=windows,
-        reference="toy@data-1.0.0",
-        content_hash="abc",
+        target_state=torch.randn(6, STEPS, 29),
     )
 
 
@@ -113,7 +106,7 @@ def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
     trained, curve = learn()
     assert trained.policy.shape == ActorCriticShape(8, 2, 8, hidden_sizes=(16,))
     assert trained.simulation is None
-    assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "abc")
+    assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "0")
     assert [(point["steps"], point["success"]) for point in curve["points"]] == [(20, None)]
     assert curve["updates_per_second"] > 0
     deployed = deploy(TASK, trained, None)

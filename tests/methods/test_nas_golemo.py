@@ -5,11 +5,11 @@ import pytest
 import torch
 from spending import SPENT, spend
 from torch import Tensor
+from toy_episodes import toy_episodes
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import Fitting, GroundConfig, correction_r2
 from astra_data.methods.nas_golemo import GolemoConfig, fit_residual
-from astra_data.models.grounding import Windows
 from astra_data.models.residual import ResidualModel
 from astra_data.progress import silent
 from astra_data.tasks import TASKS
@@ -23,19 +23,7 @@ def episodes(count: int, lacking: Tensor, action: Tensor) -> PairedEpisodes:
     state, simulated = torch.randn(2, count, STEPS, 4)
     mask = torch.ones(count, STEPS)
     mask[0, 25:] = 0.0
-    windows = Windows(
-        state=state,
-        action=action,
-        previous_action=torch.zeros(count, STEPS, 2),
-        goal=torch.zeros(count, STEPS, 2),
-        simulated_next=simulated,
-        next_state=simulated + lacking,
-        reward=torch.zeros(count, STEPS, 2),
-        topples_soon=torch.zeros(count, STEPS),
-        mask=mask,
-    )
-    none = torch.zeros(count, STEPS)
-    return PairedEpisodes(torch.zeros(count, STEPS, 29), none, none.bool(), windows, "toy@data-1.0.0", "0")
+    return toy_episodes(state, action, next_state=simulated + lacking, simulated_next=simulated, mask=mask)
 
 
 def fitting(both: PairedEpisodes, folder: Path, config: GolemoConfig = CONFIG) -> Fitting:

@@ -1,0 +1,48 @@
+"""Paired episodes of the ant's shapes out of a few tensors: what a test does not name is nothing."""
+
+import torch
+from torch import Tensor
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.models.grounding import Windows
+
+
+def toy_episodes(
+    state: Tensor,
+    action: Tensor,
+    *,
+    next_state: Tensor,
+    simulated_next: Tensor | None = None,
+    goal: Tensor | None = None,
+    mask: Tensor | None = None,
+    parts: Tensor | None = None,
+    reward: Tensor | None = None,
+    terminated: Tensor | None = None,
+    target_state: Tensor | None = None,
+) -> PairedEpisodes:
+    """Return E episodes of T steps with `state` (E, T, X) and `action` (E, T, A).
+
+    The other shapes are as in `PairedEpisodes` and `Windows`, whose `reward` is `parts` here. The simulator
+    lands where the target does, and every step is real, unless told otherwise.
+    """
+    nothing = torch.zeros(state.shape[:2])
+    none = torch.zeros(*state.shape[:2], 2)
+    windows = Windows(
+        state=state,
+        action=action,
+        previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
+        goal=none if goal is None else goal,
+        simulated_next=next_state if simulated_next is None else simulated_next,
+        next_state=next_state,
+        reward=none if parts is None else parts,
+        topples_soon=nothing,
+        mask=torch.ones_like(nothing) if mask is None else mask,
+    )
+    return PairedEpisodes(
+        target_state=torch.zeros(*state.shape[:2], 29) if target_state is None else target_state,
+        reward=nothing if reward is None else reward,
+        terminated=nothing.bool() if terminated is None else terminated,
+        windows=windows,
+        reference="toy@data-1.0.0",
+        content_hash="0",
+    )
