@@ -21,6 +21,7 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.learners.learner import Learner
 from astra_data.learners.ppo import Ppo, PpoConfig
+from astra_data.learners.recorded import Recorded
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.policy import Policy, PolicyShape
@@ -31,7 +32,7 @@ from astra_data.recipe import Config, Count, Number, choice
 from astra_data.seeding import derive
 from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
-from astra_data.training_world import WorldConfig, training_world, world_parts
+from astra_data.training_world import WorldConfig, recorded_steps, training_world, world_parts
 from astra_data.variation import Variation
 from astra_data.world import RewardSource, SimulatorWorld
 
@@ -151,8 +152,11 @@ class InSimulator:
         """Return the policy and its learning curve."""
         env, simulation = self.world(training)
         memory_size = 0 if env.latent_size else training.config.memory_size
-        policy, curve = train_in(env, training.config, memory_size, training, training.simulated_steps)
         episodes = training.episodes
+        config, recorded = training.config, None
+        if isinstance(config, SacTrainConfig) and config.imitation_weight:
+            recorded = recorded_steps(training.task, episodes, training.grounding)
+        policy, curve = train_in(env, config, memory_size, training, training.simulated_steps, recorded)
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
     def world(
@@ -183,10 +187,12 @@ def train_in(
     memory_size: int,
     training: Training,
     horizon: int,
+    recorded: Recorded | None = None,
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`; return it and its learning curve.
 
-    The policy has a memory of `memory_size`; episodes start anew after `horizon` steps.
+    The policy has a memory of `memory_size`; episodes start anew after `horizon` steps. SAC imitates what was
+    `recorded`.
     """
     torch.manual_seed(derive(training.seed, "policy"))
     sizes = env.observation_size, env.action_size, memory_size
@@ -194,7 +200,7 @@ def train_in(
     learner: Ppo | Sac
     if isinstance(config, SacTrainConfig):
         actor = SoftActor(PolicyShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)
-        learner = Sac(env, actor, config, horizon=horizon, seed=seed)
+        learner = Sac(env, actor, config, horizon=horizon, seed=seed, recorded=recorded)
     else:
         policy = ActorCritic(ActorCriticShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)
         learner = Ppo(env, policy, config, horizon=horizon, seed=seed)

@@ -11,6 +11,7 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import scatter_factor
 from astra_data.free_space import FreeSpace
 from astra_data.grounding_file import Grounding
+from astra_data.learners.recorded import Recorded
 from astra_data.mazes import Maze
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.residual import ResidualModel
@@ -18,7 +19,7 @@ from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.simulators import hidden_before, simulator_of
 from astra_data.task import Task
 from astra_data.variation import Variation
-from astra_data.world import DataStarts, RewardSource, SimulatorWorld
+from astra_data.world import DataStarts, RewardSource, SimulatorWorld, policy_observation
 
 _KERNEL_M = 0.25
 """Standard deviation of the kernel that smooths the density of the data."""
@@ -117,6 +118,21 @@ def world_parts(
             hidden=None if hidden is None else hidden[moments],
         )
     return WorldParts(thinness, config.residual_noise * scatter, starts, variation)
+
+
+@torch.no_grad()
+def recorded_steps(task: Task, episodes: PairedEpisodes, grounding: Grounding | None) -> Recorded:
+    """Return what was recorded as a policy sees it that is trained with `grounding`."""
+    windows, latent = episodes.windows, None
+    if isinstance(grounding, GroundingModel):
+        inputs = grounding.encoder_input(windows.state, windows.goal, windows.previous_action)
+        latent, _ = grounding.encoder(inputs)
+    return Recorded(
+        observation=policy_observation(task.objective, windows.state, windows.goal, latent),
+        previous_action=windows.previous_action,
+        action=windows.action,
+        lengths=episodes.lengths,
+    )
 
 
 def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import IQLLoss, SoftUpdate
 
-from astra_data.dataset.pairs import draw_steps
 from astra_data.errors import BadInputError
+from astra_data.learners.recorded import Recorded
 from astra_data.models.history import mlp
 from astra_data.models.policy import Policy
 from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
@@ -83,24 +83,17 @@ FINE_TUNING = IqlConfig(learning_rate=1e-4, policy_updates=100)
 
 
 @dataclass(frozen=True)
-class Experience:
-    """E recorded episodes of up to T steps, as a policy sees them; padded at the end.
+class Experience(Recorded):
+    """Recorded episodes with rewards; observations are what the policy sees, then what only the critics see.
 
     Attributes:
-        observation: (E, T, C), what the policy sees (O), then what only the critics see.
-        previous_action: (E, T, A), zero at the start. action: (E, T, A).
-        reward: (E, T). next_observation: (E, T, C).
+        reward: (E, T). next_observation: as `observation`, (E, T, O).
         terminated: (E, T) bool, the task ended: no value beyond it. Running out of time ends nothing.
-        lengths: the number of real steps of each episode, (E,).
     """
 
-    observation: Tensor
-    previous_action: Tensor
-    action: Tensor
     reward: Tensor
     next_observation: Tensor
     terminated: Tensor
-    lengths: Tensor
 
 
 class Iql:
@@ -160,17 +153,11 @@ class Iql:
         return {"value": float(value.detach()), "action_value": float(action_value.detach())}
 
     def _learn_policy(self, update: int) -> dict[str, float]:
-        config, experience = self.config, self._experience
+        config = self.config
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate * (1 + math.cos(math.pi * update / config.policy_updates)) / 2
-        episodes, steps, learned = draw_steps(experience.lengths, config.batch_windows, config.window)
-        learned &= steps < experience.lengths[episodes]
-        learned &= (torch.arange(steps.shape[1], device=steps.device) >= config.burn_in) | (steps[:, :1] == 0)
-        columns = {
-            name: getattr(experience, name)[episodes, steps]
-            for name in ("observation", "previous_action", "action")
-        }
-        loss = self._loss.actor_loss(TensorDict(columns, batch_size=steps.shape))[0][learned].mean()
+        columns, learned = self._experience.windows(config.batch_windows, config.window, config.burn_in)
+        loss = self._loss.actor_loss(TensorDict(columns, batch_size=learned.shape))[0][learned].mean()
         self._optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self._actor, config.gradient_norm)

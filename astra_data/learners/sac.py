@@ -15,6 +15,7 @@ from pydantic import model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.nn import functional
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
@@ -22,10 +23,11 @@ from astra_data.batched import BatchedEnv
 from astra_data.errors import BadInputError
 from astra_data.learners.acting import Acting
 from astra_data.learners.learner import Learner
+from astra_data.learners.recorded import Recorded
 from astra_data.learners.replay import Replay
 from astra_data.models.policy import features_of
 from astra_data.models.soft_actor import SoftActor, gaussian
-from astra_data.recipe import Config, Count, Number, Positive, Share
+from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
 from astra_data.seeding import derive
 
 
@@ -56,6 +58,9 @@ class SacConfig(Config):
     """Of the entropy in the reward, at the start."""
     target_rate: Share = 0.005
     """Share by which the target critics follow, per update."""
+    imitation_weight: NotNegative = 0.0
+    """Of the mean squared distance from recorded actions in what the actor minimises, times the mean size of
+    the action values. 0.4 is what Fujimoto and Gu (2021) take."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:
@@ -74,7 +79,14 @@ class Sac(Learner):
     """
 
     def __init__(
-        self, env: BatchedEnv, policy: SoftActor, config: SacConfig, *, horizon: int, seed: int
+        self,
+        env: BatchedEnv,
+        policy: SoftActor,
+        config: SacConfig,
+        *,
+        horizon: int,
+        seed: int,
+        recorded: Recorded | None = None,
     ) -> None:
         """Prepare to train `policy` in `env`.
 
@@ -84,6 +96,7 @@ class Sac(Learner):
             config: settings.
             horizon: rows are restarted after so many steps, without ending the task.
             seed: of all randomness.
+            recorded: to imitate.
 
         Raises:
             BadInputError: the buffer would hold no window.
@@ -105,6 +118,7 @@ class Sac(Learner):
                 f"buffer_size: expected at least {(self._window + 1) * env.num_envs} steps, for a window of "
                 f"{self._window} in {env.num_envs} environments, got {config.buffer_size}"
             )
+        self._recorded = recorded
         self._replay = Replay(config.buffer_size, env, policy.shape.memory_size, device)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
@@ -181,6 +195,9 @@ class Sac(Learner):
         # The actor is not to make the critics' memory forget what is bad.
         costs, told = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
         total = wrong + costs + self._loss.alpha_loss(told["log_prob"]).mean()
+        if self._recorded is not None:
+            size = costs.detach().abs()  # hardly anything but action values
+            total = total + config.imitation_weight * size * self._distance(self._recorded)
         self._optimizer.zero_grad()
         total.backward()
         self._optimizer.step()
@@ -188,6 +205,18 @@ class Sac(Learner):
         if self._memory is not None and self._late_memory is not None:
             for late, now in zip(self._late_memory.parameters(), self._memory.parameters(), strict=True):
                 late.data.lerp_(now.data, config.target_rate)
+
+    def _distance(self, recorded: Recorded) -> Tensor:
+        """Return the mean squared distance of the policy's actions from recorded ones."""
+        steps, learned = recorded.windows(self.config.batch_size // self._window, self._window, self._burn_in)
+        features = features_of(
+            self.policy.memory,
+            steps["observation"],
+            steps["previous_action"],
+            self.policy.initial_hidden(len(learned)),
+            torch.zeros_like(learned, dtype=torch.float32),
+        )
+        return functional.mse_loss(self.policy.act(features[learned]), steps["action"][learned])
 
 
 def _sac_loss(policy: SoftActor, config: SacConfig) -> SACLoss:

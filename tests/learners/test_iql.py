@@ -97,7 +97,15 @@ def constant_reward(*, terminated: bool) -> Experience:
     # After the last step the world looks as after the second: only the mask tells that there is no more.
     following = (place + 1).clamp_max(2.0)
     lengths = torch.full((8,), 3)
-    return Experience(place, torch.zeros_like(action), action, ones, following, ended, lengths)
+    return Experience(
+        observation=place,
+        previous_action=torch.zeros_like(action),
+        action=action,
+        lengths=lengths,
+        reward=ones,
+        next_observation=following,
+        terminated=ended,
+    )
 
 
 @pytest.mark.parametrize(

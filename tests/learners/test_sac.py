@@ -9,6 +9,7 @@ from toy_worlds import ConstantReward, GoToZero, Recall
 from astra_data.batched import BatchedEnv
 from astra_data.checkpoint import flatten, unflatten
 from astra_data.errors import BadInputError
+from astra_data.learners.recorded import Recorded
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.policy import PolicyShape, features_of
 from astra_data.models.soft_actor import SoftActor
@@ -20,13 +21,14 @@ def sac(
     *,
     horizon: int,
     memory: int = 0,
+    recorded: Recorded | None = None,
     **settings: Any,  # noqa: ANN401
 ) -> Sac:
     usual = {"rollout_steps": 10, "updates_per_step": 3, "batch_size": 64, "discount": 0.9}
     config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
     torch.manual_seed(0)
     shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32, 32))
-    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1)
+    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1, recorded=recorded)
 
 
 def train(learner: Sac) -> list[dict[str, float]]:
@@ -75,6 +77,21 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
     train(resumed)
     for name, value in whole.policy.state_dict().items():
         assert torch.equal(value, resumed.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_recorded_actions_are_imitated_where_rewards_leave_the_choice(memory: int) -> None:
+    action = torch.full((4, 12, 1), 0.6)
+    action[:, 9:] = -1.0  # after the end
+    previous = torch.cat([torch.zeros(4, 1, 1), action[:, :-1]], dim=1)
+    recorded = Recorded(torch.ones(4, 12, 1), previous, action, torch.full((4,), 9))
+    settings = {"horizon": 9, "memory": memory, "window": 6, "burn_in": 2, "imitation_weight": 1.0}
+    learner = sac(ConstantReward(16, math.inf), 200, recorded=recorded, **settings)
+    train(learner)
+    with torch.no_grad():
+        hidden = learner.policy.initial_hidden(1)
+        features, _ = learner.policy.remember(torch.ones(1, 1), torch.zeros(1, 1), hidden)
+        assert float(learner.policy.act(features)) == pytest.approx(0.6, abs=0.1)
 
 
 def _cloned(state: dict[str, Any]) -> dict[str, Any]:
