@@ -63,7 +63,13 @@ def test_learns_to_go_to_a_target(memory: int) -> None:
 @pytest.mark.parametrize("memory", [0, 8])
 def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
     # The replay has wrapped around by then.
-    settings = {"horizon": 7, "memory": memory, "window": 6, "burn_in": 2, "buffer_size": 8 * 25}
+    settings: dict[str, Any] = {
+        "horizon": 7,
+        "memory": memory,
+        "window": 6,
+        "burn_in": 2,
+        "buffer_size": 8 * 25,
+    }
     whole = sac(GoToZero(8), 60, **settings)
     train(whole)
     world, other_world = GoToZero(8), GoToZero(8)
@@ -85,7 +91,13 @@ def test_recorded_actions_are_imitated_where_rewards_leave_the_choice(memory: in
     action[:, 9:] = -1.0  # after the end
     previous = torch.cat([torch.zeros(4, 1, 1), action[:, :-1]], dim=1)
     recorded = Recorded(torch.ones(4, 12, 1), previous, action, torch.full((4,), 9))
-    settings = {"horizon": 9, "memory": memory, "window": 6, "burn_in": 2, "imitation_weight": 1.0}
+    settings: dict[str, Any] = {
+        "horizon": 9,
+        "memory": memory,
+        "window": 6,
+        "burn_in": 2,
+        "imitation_weight": 1.0,
+    }
     learner = sac(ConstantReward(16, math.inf), 200, recorded=recorded, **settings)
     train(learner)
     with torch.no_grad():
@@ -180,7 +192,7 @@ def test_a_window_has_to_hold_steps_to_learn_from() -> None:
 
 
 def test_the_buffer_has_to_hold_a_window() -> None:
-    sizes = {"horizon": 9, "memory": 8, "window": 6, "burn_in": 0}
+    sizes: dict[str, Any] = {"horizon": 9, "memory": 8, "window": 6, "burn_in": 0}
     with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
         sac(GoToZero(8), 10, buffer_size=55, **sizes)
     sac(GoToZero(8), 10, buffer_size=56, **sizes)
