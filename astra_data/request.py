@@ -197,10 +197,8 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_heads_to_disagree(self) -> Self:
-        for switch in ("doubt_penalty", "doubt_limit"):
-            asked = getattr(self.train, switch) or getattr(self.plus, switch)
-            if asked and self.ground.correction_heads < 2:
-                raise ValueError(f"{switch}: expected ground.correction_heads of 2 or more, got 1")
+        if (self.train.doubt_penalty or self.plus.doubt_penalty) and self.ground.correction_heads < 2:
+            raise ValueError("doubt_penalty: expected ground.correction_heads of 2 or more, got 1")
         return self
 
     @model_validator(mode="after")

@@ -51,9 +51,6 @@ class WorldConfig(Config):
     doubt_penalty: NotNegative = 0.0
     """Taken from the reward of a step for each time by which the heads of the correction disagree more than
     usual; `[ground] correction_heads` has to be 2 or more."""
-    doubt_limit: Positive | None = None
-    """A step on which they disagree more than usual by more times than this ends the episode as failed: the
-    simulator goes no farther than it knows (Kidambi et al. 2020)."""
     command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: Share = 0.0
@@ -176,7 +173,6 @@ def training_world(
         command_limit_m_s=config.command_limit_m_s,
         thinness=None if parts.thinness is None else config.support_penalty * parts.thinness,
         doubt_penalty=config.doubt_penalty,
-        doubt_limit=config.doubt_limit,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,
         tells_parameters=tells_parameters,

@@ -70,7 +70,6 @@ class SimulatorWorld:
         command_limit_m_s: float = 2.0,
         thinness: Tensor | None = None,
         doubt_penalty: float = 0.0,
-        doubt_limit: float | None = None,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
         tells_parameters: bool = False,
@@ -87,7 +86,6 @@ class SimulatorWorld:
             thinness: taken from the reward of a step to each cell of the maze's fine grid, (height, width);
                 only where there is a maze.
             doubt_penalty: taken from the reward for the grounded simulator's doubt.
-            doubt_limit: a step with more doubt fails.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
             tells_parameters: end observations with the parameters of a simulator that varies, normalised.
@@ -106,7 +104,6 @@ class SimulatorWorld:
             self._ends_at_walls = objective.ends_at_walls
         self.thinness = thinness
         self.doubt_penalty = doubt_penalty
-        self.doubt_limit = doubt_limit
         self.starts = starts
         self.data_start_share = data_start_share
         self.device = simulator.state.device
@@ -164,8 +161,6 @@ class SimulatorWorld:
         self.failed = self.objective.missed(after, self.goal)
         if self._ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
-        if self.grounded is not None and self.doubt_limit is not None:
-            self.failed = self.failed | ((self.grounded.doubt > self.doubt_limit) & ~success)
         decided = success | self.failed
         penalty = torch.zeros(self.num_envs, device=self.device)
         if self.thinness is not None and self.free is not None:

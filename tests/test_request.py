@@ -48,7 +48,6 @@ def test_a_limit_of_commands_that_does_not_reach_all_rows_is_refused() -> None:
         ({"train": SAC | {"ramp": 0.4}}, "train: ramp: expected 0 with SAC"),
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
         ({"train": {"doubt_penalty": 1.0}}, "doubt_penalty: expected ground.correction_heads of 2 or more"),
-        ({"plus": {"doubt_limit": 1.0}}, "doubt_limit: expected ground.correction_heads of 2 or more"),
         ({"train": 3}, "train: expected a table, got 3"),
         ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),
