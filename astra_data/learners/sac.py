@@ -173,7 +173,7 @@ class Sac(Learner):
             return
         seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
         nothing = self.policy.initial_hidden(len(learned))
-        acting = features_of(self.policy.memory, *seen, steps["hidden"][:, 0], first)
+        acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
         judging = features_of(self._memory, *seen, nothing, first)
         with torch.no_grad():
             following = features_of(self._late_memory, *seen, nothing, first)[:, 1:][learned]
@@ -209,8 +209,7 @@ class Sac(Learner):
     def _distance(self, recorded: Recorded) -> Tensor:
         """Return the mean squared distance of the policy's actions from recorded ones."""
         steps, learned = recorded.windows(self.config.batch_size // self._window, self._window, self._burn_in)
-        features = features_of(
-            self.policy.memory,
+        features = self.policy.remember_sequence(
             steps["observation"],
             steps["previous_action"],
             self.policy.initial_hidden(len(learned)),
