@@ -12,7 +12,8 @@ from torch import Tensor
 from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
-from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
+from astra_data.models.windows import Windows
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Number, Positive, Share
 from astra_data.seeding import derive
@@ -223,8 +224,7 @@ def telemetry(
     eigenvalues).
     """
     windows = episodes.windows
-    inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
-    latent, _ = model.encoder(inputs)
+    latent, _ = model.encode(windows)
     mask = windows.mask.bool()
     corrected = model.correct(latent, windows.action, windows.simulated_next)
     figures = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
@@ -277,8 +277,7 @@ def _explained(residual: Tensor, total: Tensor) -> float | None:
 def _fit_residual(model: GroundingModel, held_out: PairedEpisodes) -> None:
     """Fit the scatter of the target around the correction, and of its heads, on episodes not trained on."""
     windows = held_out.windows
-    inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
-    latent, _ = model.encoder(inputs)
+    latent, _ = model.encode(windows)
     opinions = model.opinions(latent, windows.action, windows.simulated_next)
     model.residual_factor.copy_(scatter_factor(held_out.steps(windows.next_state - opinions.mean(0))))
     if len(opinions) > 1:

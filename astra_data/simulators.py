@@ -5,8 +5,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.grounding_file import Grounding
-from astra_data.models.grounding import GroundingModel, Windows
+from astra_data.models.grounding import GroundingModel
 from astra_data.models.residual import ResidualModel
+from astra_data.models.windows import Windows
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.randomized import RandomizedSimulator
@@ -61,8 +62,7 @@ def hidden_before(grounding: Grounding | None, windows: Windows, every: int = 1)
         return _memory_before(grounding, windows, every)
     if not isinstance(grounding, GroundingModel):
         return None
-    inputs = grounding.encoder_input(windows.state, windows.goal, windows.previous_action)
-    _, after = grounding.encoder(inputs)
+    _, after = grounding.encode(windows)
     return functional.pad(after[:, :-1], (0, 0, 1, 0))[:, ::every]
 
 

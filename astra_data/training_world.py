@@ -122,8 +122,7 @@ def recorded_steps(task: Task, episodes: PairedEpisodes, grounding: Grounding | 
     """Return what was recorded as a policy sees it that is trained with `grounding`."""
     windows, latent = episodes.windows, None
     if isinstance(grounding, GroundingModel):
-        inputs = grounding.encoder_input(windows.state, windows.goal, windows.previous_action)
-        latent, _ = grounding.encoder(inputs)
+        latent, _ = grounding.encode(windows)
     return Recorded(
         observation=policy_observation(task.objective, windows.state, windows.goal, latent),
         previous_action=windows.previous_action,

@@ -8,8 +8,9 @@ from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding, load_history_model, save_grounding
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.models.residual import ResidualModel, ResidualShape
+from astra_data.models.windows import Windows
 from astra_data.policy_file import PolicyFile
 
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from astra_data.grounding_file import Grounding
-from astra_data.models.grounding import GroundingModel, GroundingShape, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.models.residual import ResidualModel, ResidualShape
+from astra_data.models.windows import Windows
 from astra_data.simulators import hidden_before, simulator_of, start_simulator
 from astra_data.tasks import TASKS
 

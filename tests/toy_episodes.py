@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.models.grounding import Windows
+from astra_data.models.windows import Windows
 
 
 def toy_episodes(

@@ -23,7 +23,7 @@ from astra_data.columns import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.errors import BadInputError
-from astra_data.models.grounding import RISK_STEPS, Windows
+from astra_data.models.windows import RISK_STEPS, Windows
 from astra_data.seeding import generator
 
 _COLUMNS = (

@@ -13,12 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from astra_data.models.history import HistoryEncoder, PositionFeatures, mlp, normalised
+from astra_data.models.windows import RISK_STEPS, Windows
 
 TargetKind = Literal["ema", "detach", "online"]
-
-RISK_STEPS = 20
-"""The topple head learns from so many steps before each topple: the last step alone is too rare, and by then
-the robot moves as it never does in a simulator that has no topples."""
 
 _BALL_M = 0.1
 """Unit of where the ball lies from the robot: whether it is touched is decided by less than that."""
@@ -58,31 +55,6 @@ class GroundingShape:
     corrects_reward: bool = False
     reward_dropout: float = 0.0
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Stretches of paired episodes; T steps each, the mask marks the real ones.
-
-    Attributes:
-        state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
-        goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
-        next_state: φ(s_{i+1}), (B, T, X). topples_soon: (B, T), the target ends
-            badly within `RISK_STEPS`.
-        reward: r_i, or what the task's own lacks of it, in two parts, (B, T, 2): of steps that go on, and of
-            steps that end in failure. That the goal is reached is decided, and rewarded, by the simulator.
-        mask: (B, T), 1 on real steps.
-    """
-
-    state: Tensor
-    action: Tensor
-    previous_action: Tensor
-    goal: Tensor
-    simulated_next: Tensor
-    next_state: Tensor
-    reward: Tensor
-    topples_soon: Tensor
-    mask: Tensor
 
 
 class GroundingModel(nn.Module):
@@ -183,6 +155,13 @@ class GroundingModel(nn.Module):
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
         return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
+
+    def encode(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Return the latents (B, T, Z) and hidden states (B, T, H) of histories that begin with `windows`."""
+        latent, hidden = self.encoder(
+            self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        )
+        return latent, hidden
 
     def predict_latent(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """P_lat: return mean and log-variance (..., Z) of the next latent."""

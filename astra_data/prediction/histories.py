@@ -5,7 +5,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.models.windows import Windows
 from astra_data.prediction.predictors import Predictor, bounded
 from astra_data.prediction.walks import Stretch
 

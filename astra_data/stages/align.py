@@ -12,7 +12,8 @@ from astra_data.checkpoint import finished_folder
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import load_history_model
 from astra_data.models.alignment import TargetEncoder, gaussian_mmd
-from astra_data.models.grounding import GroundingModel, Windows
+from astra_data.models.grounding import GroundingModel
+from astra_data.models.windows import Windows
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, NotNegative, Positive
 from astra_data.results.provenance import origin
@@ -112,8 +113,7 @@ def _losses(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean MMD² between p^s_i and p^t_i, and the mean squared distance of paired latents."""
     with torch.no_grad():
-        inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
-        source, _ = model.encoder(inputs)
+        source, _ = model.encode(windows)
         source_mean, source_log_variance = model.predict_latent(source, windows.action)
     target, _ = encoder.encoder(encoder.encoder_input(state, windows.goal, windows.previous_action))
     mean, log_variance = model.predict_latent(target, windows.action)

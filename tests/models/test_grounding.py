@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind, Windows
+from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
+from astra_data.models.windows import Windows
 
 NAS = LossWeights(latent=0.0, reward=0.0, state=1.0)
 LATENT_ALONE = LossWeights(latent=1.0, reward=0.0, state=0.0)
