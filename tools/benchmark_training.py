@@ -15,7 +15,6 @@ import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict
 from enum import StrEnum
-from itertools import cycle
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +24,7 @@ import numpy as np
 import torch
 import typer
 from single_file_iql import SingleFileIql
+from step_by_step import step_by_step
 from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
 
 from astra_data.ant import POSITIONS, VelocityController
@@ -238,43 +238,8 @@ def grounding(dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candid
 
     return (
         f"grounding, windows of {config.window} steps",
-        {OURS: ours, "Algorithm 1, step by step": step_by_step(training, config.window)},
+        {OURS: ours, "Algorithm 1, step by step": step_by_step(SHAPE, WEIGHTS, training, config)},
     )
-
-
-def step_by_step(episodes: PairedEpisodes, window: int) -> Stretch:
-    """Take Algorithm 1 of the paper literally: an update per trajectory, a turn of the loop per step."""
-    model = GroundingModel(SHAPE, "online")
-    optimizer = torch.optim.Adam(model.parameters(), lr=SETTINGS.ground.learning_rate)
-    order = cycle(range(len(episodes)))
-
-    def stretch() -> float:
-        number = next(order)
-        windows, length = episodes.select(torch.tensor([number])).windows, int(episodes.lengths[number])
-        hidden, loss = torch.zeros(1, SHAPE.latent_size), torch.zeros(())
-        expected: tuple[torch.Tensor, torch.Tensor] | None = None
-        for step in range(length):
-            state, action, goal = (
-                values[:, step] for values in (windows.state, windows.action, windows.goal)
-            )
-            seen = model.encoder_input(state, goal, windows.previous_action[:, step])
-            hidden = model.encoder.step(seen, hidden)
-            latent = model.encoder.latent(hidden)
-            if expected is not None:
-                mean, log_variance = expected
-                surprise = (latent - mean).square() / log_variance.exp() + log_variance
-                loss = loss + WEIGHTS.latent * 0.5 * surprise.mean()
-            expected = model.predict_latent(latent, action)
-            reward = model.predict_reward(latent, action)
-            loss = loss + WEIGHTS.reward * (reward - windows.reward[:, step].sum(-1)).square().mean()
-            corrected = model.correct(latent, action, windows.simulated_next[:, step])
-            loss = loss + WEIGHTS.state * (corrected - windows.next_state[:, step]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        return length / window
-
-    return stretch
 
 
 def target(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
