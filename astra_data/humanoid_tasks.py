@@ -65,9 +65,11 @@ _JOINT_QUANTITIES: Quantities = {
     "joints_rad": tuple(range(_COUNT)),
     "joint_rates_rad_s": tuple(range(_COUNT, 2 * _COUNT)),
 }
-_MASS_QUANTITIES: Quantities = {
+_BODY_QUANTITIES: Quantities = {
     "mass_m": tuple(range(2 * _COUNT, 2 * _COUNT + 3)),
     "mass_velocity_m_s": tuple(range(2 * _COUNT + 3, 2 * _COUNT + 6)),
+    "up": tuple(range(2 * _COUNT + 6, 2 * _COUNT + 9)),
+    "spin_rad_s": tuple(range(2 * _COUNT + 9, 2 * _COUNT + 12)),
 }
 _WALKER_QUANTITIES: Quantities = {
     "height_m": (0,),
@@ -127,6 +129,6 @@ HUMANOID_TASKS = (
         MassWalking(horizon=_HORIZON),
         HumanoidExtendedKinematics,
         beyond_extended_kinematics,
-        {**_JOINT_QUANTITIES, **_MASS_QUANTITIES},
+        {**_JOINT_QUANTITIES, **_BODY_QUANTITIES},
     ),
 )

@@ -46,11 +46,13 @@ def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Ten
 def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
     state: Array,
 ) -> Array:
-    """Keep all joints, and the centre of mass and its velocity: (..., 47) to (..., 40).
+    """Keep all joints, how the centre of mass moves and how the torso leans: (..., 47) to (..., 46).
 
     After the joints (34): x and y of the centre of mass, seen from the middle between the feet, and its
-    height above the floor, in m; its velocity (3) in m/s. All along the world's axes. A humanoid that falls
-    first moves its centre of mass from above its feet, then down. Dropped: how the torso is turned.
+    height above the floor, in m; its velocity (3) in m/s. These along the world's axes. A humanoid that falls
+    first moves its centre of mass from above its feet, then down. Then, along the torso's axes, which way is
+    up (3) and how fast the torso turns (3) in rad/s: what the paper calls robot-level information, with a
+    reference whose robot is shown both (Radosavovic et al. 2024). Dropped: the heading.
     """
     return _mapped(_extended_kinematics, state)
 
@@ -74,8 +76,11 @@ def beyond_kinematics(state: Tensor) -> Tensor:
 
 
 def beyond_extended_kinematics(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_extended_kinematics` drops: (..., 47) to (..., 7), likewise."""
-    return torch.cat([state[..., _QUATERNION], _RATE * state[..., _SPIN]], dim=-1)
+    """Return what `humanoid_to_extended_kinematics` drops, but for x and y: (..., 47) to (..., 2).
+
+    Where the torso's forward axis points, along the world's x and y.
+    """
+    return rotation(state[..., _QUATERNION])[..., :2, 0]
 
 
 def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
@@ -114,5 +119,7 @@ def _extended_kinematics(state: Tensor) -> Tensor:
     mass, feet = mass_and_feet(joints)
     aside = turned(mass - feet.mean(-2))[..., :2]
     height = state[..., _HEIGHT, None] + turned(mass)[..., 2:]
-    swept = torch.linalg.cross(state[..., _SPIN], mass) + mass_velocity(joints, rates)
-    return torch.cat([joints, rates, aside, height, state[..., _VELOCITY] + turned(swept)], dim=-1)
+    spin = state[..., _SPIN]
+    swept = torch.linalg.cross(spin, mass) + mass_velocity(joints, rates)
+    velocity = state[..., _VELOCITY] + turned(swept)
+    return torch.cat([joints, rates, aside, height, velocity, turn[..., 2, :], spin], dim=-1)

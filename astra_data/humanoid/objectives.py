@@ -127,7 +127,7 @@ class JointWalking(Walking):
 
 @dataclass(frozen=True)
 class MassWalking(Walking):
-    """Of joints and centre of mass, states (..., 40).
+    """Of joints, centre of mass and how the torso leans, states (..., 46).
 
     Attributes:
         lowest_mass_m: a centre of mass lower than this has fallen, two steps before the target says so on
@@ -137,16 +137,16 @@ class MassWalking(Walking):
     lowest_mass_m: float = 0.65
 
     def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return φ of target states (count, 47), (count, 40)."""
+        """Return φ of target states (count, 47), (count, 46)."""
         return humanoid_to_extended_kinematics(state)
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return the state (..., 40), rates scaled."""
-        joints, rates, mass = state.split((_COUNT, _COUNT, 6), dim=-1)
-        return torch.cat([joints, _RATE * rates, mass], dim=-1)
+        """Return the state (..., 46), rates scaled."""
+        joints, rates, body, spin = state.split((_COUNT, _COUNT, 9, 3), dim=-1)
+        return torch.cat([joints, _RATE * rates, body, _RATE * spin], dim=-1)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which centres of mass (B,) of states (B, 40) have fallen."""
+        """Tell which centres of mass (B,) of states (B, 46) have fallen."""
         return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:

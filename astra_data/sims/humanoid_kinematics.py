@@ -7,11 +7,13 @@ the hips, 18 at the knees. Within commands' ranges that asks no motor for more t
 humanoid under random commands, each held for 7 steps, angles of commanded joints are 0.24 rad off after 10
 steps; joints that reach their targets at once are 0.36 rad off, joints that do not move 0.30 rad.
 
-The extended simulator adds the centre of mass and its velocity. The torso stays level and looks along x, so
-that the joints alone say how the centre of mass moves, seen from the feet. Its velocity goes toward what it
+The extended simulator adds the centre of mass and its velocity, and how the torso leans and turns. To the
+centre of mass the torso is level and looks along x, so that the joints alone say how it moves, seen from the
+feet. Its velocity goes toward what it
 would be if the lower foot did not move, with a time constant of 0.3 s, about that of a body of its height
 when it topples; the height follows the velocity. Without that delay, joints that weigh nothing throw the body
-about: under those commands, its velocity along x is 3.3 m/s off after a single step, and not 0.17 m/s.
+about: under those commands, its velocity along x is 3.3 m/s off after a single step, and not 0.17 m/s. The
+torso turns on as it did, slowed with the same time constant.
 
 Both leave out:
 
@@ -23,12 +25,14 @@ The extended one leaves out:
 
 * Falling by itself: there is no weight. A centre of mass that has left the feet stays beside them, and sinks
   no faster than it did. The state can tell a fall, and so a correction of it can make one.
-* How the body leans and turns: the motion that legs give to the centre of mass is as of an upright one.
+* What turns the torso, and what its turning does: the motion that legs give to the centre of mass is as of an
+  upright one.
 * Flight, slipping and double support: one foot always stands, the other never brakes. The floor is nowhere.
 """
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from astra_data.columns import ABSTRACT_STATE, Column
 from astra_data.free_states import FreeStates
@@ -47,7 +51,9 @@ from astra_data.humanoid.skeleton import mass_and_feet
 
 _COUNT = len(JOINTS)
 _CENTRE = slice(2 * _COUNT, 2 * _COUNT + 3)
-_VELOCITY = slice(2 * _COUNT + 3, None)
+_VELOCITY = slice(2 * _COUNT + 3, 2 * _COUNT + 6)
+_UP = slice(2 * _COUNT + 6, 2 * _COUNT + 9)
+_SPIN = slice(2 * _COUNT + 9, None)
 _NAMES = (*JOINTS, *(f"{name}_rate" for name in JOINTS))
 _UNITS = ["rad"] * _COUNT + ["rad/s"] * _COUNT
 
@@ -108,21 +114,26 @@ class HumanoidKinematics(FreeStates):
 
 
 class HumanoidExtendedKinematics(HumanoidKinematics):
-    """The same, with the centre of mass and its velocity.
+    """The same, with the centre of mass and its velocity, and how the torso leans and turns.
 
     Attributes:
-        state: (B, 40) float32, as `humanoid_to_extended_kinematics` makes it.
+        state: (B, 46) float32, as `humanoid_to_extended_kinematics` makes it.
     """
 
     abstract_state = Column(
         ABSTRACT_STATE,
-        size=2 * _COUNT + 6,
-        names=(*_NAMES, "mass_x", "mass_y", "mass_z", "mass_vx", "mass_vy", "mass_vz"),
-        meaning="angles and rates of all joints; centre of mass, from between the feet, and its velocity",
+        size=2 * _COUNT + 12,
+        names=(
+            *_NAMES,
+            *("mass_x", "mass_y", "mass_z", "mass_vx", "mass_vy", "mass_vz"),
+            *("up_x", "up_y", "up_z", "wx", "wy", "wz"),
+        ),
+        meaning="angles and rates of all joints; centre of mass, from between the feet, and its velocity; "
+        "which way is up from the torso, and how fast it turns",
         astra={
-            "unit": [*_UNITS, *["m"] * 3, *["m/s"] * 3],
-            "frame": ["joint"] * 2 * _COUNT + ["world"] * 6,
-            "role": ["invariant"] * 2 * _COUNT + ["vector", "vector", "invariant"] * 2,
+            "unit": [*_UNITS, *["m"] * 3, *["m/s"] * 3, *["1"] * 3, *["rad/s"] * 3],
+            "frame": ["joint"] * 2 * _COUNT + ["world"] * 6 + ["body"] * 6,
+            "role": ["invariant"] * 2 * _COUNT + ["vector", "vector", "invariant"] * 2 + ["invariant"] * 6,
         },
     )
     abstraction = staticmethod(humanoid_to_extended_kinematics)
@@ -140,7 +151,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         Args:
             num_envs: B.
             ranges: what commands stand for.
-            follow_s: time constant of the body's velocity, above 0.
+            follow_s: time constant of the body's velocity and spin, above 0.
             device: torch device.
         """
         super().__init__(num_envs, ranges=ranges, device=device)
@@ -152,7 +163,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         return {**super().parameters, "follow_s": self.follow_s}
 
     def _moved(self, action: Tensor) -> Tensor:
-        """Return joints, centre of mass and its velocity (B, 40) after the step."""
+        """Return joints, centre of mass and its velocity, lean and spin (B, 46) after the step."""
         joints = super()._moved(action)
         mass, feet = mass_and_feet(self.state[:, :_COUNT])
         later_mass, later_feet = mass_and_feet(joints[:, :_COUNT])
@@ -163,4 +174,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         share = -torch.expm1(-self._timestep_s / self.follow_s)
         velocity = torch.lerp(self.state[:, _VELOCITY], driven, share)
         shift = torch.cat([aside[:, :2], velocity[:, 2:] * self._timestep_s], dim=-1)
-        return torch.cat([joints, self.state[:, _CENTRE] + shift, velocity], dim=-1)
+        spin = (1.0 - share) * self.state[:, _SPIN]
+        up = self.state[:, _UP]
+        up = functional.normalize(up - self._timestep_s * torch.linalg.cross(spin, up), dim=-1)
+        return torch.cat([joints, self.state[:, _CENTRE] + shift, velocity, up, spin], dim=-1)

@@ -103,12 +103,26 @@ def test_centre_of_mass_and_its_velocity_are_mujocos() -> None:
     state = states(20)
     abstract = humanoid_to_extended_kinematics(state)
     np.testing.assert_array_equal(abstract[:, :34], humanoid_to_kinematics(state))
-    for row, ours in zip(state, abstract[:, 34:], strict=True):
+    for row, ours in zip(state, abstract[:, 34:40], strict=True):
         data = posed(row)
         between = np.mean([data.geom(foot).xpos for foot in FEET], axis=0)
         centre = data.subtree_com[1]
         np.testing.assert_allclose(ours[:3], [*(centre - between)[:2], centre[2]], atol=1e-12)
         np.testing.assert_allclose(ours[3:], data.subtree_linvel[1], atol=1e-12)
+
+
+def test_the_lean_of_the_torso_is_told_from_within_and_its_heading_is_not() -> None:
+    state = states(20)
+    abstract = humanoid_to_extended_kinematics(state)
+    for row, ours in zip(state, abstract[:, 40:], strict=True):
+        np.testing.assert_allclose(ours[:3], posed(row).body("torso").xmat.reshape(3, 3)[2], atol=1e-12)
+        np.testing.assert_array_equal(ours[3:], row[27:30])
+    headed = np.zeros(4)
+    turn = np.array([np.cos(0.4), 0.0, 0.0, np.sin(0.4)])
+    for row in state:
+        mujoco.mju_mulQuat(headed, turn, row[3:7])
+        row[3:7] = headed
+    np.testing.assert_allclose(humanoid_to_extended_kinematics(state)[:, 40:], abstract[:, 40:], atol=1e-12)
 
 
 def test_where_it_stands_is_dropped() -> None:

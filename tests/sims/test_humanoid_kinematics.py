@@ -120,7 +120,7 @@ def test_the_centre_of_mass_moves_as_if_the_lower_foot_stood(bent: int) -> None:
     foot = {5: 0, 9: 1}[bent]
     assert feet[foot, 2] < feet[1 - foot, 2] - 0.01
     way = (later_mass - later_feet[foot]) - (mass - feet[foot])
-    np.testing.assert_allclose(after[0, 37:], way / TIMESTEP_S, atol=1e-4)
+    np.testing.assert_allclose(after[0, 37:40], way / TIMESTEP_S, atol=1e-4)
     moved = (after - before)[0, 34:37].numpy()
     assert moved[2] == pytest.approx(way[2], abs=1e-6)
     aside = (later_mass - later_feet.mean(axis=0)) - (mass - feet.mean(axis=0))
@@ -131,7 +131,7 @@ def test_the_centre_of_mass_moves_as_if_the_lower_foot_stood(bent: int) -> None:
 def test_the_velocity_follows_late() -> None:
     simulator = HumanoidExtendedKinematics(1, follow_s=0.3)
     state = simulator.state.clone()
-    state[0, 34:] = torch.tensor([0.2, 0.0, 0.9, 0.5, -0.1, -0.4])
+    state[0, 34:40] = torch.tensor([0.2, 0.0, 0.9, 0.5, -0.1, -0.4])
     # Joints that are where commands want them leave all to the velocity.
     rest = CommandRanges().targets(torch.zeros(4))
     state[0, COMMANDED] = rest
@@ -139,10 +139,27 @@ def test_the_velocity_follows_late() -> None:
     for _ in range(20):
         after = simulator.step(torch.zeros(1, 4))[0]
     slowed = math.exp(-20 * 0.015 / 0.3)
-    torch.testing.assert_close(after[37:], slowed * state[0, 37:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(after[37:40], slowed * state[0, 37:40], atol=1e-4, rtol=0)
     torch.testing.assert_close(after[34:36], state[0, 34:36], atol=1e-5, rtol=0)
     # About the integral of the falling velocity: 0.4 m/s for a time of 0.3 s times its lost share.
     assert float(after[36]) == pytest.approx(0.9 - 0.4 * 0.3 * (1 - slowed), abs=0.003)
+
+
+def test_the_torso_turns_on_and_ever_slower() -> None:
+    simulator = HumanoidExtendedKinematics(1, follow_s=0.3)
+    state = simulator.state.clone()
+    assert state[0, 40:].tolist() == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    spin = torch.tensor([0.0, 0.8, 0.0])
+    state[0, 43:] = spin
+    simulator.reset_to(state)
+    for _ in range(20):
+        after = simulator.step(torch.zeros(1, 4))[0]
+    slowed = math.exp(-20 * 0.015 / 0.3)
+    torch.testing.assert_close(after[43:], slowed * spin, atol=1e-5, rtol=0)
+    # Leaning forward, its own forward axis points down: up is behind.
+    lean = 0.8 * 0.3 * (1 - slowed)
+    expected = torch.tensor([-math.sin(lean), 0.0, math.cos(lean)])
+    torch.testing.assert_close(after[40:43], expected, atol=0.01, rtol=0)
 
 
 def test_a_falling_humanoid_can_be_told_from_a_standing_one() -> None:

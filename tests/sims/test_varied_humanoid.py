@@ -155,13 +155,13 @@ def test_friction_and_timestep_change_how_far_joints_get(kind: Kind) -> None:
 
 def test_a_longer_step_slows_the_body_and_moves_it_for_longer() -> None:
     state = HumanoidExtendedKinematics(2).state.clone()
-    state[:, 34:] = torch.tensor([0.2, 0.0, 0.9, 0.5, -0.1, -0.4])
+    state[:, 34:40] = torch.tensor([0.2, 0.0, 0.9, 0.5, -0.1, -0.4])
     # Joints that are where commands want them leave all to the velocity.
     state[:, COMMANDED] = CommandRanges().targets(torch.zeros(4))
     simulator = varied(HumanoidExtendedKinematics, state, JointVariation(timestep_scale=(2.0, 2.0)))
     after = simulator.step(torch.zeros(2, 4))[0]
     slowed = math.exp(-0.03 / 0.3)
-    torch.testing.assert_close(after[37:], slowed * state[0, 37:], atol=1e-5, rtol=0)
+    torch.testing.assert_close(after[37:40], slowed * state[0, 37:40], atol=1e-5, rtol=0)
     assert float(after[36]) == pytest.approx(0.9 - 0.4 * slowed * 0.03, abs=1e-5)
 
 
