@@ -1,4 +1,5 @@
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 import fake_stages
@@ -7,6 +8,9 @@ from pydantic import create_model
 
 if TYPE_CHECKING:
     from astra_data.request import Recipe
+
+# Before torch and numpy are loaded: tests run side by side, a core each.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture
