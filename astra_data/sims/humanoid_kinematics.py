@@ -9,11 +9,10 @@ steps; joints that reach their targets at once are 0.36 rad off, joints that do 
 
 The extended simulator adds the centre of mass and its velocity, and how the torso leans and turns. To the
 centre of mass the torso is level and looks along x, so that the joints alone say how it moves, seen from the
-feet. Its velocity goes toward what it
-would be if the lower foot did not move, with a time constant of 0.3 s, about that of a body of its height
-when it topples; the height follows the velocity. Without that delay, joints that weigh nothing throw the body
-about: under those commands, its velocity along x is 3.3 m/s off after a single step, and not 0.17 m/s. The
-torso turns on as it did, slowed with the same time constant.
+feet. Its velocity goes toward what it would be if the lower foot did not move, with a time constant of 0.3 s,
+about that of a body of its height when it topples; the height follows the velocity. Without that delay,
+joints that weigh nothing throw the body about: under those commands, its velocity along x is 3.3 m/s off
+after a single step, and not 0.17 m/s. The torso turns on as it did, slowed with the same time constant.
 
 Both leave out:
 
