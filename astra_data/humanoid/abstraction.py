@@ -13,6 +13,7 @@ from torch import Tensor
 
 from astra_data.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
 from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
+from astra_data.humanoid.spread import in_spreads
 
 _HEIGHT = 2
 _QUATERNION = slice(3, 7)
@@ -20,7 +21,6 @@ _JOINTS = slice(7, POSITIONS)
 _VELOCITY = slice(POSITIONS, POSITIONS + 3)
 _SPIN = slice(POSITIONS + 3, POSITIONS + 6)
 _RATES = slice(POSITIONS + 6, None)
-_RATE = 0.2
 
 
 def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
@@ -58,21 +58,22 @@ def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.floa
 
 
 def beyond_walker2d(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_walker2d` drops: (..., 47) to (..., 34).
+    """Return what `humanoid_to_walker2d` drops: (..., 47) to (..., 34), in spreads.
 
-    How the torso is turned and spins, the velocity along y, and the joints that no command moves; a fifth of
-    all angular rates, which reach 10 rad/s, and all else in SI units.
+    How the torso is turned and spins, the velocity along y, and the joints that no command moves.
     """
+    seen = in_spreads(state)
     rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
-    joints, rates = state[..., _JOINTS][..., rest], state[..., _RATES][..., rest]
-    turned = [state[..., _QUATERNION], joints, state[..., _VELOCITY][..., 1:2]]
-    return torch.cat([*turned, _RATE * state[..., _SPIN], _RATE * rates], dim=-1)
+    joints, rates = seen[..., _JOINTS][..., rest], seen[..., _RATES][..., rest]
+    turned = [seen[..., _QUATERNION], joints, seen[..., _VELOCITY][..., 1:2]]
+    return torch.cat([*turned, seen[..., _SPIN], rates], dim=-1)
 
 
 def beyond_kinematics(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_kinematics` drops, but for x and y: (..., 47) to (..., 11), likewise."""
-    height, quaternion = state[..., [_HEIGHT]], state[..., _QUATERNION]
-    return torch.cat([height, quaternion, state[..., _VELOCITY], _RATE * state[..., _SPIN]], dim=-1)
+    """Return what `humanoid_to_kinematics` drops, but for x and y: (..., 47) to (..., 11), in spreads."""
+    seen = in_spreads(state)
+    height, quaternion = seen[..., [_HEIGHT]], seen[..., _QUATERNION]
+    return torch.cat([height, quaternion, seen[..., _VELOCITY], seen[..., _SPIN]], dim=-1)
 
 
 def beyond_extended_kinematics(state: Tensor) -> Tensor:

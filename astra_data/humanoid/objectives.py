@@ -10,6 +10,8 @@ do with the target's there: the level torso that it goes by is what such a body 
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -22,13 +24,22 @@ from astra_data.humanoid.abstraction import (
     humanoid_to_walker2d,
 )
 from astra_data.humanoid.locomotion import Locomotion
-from astra_data.humanoid.model import COMMANDED, JOINTS, TIMESTEP_S
+from astra_data.humanoid.model import COMMANDED, JOINTS, STANDING, TIMESTEP_S
 from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity
+from astra_data.humanoid.spread import (
+    JOINT_RATES_RAD_S,
+    JOINTS_RAD,
+    LEAN_RAD,
+    POSITION_M,
+    SPIN_RAD_S,
+    VELOCITY_M_S,
+)
+from astra_data.models.history import normalised
 from astra_data.objective import Objective
 
 _COUNT = len(JOINTS)
-_RATE = 0.2
-"""Factor on angular rates, which reach 10 rad/s."""
+_LEGS_RAD = tuple(JOINTS_RAD[joint] for joint in COMMANDED)
+_LEG_RATES_RAD_S = tuple(JOINT_RATES_RAD_S[joint] for joint in COMMANDED)
 
 
 @dataclass(frozen=True)
@@ -43,6 +54,8 @@ class Walking(Objective):
     action_size = len(COMMANDED)
     goal_size = 0
     is_lasting = True
+    spread: ClassVar[tuple[float, ...]]
+    """How far each number of a state usually is from standing, (X,)."""
 
     locomotion: Locomotion = field(default_factory=Locomotion)
     failure_reward: float = field(default=-5.0, kw_only=True)
@@ -50,6 +63,14 @@ class Walking(Objective):
     @abstractmethod
     def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return φ of target states (count, 47), (count, X)."""
+
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return how far states (..., X) are from standing, in spreads and cut off at ±5, (..., X)."""
+        return normalised(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
+
+    @cached_property
+    def _standing(self) -> NDArray[np.float64]:
+        return self.abstracted(np.array(STANDING))
 
     @abstractmethod
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
@@ -81,13 +102,15 @@ class Walking(Objective):
 class PlanarWalking(Walking):
     """Of the planar walker, states (..., 15); it falls as the target does: at no healthy height."""
 
+    spread = (
+        *(POSITION_M, LEAN_RAD, *_LEGS_RAD),
+        *(VELOCITY_M_S, VELOCITY_M_S, SPIN_RAD_S, *_LEG_RATES_RAD_S),
+        *(1.0, 1.0),
+    )
+
     def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return φ of target states (count, 47), (count, 15)."""
         return humanoid_to_walker2d(state)
-
-    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return the state (..., 15), rates scaled."""
-        return torch.cat([state[..., :8], _RATE * state[..., 8:13], state[..., 13:]], dim=-1)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell which torsos (B,) of states (B, 15) are at no healthy height."""
@@ -109,13 +132,11 @@ class PlanarWalking(Walking):
 class JointWalking(Walking):
     """Of the joints alone, states (..., 34): nothing in them tells a fall, so every episode succeeds."""
 
+    spread = (*JOINTS_RAD, *JOINT_RATES_RAD_S)
+
     def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return φ of target states (count, 47), (count, 34)."""
         return humanoid_to_kinematics(state)
-
-    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return the state (..., 34), rates scaled."""
-        return torch.cat([state[..., :_COUNT], _RATE * state[..., _COUNT:]], dim=-1)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return how fast a level torso goes over its lower foot, which does not slip, (B,) in m/s."""
@@ -134,16 +155,16 @@ class MassWalking(Walking):
             average; that of one who stands is 0.9 m high.
     """
 
+    spread = (
+        *JointWalking.spread,
+        *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3),
+    )
+
     lowest_mass_m: float = 0.65
 
     def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return φ of target states (count, 47), (count, 46)."""
         return humanoid_to_extended_kinematics(state)
-
-    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return the state (..., 46), rates scaled."""
-        joints, rates, body, spin = state.split((_COUNT, _COUNT, 9, 3), dim=-1)
-        return torch.cat([joints, _RATE * rates, body, _RATE * spin], dim=-1)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Tell which centres of mass (B,) of states (B, 46) have fallen."""

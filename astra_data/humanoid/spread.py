@@ -1,0 +1,31 @@
+"""How far from standing the humanoid's numbers are while it walks, so that networks see each about one long.
+
+Standard deviations of walking, rounded. Joints that no command moves give way by hundredths of a radian, and
+that tells what pulls at them: a network fitted to recorded actions lasts 566 steps on angles in radians and a
+fifth of rates in rad/s, 730 on numbers of one length (64 episodes of `humanoid-extended`).
+"""
+
+from torch import Tensor
+
+from astra_data.humanoid.model import COMMANDED, JOINTS, STANDING
+from astra_data.models.history import normalised
+
+JOINTS_RAD = tuple(0.3 if joint in COMMANDED else 0.025 for joint in range(len(JOINTS)))
+JOINT_RATES_RAD_S = tuple(2.5 if joint in COMMANDED else 0.6 for joint in range(len(JOINTS)))
+POSITION_M = 0.07
+VELOCITY_M_S = 0.3
+LEAN_RAD = 0.1
+SPIN_RAD_S = 1.0
+
+_QUATERNION = 0.2
+_STATE = (
+    *([POSITION_M] * 3 + [_QUATERNION] * 4),
+    *JOINTS_RAD,
+    *([VELOCITY_M_S] * 3 + [SPIN_RAD_S] * 3),
+    *JOINT_RATES_RAD_S,
+)
+
+
+def in_spreads(state: Tensor) -> Tensor:
+    """Return how far target states (..., 47) are from standing, cut off at 5 spreads, (..., 47)."""
+    return normalised(state, state.new_tensor(STANDING), state.new_tensor(_STATE))
