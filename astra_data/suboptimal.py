@@ -1,11 +1,10 @@
 """Policies that were stopped early: better than chance, far from good."""
 
-from collections import deque
 from typing import Any
 
-import numpy as np
 import torch
 
+from astra_data.behaviors import PolicyBehavior
 from astra_data.deployment import DeployedPolicy
 from astra_data.errors import BadInputError
 from astra_data.learners.ppo import Ppo, PpoConfig
@@ -31,8 +30,8 @@ _SAC_SIZES = (256, 256)
 type Told = dict[str, Any]
 """What a dataset records about the behaviour."""
 
-_RECENT = 50
-"""Episodes that tell how long they last at present."""
+_TRIALS = 32
+"""Episodes after each iteration, which tell how long they last by now."""
 
 
 def suboptimal_by_ppo(
@@ -76,21 +75,34 @@ def suboptimal_by_sac(
     actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))
     config = _SAC.model_copy(update={"total_steps": steps})
     sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
-    ended: deque[tuple[float, float]] = deque()
+    deployed = DeployedPolicy(task, actor, observed="full")
     lasted = 0.0
     while not sac.done and lasted < episode_steps:
-        metrics = sac.iterate()
-        if metrics["episodes"]:
-            ended.append((metrics["episodes"], metrics["episode_steps"]))
-        counts, means = zip(*ended, strict=True) if ended else ((0.0,), (0.0,))
-        if sum(counts) >= _RECENT:
-            lasted = float(np.average(means, weights=counts))
-        while sum(count for count, _ in list(ended)[1:]) >= _RECENT:
-            ended.popleft()
+        sac.iterate()
+        lasted = _lasts(deployed, derive(seed, f"trial {sac.steps}"), num_threads)
         share = max(sac.steps / steps, lasted / episode_steps)
         progress(min(1.0, share), f"training the behaviour: episodes last {lasted:.0f} steps")
     told = _told(sac.steps, actor, world, config)
-    return DeployedPolicy(task, actor.requires_grad_(False), observed="full"), told
+    actor.requires_grad_(False)
+    return deployed, told
+
+
+def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:
+    """Return how many steps episodes of the policy last that draws its actions, on average.
+
+    Episodes that end while it learns tell that too late: they began when it was worse.
+    """
+    behavior, task = PolicyBehavior(deployed), deployed.task
+    env = task.target(_TRIALS, seed=derive(seed, "starts"), num_threads=num_threads)
+    env.reset()
+    behavior.start(_TRIALS, seed)
+    active, lasted = torch.ones(_TRIALS, dtype=torch.bool), 0
+    for _ in range(task.objective.horizon):
+        if not active.any():
+            break
+        lasted += int(active.sum())
+        active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
+    return lasted / _TRIALS
 
 
 def _told(steps: int, policy: Policy, world: TargetWorld, config: Config) -> Told:
