@@ -5,7 +5,7 @@ from typing import Any
 
 from astra_data.deployment import Observed
 from astra_data.policy_file import PolicyFile
-from astra_data.recipe import Config, Count
+from astra_data.recipe import Config, Count, Number
 from astra_data.target_world import TargetStarts, TargetWorld
 from astra_data.training import Training, train_in
 
@@ -17,6 +17,8 @@ class TargetConfig(Config):
     """Environment steps in all; by default as many."""
     num_envs: Count | None = None
     """Target environments stepped side by side; by default as many."""
+    memory_size: Number | None = None
+    """Of the policy's own GRU; by default as large. A policy that sees the complete state needs none."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class InTarget:
     """Train in the target, from its own rewards.
 
     Attributes:
-        observed: whether the policy, which has a memory, sees φ of the state or all of it.
+        observed: whether the policy sees φ of the state or all of it.
     """
 
     observed: Observed

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from astra_data.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
 from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
@@ -27,10 +28,11 @@ def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tenso
     """Keep what a planar walker has: (..., 47) to (..., 15).
 
     Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee;
-    velocities of all of these, that along x first; and whether left and right foot touch the floor, 1 or 0.
-    The pitch is the angle by which the torso's forward axis points below the horizon, whatever its heading.
-    Velocities along x and z are the torso's in the world, m/s. Dropped: the velocity along y, how the torso
-    rolls and turns, and the joints that no command moves, though the feet's height is theirs too.
+    velocities of all of these, after the torso's forward one; and whether left and right foot touch the
+    floor, 1 or 0. The pitch is the angle by which the torso's forward axis points below the horizon, whatever
+    its heading. Velocities forward, which is level, and up are in m/s. Dropped: the velocity to the side, the
+    heading, how the torso rolls and turns, and the joints that no command moves, though the feet's height is
+    theirs too.
     """
     return _mapped(_walker2d, state)
 
@@ -49,10 +51,11 @@ def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.floa
     """Keep all joints, how the centre of mass moves and how the torso leans: (..., 47) to (..., 46).
 
     After the joints (34): x and y of the centre of mass, seen from the middle between the feet, and its
-    height above the floor, in m; its velocity (3) in m/s. These along the world's axes. A humanoid that falls
-    first moves its centre of mass from above its feet, then down. Then, along the torso's axes, which way is
-    up (3) and how fast the torso turns (3) in rad/s: what the paper calls robot-level information, with a
-    reference whose robot is shown both (Radosavovic et al. 2024). Dropped: the heading.
+    height above the floor, in m; its velocity (3) in m/s. These along level axes of which x is the torso's
+    heading, so that a step looks the same in whatever direction it goes. A humanoid that falls first moves
+    its centre of mass from above its feet, then down. Then, along the torso's axes, which way is up (3) and
+    how fast the torso turns (3) in rad/s: what the paper calls robot-level information, with a reference
+    whose robot is shown both (Radosavovic et al. 2024). Dropped: the heading.
     """
     return _mapped(_extended_kinematics, state)
 
@@ -79,9 +82,9 @@ def beyond_kinematics(state: Tensor) -> Tensor:
 def beyond_extended_kinematics(state: Tensor) -> Tensor:
     """Return what `humanoid_to_extended_kinematics` drops, but for x and y: (..., 47) to (..., 2).
 
-    Where the torso's forward axis points, along the world's x and y.
+    The heading, as cosine and sine.
     """
-    return rotation(state[..., _QUATERNION])[..., :2, 0]
+    return _heading(rotation(state[..., _QUATERNION]))
 
 
 def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
@@ -91,10 +94,11 @@ def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
 
 
 def _walker2d(state: Tensor) -> Tensor:
-    height, velocity, spin = state[..., _HEIGHT], state[..., _VELOCITY], state[..., _SPIN]
-    joints = state[..., _JOINTS]
+    height, spin = state[..., _HEIGHT], state[..., _SPIN]
+    joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
+    velocity = _headed(turn, state[..., _VELOCITY])
     # How far the torso's axes point up.
-    forward, left, up = rotation(state[..., _QUATERNION])[..., 2, :].unbind(-1)
+    forward, left, up = turn[..., 2, :].unbind(-1)
     level = torch.hypot(left, up).clamp_min(1e-6)
     pitch = torch.atan2(-forward, level)
     pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level
@@ -118,9 +122,21 @@ def _extended_kinematics(state: Tensor) -> Tensor:
         return (turn @ vector.unsqueeze(-1)).squeeze(-1)
 
     mass, feet = mass_and_feet(joints)
-    aside = turned(mass - feet.mean(-2))[..., :2]
+    aside = _headed(turn, turned(mass - feet.mean(-2)))[..., :2]
     height = state[..., _HEIGHT, None] + turned(mass)[..., 2:]
     spin = state[..., _SPIN]
     swept = torch.linalg.cross(spin, mass) + mass_velocity(joints, rates)
-    velocity = state[..., _VELOCITY] + turned(swept)
+    velocity = _headed(turn, state[..., _VELOCITY] + turned(swept))
     return torch.cat([joints, rates, aside, height, velocity, turn[..., 2, :], spin], dim=-1)
+
+
+def _heading(turn: Tensor) -> Tensor:
+    """Return where torsos turned by (..., 3, 3) look on the floor, as cosine and sine (..., 2)."""
+    return functional.normalize(turn[..., :2, 0], dim=-1)
+
+
+def _headed(turn: Tensor, vector: Tensor) -> Tensor:
+    """Return vectors (..., 3) along level axes of which x is where torsos turned by (..., 3, 3) look."""
+    cosine, sine = _heading(turn).unbind(-1)
+    x, y, z = vector.unbind(-1)
+    return torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=-1)

@@ -8,7 +8,7 @@ humanoid under random commands, each held for 7 steps, angles of commanded joint
 steps; joints that reach their targets at once are 0.36 rad off, joints that do not move 0.30 rad.
 
 The extended simulator adds the centre of mass and its velocity, and how the torso leans and turns. To the
-centre of mass the torso is level and looks along x, so that the joints alone say how it moves, seen from the
+centre of mass the torso is level, so that the joints alone say how it moves, seen from the
 feet. Its velocity goes toward what it would be if the lower foot did not move, with a time constant of 0.3 s,
 about that of a body of its height when it topples; the height follows the velocity. Without that delay,
 joints that weigh nothing throw the body about: under those commands, its velocity along x is 3.3 m/s off
@@ -127,12 +127,12 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
             *("mass_x", "mass_y", "mass_z", "mass_vx", "mass_vy", "mass_vz"),
             *("up_x", "up_y", "up_z", "wx", "wy", "wz"),
         ),
-        meaning="angles and rates of all joints; centre of mass, from between the feet, and its velocity; "
-        "which way is up from the torso, and how fast it turns",
+        meaning="angles and rates of all joints; along the heading, centre of mass, from between the feet, "
+        "and its velocity; which way is up from the torso, and how fast it turns",
         astra={
             "unit": [*_UNITS, *["m"] * 3, *["m/s"] * 3, *["1"] * 3, *["rad/s"] * 3],
-            "frame": ["joint"] * 2 * _COUNT + ["world"] * 6 + ["body"] * 6,
-            "role": ["invariant"] * 2 * _COUNT + ["vector", "vector", "invariant"] * 2 + ["invariant"] * 6,
+            "frame": ["joint"] * 2 * _COUNT + ["heading"] * 6 + ["body"] * 6,
+            "role": ["invariant"] * (2 * _COUNT + 12),
         },
     )
     abstraction = staticmethod(humanoid_to_extended_kinematics)

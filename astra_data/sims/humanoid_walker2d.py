@@ -61,7 +61,7 @@ class HumanoidWalker2d(FreeStates):
         meaning="torso, legs and foot contacts of a planar walker",
         astra={
             "unit": ["m", *["rad"] * 5, "m/s", "m/s", *["rad/s"] * 5, "1", "1"],
-            "frame": ["world"] * 2 + ["joint"] * 4 + ["world"] * 3 + ["joint"] * 4 + ["world"] * 2,
+            "frame": ["heading"] * 2 + ["joint"] * 4 + ["heading"] * 3 + ["joint"] * 4 + ["world"] * 2,
             "role": ["invariant"] * 15,
         },
     )
