@@ -49,7 +49,8 @@ class SacConfig(Config):
     buffer_size: Count = 1_000_000
     """The most recent steps that are kept."""
     learning_rate: Positive = 1e-3
-    """Of actor, critics and temperature."""
+    """Of actor, critics and temperature; over the second half of the training it falls to nothing. Without
+    that it is chance how good the policy is that the training happens to end with."""
     discount: Share = 0.97
     """Of the reward, per step."""
     reward_scale: Positive = 1.0
@@ -137,6 +138,8 @@ class Sac(Learner):
 
     def _iterate(self) -> dict[str, float]:
         """Act for a stretch of steps, and learn after each; return the "temperature" of the entropy."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * min(1.0, 2.0 * self.share_left)
         for _ in range(self.rollout_steps):
             self._act()
             if len(self._replay) > self._window:

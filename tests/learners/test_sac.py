@@ -1,3 +1,4 @@
+import copy
 import math
 from typing import Any
 
@@ -58,6 +59,23 @@ def test_learns_to_go_to_a_target(memory: int) -> None:
     assert distance_after(learner.policy, 10) < 0.15
     assert learner.steps == 150 * 16
     assert metrics[-1]["reward"] > metrics[0]["reward"]
+
+
+def test_the_second_half_learns_ever_more_slowly() -> None:
+    one, other = (sac(GoToZero(8), steps, horizon=7) for steps in (40, 80))
+    for alike in (True, True, True, False):
+        one.iterate()
+        other.iterate()
+        pairs = zip(one.policy.parameters(), other.policy.parameters(), strict=True)
+        assert all(torch.equal(*pair) for pair in pairs) == alike
+    before = copy.deepcopy(other.policy)
+    steps = []
+    while not other.done:
+        other.iterate()
+        pairs = zip(before.parameters(), other.policy.parameters(), strict=True)
+        steps.append(max(float((now - then).detach().abs().max()) for now, then in pairs))
+        before = copy.deepcopy(other.policy)
+    assert steps[-1] < 0.5 * steps[0]
 
 
 @pytest.mark.parametrize("memory", [0, 8])
