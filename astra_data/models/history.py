@@ -70,9 +70,28 @@ class HistoryEncoder(nn.Module):
 
     def step(self, inputs: Tensor, hidden: Tensor) -> Tensor:
         """Take in one step `inputs` (B, I); return the next hidden state (B, Z)."""
-        (weights,) = self.recurrence.all_weights
-        return torch.gru_cell(functional.elu(self.embedding(inputs)), hidden, *weights)
+        return self._next(functional.elu(self.embedding(inputs)), hidden)
+
+    def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
+        """Encode `inputs` (B, T, I), in which episodes begin, from `hidden` (B, Z).
+
+        `start` (B, T) is 1 where a new episode begins: there the hidden state is emptied.
+
+        Returns:
+            hidden states (B, T, Z) after each step.
+        """
+        embedded = functional.elu(self.embedding(inputs)).unbind(1)
+        keep = (1.0 - start).unsqueeze(-1).unbind(1)
+        states = []
+        for step, kept in zip(embedded, keep, strict=True):
+            hidden = self._next(step, hidden * kept)
+            states.append(hidden)
+        return torch.stack(states, dim=1)
 
     def latent(self, hidden: Tensor) -> Tensor:
         """Return the latent of a hidden state (..., Z)."""
         return functional.layer_norm(hidden, (self.latent_size,))
+
+    def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:
+        (weights,) = self.recurrence.all_weights
+        return torch.gru_cell(embedded, hidden, *weights)

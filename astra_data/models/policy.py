@@ -55,12 +55,7 @@ def features_of(
     if memory is None:
         return observation
     inputs = torch.cat([observation, previous_action], dim=-1)
-    keep = 1.0 - start.unsqueeze(-1)
-    states = []
-    for step in range(inputs.shape[1]):
-        hidden = memory.step(inputs[:, step], hidden * keep[:, step])
-        states.append(hidden)
-    return torch.cat([observation, memory.latent(torch.stack(states, dim=1))], dim=-1)
+    return torch.cat([observation, memory.latent(memory.through_episodes(inputs, hidden, start))], dim=-1)
 
 
 class Policy(nn.Module, ABC):
