@@ -122,12 +122,18 @@ HORIZON = 12
 """Steps after which none has fallen yet."""
 
 
+@pytest.mark.parametrize(
+    "quaternion", [(0.9, 0.2, 0.3, 0.1), (1.0, 0.0, 0.0, 1.0)], ids=["ahead", "to the left"]
+)
 @pytest.mark.parametrize("task", HUMANOID_TASKS, ids=lambda task: task.name)
-def test_phi_and_what_is_beyond_it_lose_only_the_place(task: Task) -> None:
+def test_phi_and_what_is_beyond_it_lose_only_the_place(
+    task: Task, quaternion: tuple[float, float, float, float]
+) -> None:
     generator = torch.Generator().manual_seed(0)
     state = torch.tensor(STANDING) + 0.03 * torch.randn(47, generator=generator)
-    state[3:7] = functional.normalize(torch.tensor([0.9, 0.2, 0.3, 0.1]), dim=0)
+    state[3:7] = functional.normalize(torch.tensor(quaternion), dim=0)
     changed = state + 1e-2 * torch.eye(47)
+    changed[:, 3:7] = functional.normalize(changed[:, 3:7], dim=-1)
 
     def known(states: torch.Tensor) -> torch.Tensor:
         return torch.cat([task.abstraction(states), task.beyond(states)], dim=-1)

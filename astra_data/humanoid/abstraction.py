@@ -14,7 +14,8 @@ from torch.nn import functional
 
 from astra_data.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
 from astra_data.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
-from astra_data.humanoid.spread import in_spreads
+from astra_data.humanoid.spread import VELOCITY_M_S, in_spreads
+from astra_data.models.history import normalised
 
 _HEIGHT = 2
 _QUATERNION = slice(3, 7)
@@ -63,13 +64,14 @@ def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.floa
 def beyond_walker2d(state: Tensor) -> Tensor:
     """Return what `humanoid_to_walker2d` drops: (..., 47) to (..., 34), in spreads.
 
-    How the torso is turned and spins, the velocity along y, and the joints that no command moves.
+    How the torso is turned and spins, its velocity to the left, and the joints that no command moves.
     """
     seen = in_spreads(state)
+    velocity = _headed(rotation(state[..., _QUATERNION]), state[..., _VELOCITY])
     rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
     joints, rates = seen[..., _JOINTS][..., rest], seen[..., _RATES][..., rest]
-    turned = [seen[..., _QUATERNION], joints, seen[..., _VELOCITY][..., 1:2]]
-    return torch.cat([*turned, seen[..., _SPIN], rates], dim=-1)
+    left = normalised(velocity[..., 1:2], 0.0, VELOCITY_M_S)
+    return torch.cat([seen[..., _QUATERNION], joints, left, seen[..., _SPIN], rates], dim=-1)
 
 
 def beyond_kinematics(state: Tensor) -> Tensor:
