@@ -59,7 +59,7 @@ class EpisodeRecord:
         self._failed += failed & active
         self._contact += contact & active
         self._steps += active
-        self._return += reward * active
+        self._return += torch.where(active, reward, 0.0)
         self._positions.append(torch.where(active.unsqueeze(-1), position, torch.nan))
         self.total_steps += int(active.sum())
         self.active = active & ~success & ~failed

@@ -1,3 +1,5 @@
+import math
+
 import torch
 from torch import Tensor
 
@@ -11,11 +13,14 @@ def flags(*values: int) -> Tensor:
 def test_what_happens_after_the_end_does_not_count() -> None:
     record = EpisodeRecord(torch.zeros(3, 2))
     none = flags(0, 0, 0)
-    for step, (success, failed, contact) in enumerate(
-        [(none, none, flags(1, 1, 0)), (flags(1, 0, 0), none, none), (none, flags(1, 1, 0), flags(1, 1, 1))]
+    for step, (success, failed, contact, reward) in enumerate(
+        [
+            (none, none, flags(1, 1, 0), [1.0, 2.0, 4.0]),
+            (flags(1, 0, 0), none, none, [1.0, 2.0, 4.0]),
+            (none, flags(1, 1, 0), flags(1, 1, 1), [math.nan, 2.0, 4.0]),
+        ]
     ):
-        position = torch.full((3, 2), float(step + 1))
-        record.add(position, torch.tensor([1.0, 2.0, 4.0]), success, failed, contact)
+        record.add(torch.full((3, 2), float(step + 1)), torch.tensor(reward), success, failed, contact)
     assert record.active.tolist() == [False, False, True]
     assert record.total_steps == 3 + 3 + 2
     outcome = record.outcome()

@@ -25,6 +25,7 @@ TITLES = {
     "astra_without_latent": "ASTRA w/o L_trans",
     "astra_without_reward": "ASTRA w/o L_rew",
     "astra_task_reward": "ASTRA, task reward",
+    "behavior_cloning": "Behavior cloning",
     "iql": "IQL",
     "direct_transfer_iql": "Direct transfer + IQL",
     "target": "Target",
@@ -48,6 +49,7 @@ COLOURS = {
     "astra_without_latent": "#44AA99",
     "astra_without_reward": "#999933",
     "astra_task_reward": "#117733",
+    "behavior_cloning": "#AA4499",
     "iql": "#D55E00",
     "direct_transfer_iql": "#7B3294",
     "target": "#4D4D4D",
@@ -60,7 +62,7 @@ COLOURS = {
 }
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
-SPARE_COLOURS = ("#882255", "#AA4499", "#332288", "#661100", "#6699CC", "#88CCEE")
+SPARE_COLOURS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a colour of their own."""
 
 ROLES = {

@@ -60,8 +60,8 @@ class SacConfig(Config):
     target_rate: Share = 0.005
     """Share by which the target critics follow, per update."""
     imitation_weight: NotNegative = 0.0
-    """Of the mean squared distance from recorded actions in what the actor minimises, times the mean size of
-    the action values. 0.4 is what Fujimoto and Gu (2021) take."""
+    """Of the mean squared distance from recorded actions in what the actor minimises, times the size of the
+    mean action value, entropy included. 0.4 is what Fujimoto and Gu (2021) take, of the mean size."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:

@@ -7,7 +7,7 @@ from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
-from astra_data.methods.iql import DIRECT_TRANSFER_IQL, IQL
+from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
 from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
@@ -30,6 +30,7 @@ METHODS: dict[str, Method] = {
         ASTRA_TASK_REWARD,
         TARGET,
         FULL_OBS,
+        BEHAVIOR_CLONING,
         IQL,
         DIRECT_TRANSFER_IQL,
         FOLLOWER,

@@ -1,5 +1,6 @@
 """IQL on the target's own episodes, and direct transfer fine-tuned by it (Section V, "IQL" and "DT+IQL").
 
+And what IQL is without its critics: behavior cloning, against which the imitation in `[plus]` is to be held.
 The paper does not say whether the fine-tuning interacts with the target: ours learns from the same recorded
 episodes as every other row. On the Long Maze, after 1500 updates of the critics, the command that they value
 most has a mean cosine with the careful follower's of 0.35; of 0.50 with returns of ten steps; of 0.65 with
@@ -7,6 +8,7 @@ sines and cosines of the position as well; but of 0.41 without those where the c
 """
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -40,9 +42,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     Returns:
         the policy, which begins as `training.initial` where there is one, and the losses every few updates.
     """
-    usual = FINE_TUNING if training.initial else IqlConfig()
-    config = training.settings if isinstance(training.settings, IqlConfig) else usual
-    episodes = training.episodes
+    config, episodes = _config(training), training.episodes
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:
@@ -57,6 +57,17 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
     curve = _optimise(Iql(policy, experience, config, seed=training.seed), training)
     return PolicyFile(policy, None, episodes.reference, episodes.content_hash), curve
+
+
+def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+    """Imitate every recorded action alike, which is IQL at temperature 0; return what it returns."""
+    cloning = _config(training).model_copy(update={"temperature": 0.0, "critic_updates": 1})
+    return learn_from_episodes(replace(training, settings=cloning))
+
+
+def _config(training: Training) -> IqlConfig:
+    usual = FINE_TUNING if training.initial else IqlConfig()
+    return training.settings if isinstance(training.settings, IqlConfig) else usual
 
 
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
@@ -108,6 +119,10 @@ def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
 
 
 IQL = Method(name="iql", title="IQL", learn=learn_from_episodes)
+
+BEHAVIOR_CLONING = Method(
+    name="behavior_cloning", title="Behavior cloning", learn=clone_behavior, table="iql"
+)
 
 DIRECT_TRANSFER_IQL = Method(
     name="direct_transfer_iql",

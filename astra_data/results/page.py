@@ -41,11 +41,11 @@ HOW_TO_READ = {
         "in the table. High here and low there means that the policy learned what the target does not do."
     ),
     "learning_steps": (
-        "Steps that the training episodes survive, in the simulator that the policy is trained in: mean over "
-        "seeds, band from the worst seed to the best; dashed with the `[plus]` settings. With "
-        "`data_start_share` in the recipe that share of the episodes starts in the midst of a recorded "
-        "trajectory, so these figures are not the task's; those are in the table. High here and low there "
-        "means that the policy learned what the target does not do."
+        "Steps that the training episodes last, in the simulator that the policy is trained in: mean over "
+        "seeds, band from the worst seed to the best; dashed with the `[plus]` settings. They are cut off "
+        "after `episode_steps` where the recipe sets that, and with `data_start_share` that share of them "
+        "starts in the midst of a recorded trajectory, so these figures are not the task's; those are in the "
+        "table. High here and low there means that the policy learned what the target does not do."
     ),
     "validity": (
         "A dot is one policy: a row's seed, with its mean return over the episodes. On the dashed line the "

@@ -157,6 +157,36 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(
     assert value == pytest.approx(expected, rel=0.12)
 
 
+def test_a_window_begins_with_the_memory_that_the_policy_had_when_it_acted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learner = sac(GoToZero(8), 40, horizon=9, memory=4, window=2, burn_in=0)
+    policy = learner.policy
+    acting, learning = policy.remember, policy.remember_sequence
+    acted: dict[tuple[float, ...], list[float]] = {}
+    begun: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def remember(
+        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        for moment, memory in zip(torch.cat([observation, previous], dim=-1), hidden, strict=True):
+            acted[tuple(moment.tolist())] = memory.tolist()
+        return acting(observation, previous, hidden)
+
+    def remember_sequence(
+        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor, start: torch.Tensor
+    ) -> torch.Tensor:
+        begun.append((torch.cat([observation, previous], dim=-1)[:, 0], hidden))
+        return learning(observation, previous, hidden, start)
+
+    monkeypatch.setattr(policy, "remember", remember)
+    monkeypatch.setattr(policy, "remember_sequence", remember_sequence)
+    train(learner)
+    moments, memories = (torch.cat(column) for column in zip(*begun, strict=True))
+    assert memories.tolist() == [acted[tuple(moment.tolist())] for moment in moments]
+    assert float((memories.abs().amax(-1) > 0).float().mean()) > 0.5
+
+
 def test_the_memory_that_values_come_from_follows_slowly() -> None:
     learner = sac(
         GoToZero(8),

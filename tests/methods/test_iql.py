@@ -11,12 +11,14 @@ from toy_episodes import toy_episodes
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.learners.iql import IqlConfig
 from astra_data.methods import METHODS, iql
-from astra_data.methods.iql import experience_of, learn_from_episodes
+from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.policy_file import PolicyFile, deploy
 from astra_data.progress import Progress, silent
 from astra_data.tasks import TASKS
 from astra_data.training import PpoTrainConfig, Training
+
+Learn = Callable[..., tuple[PolicyFile, dict[str, Any]]]
 
 TASK = TASKS["antmaze-umaze"]
 STEPS = 30
@@ -61,15 +63,15 @@ def given() -> PolicyFile:
     return PolicyFile(policy.requires_grad_(False), None, "toy@data-1.0.0", "abc")
 
 
-Learn = Callable[..., tuple[PolicyFile, dict[str, Any]]]
-
-
 @pytest.fixture
 def learn(episodes: PairedEpisodes, tmp_path: Path) -> Learn:
     def learn(
-        initial: PolicyFile | None = None, progress: Progress = silent, **settings: object
+        initial: PolicyFile | None = None,
+        progress: Progress = silent,
+        how: Learn = learn_from_episodes,
+        **settings: object,
     ) -> tuple[PolicyFile, dict[str, Any]]:
-        return learn_from_episodes(
+        return how(
             Training(
                 task=TASK,
                 config=PpoTrainConfig(memory_size=8, hidden_sizes=(16,)),
@@ -124,6 +126,29 @@ def test_fine_tuning_begins_with_the_given_policy(learn: Learn, given: PolicyFil
     assert not torch.equal(tuned.policy.state_dict()["actor.4.weight"], before["actor.4.weight"])
     assert all(torch.equal(given.policy.state_dict()[name], value) for name, value in before.items())
     assert METHODS["direct_transfer_iql"].initial == "direct_transfer"
+
+
+def test_cloning_does_what_was_recorded_whatever_it_paid(
+    learn: Learn, episodes: PairedEpisodes, tmp_path: Path
+) -> None:
+    # Going right pays, going left does not; both were recorded, left three times as often.
+    rightwards = torch.rand(6, STEPS) < 0.25
+    episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))
+    episodes.reward.copy_(torch.where(rightwards, 10.0, -10.0))
+    settings = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300, "learning_rate": 1e-2}
+    seen = experience_of(TASK, episodes)
+    start = torch.zeros(6, STEPS)
+    mean = {}
+    for how in (learn_from_episodes, clone_behavior):
+        policy = learn(how=how, **settings)[0].policy
+        features = policy.remember_sequence(
+            seen.observation[..., :8], seen.previous_action, policy.initial_hidden(6), start
+        )
+        mean[how] = float(policy.act(features)[episodes.windows.mask.bool()].mean().detach())
+        (tmp_path / "checkpoint.safetensors").unlink()
+    recorded = float(episodes.windows.action[episodes.windows.mask.bool()].mean())
+    assert mean[clone_behavior] == pytest.approx(recorded, abs=0.15)
+    assert mean[learn_from_episodes] > recorded + 0.3
 
 
 class Stopped(Exception):  # noqa: N818 - stands for a kill
