@@ -4,9 +4,9 @@ All pay for going forward and for staying up, as `Locomotion` does; none knows o
 which cost the target little. Nothing is to be reached: who lasts to the horizon without falling succeeds.
 
 Under random commands the pay for a step differs from the target's, costs aside, by 0.1 to 0.2 (root mean
-square) where the centre of mass is known but not the heading, by 0.6 in the plane, and by 2 of the joints alone,
-whose pay has nothing to do with the target's there: the level torso that it goes by is what such a body does
-not have.
+square) where the centre of mass is known but not the heading, by 0.6 in the plane, and by 2 of the joints
+alone, whose pay has nothing to do with the target's there: the level torso that it goes by is what such a
+body does not have.
 """
 
 from abc import abstractmethod
