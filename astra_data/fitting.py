@@ -36,6 +36,11 @@ class GroundConfig(Config):
     """At the start; falls to zero along a half cosine."""
     gradient_norm: Positive = 1.0
     """Gradients are clipped to this norm."""
+    latent_weight: Positive = 0.1
+    """λ1, of the loss of the next latent. At 1 it crowds out the correction: on the Long Maze held-out R²
+    0.826 against 0.835 of NAS, 200-step position error 0.92 m against 0.65 m; at 0.1: 0.833, 0.72 m."""
+    reward_weight: Positive = 1.0
+    """λ2, of the loss of the reward; λ3, of the correction's, is 1."""
     target: TargetKind = "ema"
     """Where the next latent of the latent loss comes from; "online" is the printed loss, unbounded below."""
     ema_rate: Share = 0.01
@@ -92,9 +97,21 @@ Fit = Callable[[Fitting], tuple[Grounding, dict[str, Any]]]
 
 @dataclass(frozen=True)
 class HistoryFit:
-    """Fit a history model with these weights of its losses (paper, Section IV-A)."""
+    """Fit a history model: the correction, and what else a method learns (paper, Section IV-A).
 
-    weights: LossWeights
+    Attributes:
+        latent: whether it predicts the next latent. reward: whether it predicts the target's reward.
+    """
+
+    latent: bool
+    reward: bool
+
+    def weights(self, config: GroundConfig) -> LossWeights:
+        """Return the weights of the losses."""
+        return LossWeights(
+            latent=config.latent_weight if self.latent else 0.0,
+            reward=config.reward_weight if self.reward else 0.0,
+        )
 
     def __call__(self, fitting: Fitting) -> tuple[GroundingModel, dict[str, Any]]:
         """Return the model and its telemetry."""
@@ -130,7 +147,7 @@ class HistoryFit:
             }
         )
         model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
-        metrics = _optimise(model, self.weights, fitting)
+        metrics = _optimise(model, self.weights(config), fitting)
         _fit_residual(model, fitting.held_out)
         return model, metrics
 

@@ -57,4 +57,4 @@ class Method:
     @property
     def predicts_reward(self) -> bool:
         """Whether its grounding learns to predict the target's reward."""
-        return isinstance(self.fit, HistoryFit) and self.fit.weights.reward > 0
+        return isinstance(self.fit, HistoryFit) and self.fit.reward

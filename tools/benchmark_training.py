@@ -36,7 +36,7 @@ from astra_data.learners.iql import Experience, Iql, IqlConfig
 from astra_data.learners.ppo import Ppo
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.models.grounding import GroundingModel, GroundingShape
 from astra_data.models.policy import PolicyShape
 from astra_data.models.soft_actor import SoftActor
 from astra_data.progress import silent
@@ -51,8 +51,7 @@ SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.tom
 TASK = TASKS[SETTINGS.task]
 WALKER = TASKS["humanoid-walker2d"]
 SHAPE = GroundingShape(state_size=4, action_size=2, goal_size=2)
-WEIGHTS = LossWeights(latent=0.1)
-"""Of ASTRA."""
+ASTRA = HistoryFit(latent=True, reward=True)
 PEERS = Path(__file__).parent / "peers"
 GYMNASIUM_ID = "AntMaze_UMaze-v5"
 ANTS = 128
@@ -231,14 +230,15 @@ def grounding(dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candid
 
     def ours() -> int:
         with tempfile.TemporaryDirectory() as folder:
-            HistoryFit(WEIGHTS)(
-                Fitting(TASK, config, None, training, held_out, 0, "cpu", Path(folder), silent)
-            )
+            ASTRA(Fitting(TASK, config, None, training, held_out, 0, "cpu", Path(folder), silent))
         return config.updates * config.batch_windows
 
     return (
         f"grounding, windows of {config.window} steps",
-        {OURS: ours, "Algorithm 1, step by step": step_by_step(SHAPE, WEIGHTS, training, config)},
+        {
+            OURS: ours,
+            "Algorithm 1, step by step": step_by_step(SHAPE, ASTRA.weights(config), training, config),
+        },
     )
 
 

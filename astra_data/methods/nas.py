@@ -5,10 +5,9 @@ The reward is the task's own on corrected states, as Golemo et al. recompute it.
 
 from astra_data.fitting import HistoryFit
 from astra_data.method import Method
-from astra_data.models.grounding import LossWeights
 
 NAS = Method(
     name="nas",
     title="NAS",
-    fit=HistoryFit(LossWeights(latent=0.0, reward=0.0, state=1.0)),
+    fit=HistoryFit(latent=False, reward=False),
 )

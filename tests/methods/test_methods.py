@@ -3,7 +3,7 @@ import pytest
 from astra_data.errors import BadInputError
 from astra_data.figures import method_colour, method_title
 from astra_data.figures.style import SPARE_COLOURS
-from astra_data.fitting import HistoryFit
+from astra_data.fitting import GroundConfig, HistoryFit
 from astra_data.methods import METHODS, method_named
 from astra_data.models.grounding import LossWeights
 from astra_data.training import InSimulator
@@ -11,7 +11,8 @@ from astra_data.training import InSimulator
 
 def weights(name: str) -> LossWeights | None:
     fit = METHODS[name].fit
-    return fit.weights if isinstance(fit, HistoryFit) else None
+    config = GroundConfig(latent_weight=0.2, reward_weight=0.3)
+    return fit.weights(config) if isinstance(fit, HistoryFit) else None
 
 
 def reward(name: str) -> str:
@@ -39,9 +40,9 @@ def test_figures_call_methods_by_their_titles_in_colours_of_their_own() -> None:
 def test_what_the_rows_of_the_paper_differ_in() -> None:
     assert weights("direct_transfer") is None
     assert weights("nas") == LossWeights(0.0, 0.0, 1.0)
-    assert weights("astra") == LossWeights(0.1, 1.0, 1.0)
-    assert weights("astra_without_latent") == LossWeights(0.0, 1.0, 1.0)
-    assert weights("astra_without_reward") == LossWeights(0.1, 0.0, 1.0)
+    assert weights("astra") == LossWeights(0.2, 0.3, 1.0)
+    assert weights("astra_without_latent") == LossWeights(0.0, 0.3, 1.0)
+    assert weights("astra_without_reward") == LossWeights(0.2, 0.0, 1.0)
     assert {name for name, method in METHODS.items() if method.aligns} == {
         "astra",
         "astra_without_reward",
