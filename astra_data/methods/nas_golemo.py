@@ -9,12 +9,13 @@ import torch
 
 from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.fitting import Fitting, correction_r2, scatter_factor
+from astra_data.fitting import Fitting, scatter_factor
 from astra_data.method import Method
 from astra_data.models.residual import ResidualModel, ResidualShape
 from astra_data.recipe import Config, Count, Positive
 from astra_data.seeding import derive, generator
 from astra_data.stopwatch import Stopwatch
+from astra_data.telemetry import correction_r2
 
 
 class GolemoConfig(Config):

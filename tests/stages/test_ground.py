@@ -9,13 +9,13 @@ from small_run import GOLEMO, GROUND, TRAIN
 from astra_data import fitting as stage
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.errors import BadInputError
-from astra_data.fitting import telemetry
 from astra_data.grounding_file import load_grounding, load_history_model
 from astra_data.methods.compass import CompassConfig
 from astra_data.models.grounding import LossWeights
 from astra_data.progress import Progress, silent
 from astra_data.stages.ground import ground
 from astra_data.stages.train import train
+from astra_data.telemetry import telemetry
 from astra_data.variation import WIDE_RANGES, Variation
 
 
