@@ -40,8 +40,8 @@ def cost(results: Results) -> str:
         + table(["stage", "wall time", "CPU time", "speed"], stages)
         + "\n\nTimes are summed over rows and seeds, which run side by side, with artefacts that rows share "
         "counted once; a dash where a stage recorded none. CPU time: of all threads. Speed: of one item "
-        "beside the others, averaged over seeds. Simulator steps/s: the world alone; PPO steps/s: world and "
-        "learning.\n\n"
+        "beside the others, averaged over seeds. Simulator steps/s: the world alone; training steps/s: world "
+        "and learning.\n\n"
         + table(["method", *COSTED, "wall time", "CPU time"], rows)
         + "\n\nOne seed of each row, averaged over its seeds, with the grounding and alignment that it uses, "
         "though other rows may share them. What all rows share, `collect` and `pair`, is not in it, nor the "
@@ -58,9 +58,9 @@ def _rates(rows: Mapping[str, list[float]]) -> str:
 
 
 def _unit(figure: str) -> str:
-    """Return "target steps/s" for "target_steps_per_second"; bare steps are PPO's."""
+    """Return "target steps/s" for "target_steps_per_second"; bare steps are those of a training."""
     steps = figure.removesuffix("_per_second").replace("_", " ")
-    return f"{'PPO ' if steps == 'steps' else ''}{steps}/s"
+    return f"{'training ' if steps == 'steps' else ''}{steps}/s"
 
 
 def origin(results: Results) -> str:

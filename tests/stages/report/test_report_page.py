@@ -50,7 +50,7 @@ def test_cost_gives_the_speed_of_every_stage(folder: Path) -> None:
     page = (folder / "results.md").read_text()
     assert "| collect | 15 s | - | 4 k target steps/s |" in page
     assert "| ground | 21 s | 42 s | 100 windows/s |" in page
-    assert "| train | - | - | 96 k simulator steps/s; 48 k PPO steps/s |" in page
+    assert "| train | - | - | 96 k simulator steps/s; 48 k training steps/s |" in page
     assert "| evaluate | 2 min | 4 min | 1 k target steps/s |" in page
     assert "| whole recipe | 3 min | 5 min |  |" in page
     assert "| pair |" not in page  # neither time nor speed recorded
