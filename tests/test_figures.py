@@ -1,3 +1,4 @@
+from io import BytesIO
 from itertools import pairwise
 
 import matplotlib
@@ -5,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 from astra_data.figures import (
     Curve,
@@ -26,7 +28,7 @@ from astra_data.figures import (
     strips,
     trajectories,
 )
-from astra_data.figures.style import COLOURS, DEPLOYED, SIMULATED
+from astra_data.figures.style import COLOURS, DEPLOYED, SIMULATED, style
 from astra_data.mazes import U_MAZE
 from astra_data.score import SUCCESS, SURVIVED_STEPS
 
@@ -237,6 +239,18 @@ def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
     image = png(score_bars(SUCCESS, {"nas": np.array([0.5])}, {"nas": (0.5, np.nan, np.nan)}, {}))
     assert image.startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
+
+
+def test_a_palette_keeps_the_colours_of_methods() -> None:
+    scores = {method: np.array([0.5]) for method in ROWS}
+    figure = score_bars(SUCCESS, scores, {method: (0.5, np.nan, np.nan) for method in ROWS}, {})
+    everything = BytesIO()
+    with style():
+        figure.savefig(everything, format="png")
+    small = png(figure)
+    assert len(small) < 0.5 * len(everything.getvalue())
+    drawn = imread(BytesIO(everything.getvalue()))[..., :3]
+    np.testing.assert_allclose(imread(BytesIO(small))[..., :3], drawn, atol=0.07)
 
 
 def test_only_visited_cells_are_coloured() -> None:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.style import context
+from PIL import Image
 
 from astra_data.rows import base_method, is_plus
 from astra_data.score import Score
@@ -150,8 +151,11 @@ def score_axis(axes: Axes, score: Score) -> None:
 
 
 def png(figure: Figure) -> bytes:
-    """Render a figure as PNG, without a display."""
-    buffer = BytesIO()
+    """Render a figure as PNG of 256 colours (a fifth of the bytes of all colours), without a display."""
+    drawn, small = BytesIO(), BytesIO()
     with style():
-        figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+        figure.savefig(drawn, format="png")
+    with Image.open(drawn) as picture:
+        palette = picture.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette.save(small, format="png", optimize=True)
+    return small.getvalue()
