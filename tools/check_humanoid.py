@@ -1,0 +1,242 @@
+"""Why policies of the planar walker fall: which way, whether the grounding foretells it, what φ would allow.
+
+    uv run python tools/check_humanoid.py runs/humanoid_walker2d --seed 0
+
+reads a finished run and prints
+
+1. how humanoids lean some steps before they fall, in held-out recorded episodes and by the policies of rows,
+   and what height NAS's simulator foretells for the fall, given the true history and actions;
+2. how long a humanoid lasts that is shown φ alone, and remembers, once Full Obs has told it on its own way
+   what to do (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Annotated
+
+import torch
+import typer
+from torch import Tensor, nn
+
+from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.deployment import target_observation
+from astra_data.envs.humanoid import HumanoidEnv
+from astra_data.grounding_file import load_grounding
+from astra_data.humanoid.skeleton import rotation
+from astra_data.methods import method_named
+from astra_data.models.grounding import GroundingModel
+from astra_data.models.history import HistoryEncoder, mlp
+from astra_data.policy_file import PolicyFile, deploy
+from astra_data.rows import base_method
+from astra_data.sims.grounded import GroundedSimulator
+from astra_data.tasks import task_named
+
+TASK = task_named("humanoid-walker2d")
+ROWS = ("behavior_cloning", "nas", "astra", "nas_plus", "astra_plus")
+HUMANOIDS = 32
+HORIZON = 1000
+BEFORE_FALL = (10, 20, 40)
+WINDOW, BURN_IN = 64, 16
+
+Act = Callable[[Tensor], Tensor]
+"""From target states (B, S) to actions (B, A)."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """An episode: target states before each action, (T, S), and actions (T, A)."""
+
+    state: Tensor
+    action: Tensor
+    fell: bool
+
+
+def no_goals(count: int) -> Tensor:
+    """Return goals (count, 0): a humanoid has none."""
+    return torch.zeros(count, 0)
+
+
+def row_acts(run: Path, row: str, seed: int, count: int) -> Act:
+    """Return how the policy of `row` acts on `count` humanoids; latents come from the simulator's encoder."""
+    trained = PolicyFile.load(run / "train" / row / f"seed_{seed}" / "policy.safetensors")
+    grounds = method_named(row).grounds
+    folder = run / "ground" / base_method(row) / f"seed_{seed}"
+    deployed = deploy(TASK, trained, load_grounding(folder / "grounding.safetensors") if grounds else None)
+    deployed.start(count)
+    return lambda state: deployed.act(state, no_goals(len(state)))
+
+
+@torch.no_grad()
+def walks(act: Act, env: HumanoidEnv) -> list[Walk]:
+    """Let each of the humanoids walk once."""
+    env.reset()
+    active = torch.ones(env.num_envs, dtype=torch.bool)
+    lengths = torch.zeros(env.num_envs, dtype=torch.long)
+    states, actions = list[Tensor](), list[Tensor]()
+    while active.any() and len(states) < HORIZON:
+        states.append(env.state)
+        actions.append(act(env.state))
+        lengths += active
+        active &= ~env.step(actions[-1], active).terminated
+    each = zip(
+        torch.stack(states, 1), torch.stack(actions, 1), lengths.tolist(), active.tolist(), strict=True
+    )
+    return [Walk(state[:length], action[:length], not stands) for state, action, length, stands in each]
+
+
+def recorded(dataset: Path, seed: int) -> list[Walk]:
+    """Return the episodes of `dataset` that `ground` holds out."""
+    _, held_out = PairedEpisodes.load(dataset).split(0.1, seed)
+    each = zip(
+        held_out.target_state,
+        held_out.windows.action,
+        held_out.lengths.tolist(),
+        held_out.terminated.any(1).tolist(),
+        strict=True,
+    )
+    return [Walk(state[:length], action[:length], fell) for state, action, length, fell in each]
+
+
+@torch.no_grad()
+def foretold_heights(falls: list[Walk], before: int, model: GroundingModel) -> Tensor:
+    """Return the last height (n,) in m as the grounded simulator foretells it `before` steps ahead."""
+    hidden, starts, previous = [], [], []
+    for fall in falls:
+        start = len(fall.state) - 1 - before
+        seen = TASK.abstraction(fall.state[: start + 1])
+        earlier = torch.cat([torch.zeros_like(fall.action[:1]), fall.action[:start]])
+        memory = torch.zeros(1, model.shape.latent_size)
+        for state, action in zip(seen[:-1], earlier[:-1], strict=True):
+            memory = model.encoder.step(model.encoder_input(state[None], no_goals(1), action[None]), memory)
+        hidden.append(memory[0])
+        starts.append(seen[-1])
+        previous.append(earlier[-1])
+    simulator = GroundedSimulator(TASK.simulator(len(falls)), model)
+    rows = torch.arange(len(falls))
+    simulator.reset_to(
+        torch.stack(starts),
+        rows,
+        no_goals(len(falls)),
+        hidden=torch.stack(hidden),
+        previous_action=torch.stack(previous),
+    )
+    for step in range(before, 0, -1):
+        simulator.step(torch.stack([fall.action[-1 - step] for fall in falls]))
+    return simulator.state[:, 0]
+
+
+def print_falls(name: str, walked: list[Walk], model: GroundingModel) -> None:
+    """Print how humanoids lean before they fall, and what the grounded simulator foretells."""
+    falls = [walk for walk in walked if walk.fell and len(walk.state) > max(BEFORE_FALL)]
+    last = torch.stack([TASK.abstraction(fall.state[-1])[0] for fall in falls])
+    for before in BEFORE_FALL:
+        _, left, up = rotation(torch.stack([fall.state[-1 - before] for fall in falls])[:, 3:7])[:, 2].T
+        pitch = torch.stack([TASK.abstraction(fall.state[-1 - before])[1] for fall in falls]).rad2deg()
+        roll = torch.atan2(left, up).abs().rad2deg()
+        wrong = foretold_heights(falls, before, model) - last
+        print(
+            f"{name:17s} {len(falls):3d} falls, {before:2d} steps earlier: leans {roll.mean():4.1f} deg to a"
+            f" side, {pitch.mean():5.1f} ahead; height foretold for the fall: {wrong.mean():+.2f} m"
+            f" (RMSE {wrong.square().mean().sqrt():.2f})"
+        )
+
+
+class Student(nn.Module):
+    """Sees φ and remembers."""
+
+    def __init__(self, seen: int, actions: int) -> None:
+        super().__init__()
+        self.actions = actions
+        self.memory = HistoryEncoder(seen + actions, embedding_size=128, latent_size=128)
+        self.head = mlp((seen + 128, 256, 256, actions))
+
+    def forward(self, seen: Tensor, previous: Tensor) -> Tensor:
+        """Return actions (B, T, A) for observations (B, T, O) and the actions before them."""
+        return self._act(seen, self.memory(torch.cat([seen, previous], -1))[0])
+
+    def _act(self, seen: Tensor, latent: Tensor) -> Tensor:
+        return torch.tanh(self.head(torch.cat([seen, latent], -1)))
+
+    def acts(self, count: int) -> Act:
+        """Return how this acts on `count` humanoids from their starts on."""
+        hidden, previous = torch.zeros(count, 128), torch.zeros(count, self.actions)
+
+        def act(state: Tensor) -> Tensor:
+            nonlocal hidden, previous
+            seen = observed(state)
+            hidden = self.memory.step(torch.cat([seen, previous], -1), hidden)
+            previous = self._act(seen, self.memory.latent(hidden))
+            return previous
+
+        return act
+
+
+def observed(state: Tensor) -> Tensor:
+    """Return what is seen of target states (B, S): φ, scaled as for all policies, (B, O)."""
+    return target_observation(TASK, state, no_goals(len(state)), None, "abstract")
+
+
+def lesson(walk: Walk, teacher: Act) -> Tensor:
+    """Return what was seen, done before, and right, (T, O + A + A)."""
+    before = torch.cat([torch.zeros_like(walk.action[:1]), walk.action[:-1]])
+    return torch.cat([observed(walk.state), before, teacher(walk.state)], -1)
+
+
+def drawn(lessons: list[Tensor], count: int) -> tuple[Tensor, Tensor]:
+    """Return windows (count, WINDOW, O + A + A) of `lessons`, padded, and which of their steps count."""
+    chances = torch.tensor([float(len(lesson)) for lesson in lessons])
+    windows, mask = torch.zeros(count, WINDOW, lessons[0].shape[1]), torch.zeros(count, WINDOW)
+    for row, chosen in enumerate(torch.multinomial(chances, count, replacement=True).tolist()):
+        first = int(torch.randint(max(1, len(lessons[chosen]) - BURN_IN), ()))
+        piece = lessons[chosen][first : first + WINDOW]
+        windows[row, : len(piece)] = piece
+        mask[row, BURN_IN if first else 0 : len(piece)] = 1.0
+    return windows, mask
+
+
+def teach(teacher: Act, env: HumanoidEnv, rounds: int) -> None:
+    """Teach a student on its own way, and print how long it lasts."""
+    seen_size, action_size = observed(env.state).shape[-1], env.action_size
+    student, lessons = Student(seen_size, action_size), list[Tensor]()
+    optimizer = torch.optim.Adam(student.parameters())
+    for number in range(rounds + 1):
+        lived = walks(student.acts(env.num_envs) if number else teacher, env)
+        lessons += [lesson(walk, teacher) for walk in lived]
+        lasted, told = fmean(len(walk.state) for walk in lived), sum(map(len, lessons))
+        print(
+            f"{'student' if number else 'teacher'} lasts {lasted:.0f} steps; {told:,} told so far", flush=True
+        )
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-3 * (1 - number / (rounds + 1))
+        for _ in range(350):
+            windows, mask = drawn(lessons, 48)
+            seen, before, right = windows.split([seen_size, action_size, action_size], -1)
+            wrong = (student(seen, before) - right).square().mean(-1)
+            optimizer.zero_grad()
+            ((wrong * mask).sum() / mask.sum()).backward()
+            nn.utils.clip_grad_norm_(student.parameters(), 1.0)
+            optimizer.step()
+
+
+def main(
+    run: Annotated[Path, typer.Argument(help="A finished run of recipes/humanoid_walker2d.toml.")],
+    seed: Annotated[int, typer.Option(help="One of the run's seeds, and that of all randomness here.")] = 0,
+    rounds: Annotated[int, typer.Option(help="Of teaching.")] = 40,
+) -> None:
+    """Print why policies of the planar walker fall."""
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    model = load_grounding(run / "ground" / "nas" / f"seed_{seed}" / "grounding.safetensors")
+    assert isinstance(model, GroundingModel)
+    env = TASK.target(HUMANOIDS, seed=seed)
+    assert isinstance(env, HumanoidEnv)
+    print_falls("recorded", recorded(run / "pair" / f"seed_{seed}", seed), model)
+    for row in ROWS:
+        print_falls(row, walks(row_acts(run, row, seed, HUMANOIDS), env), model)
+    teach(row_acts(run, "full_obs", seed, HUMANOIDS), env, rounds)
+
+
+if __name__ == "__main__":
+    typer.run(main)
