@@ -1,15 +1,17 @@
-"""Why policies of the planar walker fall: which way, whether the grounding foretells it, what φ would allow.
+"""Why policies of the humanoid fall: which way, whether the grounding foretells it, what φ would allow.
 
     uv run python tools/check_humanoid.py runs/humanoid_walker2d --seed 0
 
 reads a finished run and prints
 
 1. how humanoids lean some steps before they fall, in held-out recorded episodes and by the policies of rows,
-   and what height NAS's simulator foretells for the fall, given the true history and actions;
+   and what height NAS's simulator, if it knows of heights, foretells for the fall, given the true history and
+   actions;
 2. how long a humanoid lasts that is shown φ alone, and remembers, once Full Obs has told it on its own way
    what to do (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,9 +33,9 @@ from astra_data.models.history import HistoryEncoder, mlp
 from astra_data.policy_file import PolicyFile, deploy
 from astra_data.rows import base_method
 from astra_data.sims.grounded import GroundedSimulator
+from astra_data.task import Task
 from astra_data.tasks import task_named
 
-TASK = task_named("humanoid-walker2d")
 ROWS = ("behavior_cloning", "nas", "astra", "nas_plus", "astra_plus")
 HUMANOIDS = 32
 HORIZON = 1000
@@ -58,12 +60,12 @@ def no_goals(count: int) -> Tensor:
     return torch.zeros(count, 0)
 
 
-def row_acts(run: Path, row: str, seed: int, count: int) -> Act:
+def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
     """Return how the policy of `row` acts on `count` humanoids; latents come from the simulator's encoder."""
     trained = PolicyFile.load(run / "train" / row / f"seed_{seed}" / "policy.safetensors")
     grounds = method_named(row).grounds
     folder = run / "ground" / base_method(row) / f"seed_{seed}"
-    deployed = deploy(TASK, trained, load_grounding(folder / "grounding.safetensors") if grounds else None)
+    deployed = deploy(task, trained, load_grounding(folder / "grounding.safetensors") if grounds else None)
     deployed.start(count)
     return lambda state: deployed.act(state, no_goals(len(state)))
 
@@ -100,12 +102,12 @@ def recorded(dataset: Path, seed: int) -> list[Walk]:
 
 
 @torch.no_grad()
-def foretold_heights(falls: list[Walk], before: int, model: GroundingModel) -> Tensor:
+def foretold_heights(task: Task, falls: list[Walk], before: int, model: GroundingModel) -> Tensor:
     """Return the last height (n,) in m as the grounded simulator foretells it `before` steps ahead."""
     hidden, starts, previous = [], [], []
     for fall in falls:
         start = len(fall.state) - 1 - before
-        seen = TASK.abstraction(fall.state[: start + 1])
+        seen = task.abstraction(fall.state[: start + 1])
         earlier = torch.cat([torch.zeros_like(fall.action[:1]), fall.action[:start]])
         memory = torch.zeros(1, model.shape.latent_size)
         for state, action in zip(seen[:-1], earlier[:-1], strict=True):
@@ -113,7 +115,7 @@ def foretold_heights(falls: list[Walk], before: int, model: GroundingModel) -> T
         hidden.append(memory[0])
         starts.append(seen[-1])
         previous.append(earlier[-1])
-    simulator = GroundedSimulator(TASK.simulator(len(falls)), model)
+    simulator = GroundedSimulator(task.simulator(len(falls)), model)
     rows = torch.arange(len(falls))
     simulator.reset_to(
         torch.stack(starts),
@@ -127,27 +129,27 @@ def foretold_heights(falls: list[Walk], before: int, model: GroundingModel) -> T
     return simulator.state[:, 0]
 
 
-def print_falls(name: str, walked: list[Walk], model: GroundingModel) -> None:
-    """Print how humanoids lean before they fall, and what the grounded simulator foretells."""
+def print_falls(task: Task, name: str, walked: list[Walk], model: GroundingModel) -> None:
+    """Print how humanoids lean before they fall, and what height the grounded simulator foretells."""
     falls = [walk for walk in walked if walk.fell and len(walk.state) > max(BEFORE_FALL)]
-    last = torch.stack([TASK.abstraction(fall.state[-1])[0] for fall in falls])
+    last = torch.stack([fall.state[-1, 2] for fall in falls])
     for before in BEFORE_FALL:
-        _, left, up = rotation(torch.stack([fall.state[-1 - before] for fall in falls])[:, 3:7])[:, 2].T
-        pitch = torch.stack([TASK.abstraction(fall.state[-1 - before])[1] for fall in falls]).rad2deg()
-        roll = torch.atan2(left, up).abs().rad2deg()
-        wrong = foretold_heights(falls, before, model) - last
-        print(
-            f"{name:17s} {len(falls):3d} falls, {before:2d} steps earlier: leans {roll.mean():4.1f} deg to a"
-            f" side, {pitch.mean():5.1f} ahead; height foretold for the fall: {wrong.mean():+.2f} m"
-            f" (RMSE {wrong.square().mean().sqrt():.2f})"
-        )
+        ahead, left, up = rotation(torch.stack([fall.state[-1 - before, 3:7] for fall in falls]))[:, 2].T
+        roll, pitch = torch.atan2(left, up).abs().rad2deg(), -torch.asin(ahead).rad2deg()
+        told = f"{before:2d} steps earlier: leans {roll.mean():4.1f} deg to a side, {pitch.mean():5.1f} ahead"
+        if "height_m" in task.quantities:
+            wrong = foretold_heights(task, falls, before, model) - last
+            rmse = wrong.square().mean().sqrt()
+            told += f"; height foretold for the fall: {wrong.mean():+.2f} m (RMSE {rmse:.2f})"
+        print(f"{name:17s} {len(falls):3d} falls, {told}", flush=True)
 
 
 class Student(nn.Module):
     """Sees φ and remembers."""
 
-    def __init__(self, seen: int, actions: int) -> None:
+    def __init__(self, task: Task, seen: int, actions: int) -> None:
         super().__init__()
+        self.task = task
         self.actions = actions
         self.memory = HistoryEncoder(seen + actions, embedding_size=128, latent_size=128)
         self.head = mlp((seen + 128, 256, 256, actions))
@@ -165,7 +167,7 @@ class Student(nn.Module):
 
         def act(state: Tensor) -> Tensor:
             nonlocal hidden, previous
-            seen = observed(state)
+            seen = observed(self.task, state)
             hidden = self.memory.step(torch.cat([seen, previous], -1), hidden)
             previous = self._act(seen, self.memory.latent(hidden))
             return previous
@@ -173,15 +175,15 @@ class Student(nn.Module):
         return act
 
 
-def observed(state: Tensor) -> Tensor:
+def observed(task: Task, state: Tensor) -> Tensor:
     """Return what is seen of target states (B, S): φ, scaled as for all policies, (B, O)."""
-    return target_observation(TASK, state, no_goals(len(state)), None, "abstract")
+    return target_observation(task, state, no_goals(len(state)), None, "abstract")
 
 
-def lesson(walk: Walk, teacher: Act) -> Tensor:
+def lesson(task: Task, walk: Walk, teacher: Act) -> Tensor:
     """Return what was seen, done before, and right, (T, O + A + A)."""
     before = torch.cat([torch.zeros_like(walk.action[:1]), walk.action[:-1]])
-    return torch.cat([observed(walk.state), before, teacher(walk.state)], -1)
+    return torch.cat([observed(task, walk.state), before, teacher(walk.state)], -1)
 
 
 def drawn(lessons: list[Tensor], count: int) -> tuple[Tensor, Tensor]:
@@ -196,14 +198,14 @@ def drawn(lessons: list[Tensor], count: int) -> tuple[Tensor, Tensor]:
     return windows, mask
 
 
-def teach(teacher: Act, env: HumanoidEnv, rounds: int) -> None:
+def teach(task: Task, teacher: Act, env: HumanoidEnv, rounds: int) -> None:
     """Teach a student on its own way, and print how long it lasts."""
-    seen_size, action_size = observed(env.state).shape[-1], env.action_size
-    student, lessons = Student(seen_size, action_size), list[Tensor]()
+    seen_size, action_size = observed(task, env.state).shape[-1], env.action_size
+    student, lessons = Student(task, seen_size, action_size), list[Tensor]()
     optimizer = torch.optim.Adam(student.parameters())
     for number in range(rounds + 1):
         lived = walks(student.acts(env.num_envs) if number else teacher, env)
-        lessons += [lesson(walk, teacher) for walk in lived]
+        lessons += [lesson(task, walk, teacher) for walk in lived]
         lasted, told = fmean(len(walk.state) for walk in lived), sum(map(len, lessons))
         print(
             f"{'student' if number else 'teacher'} lasts {lasted:.0f} steps; {told:,} told so far", flush=True
@@ -221,21 +223,24 @@ def teach(teacher: Act, env: HumanoidEnv, rounds: int) -> None:
 
 
 def main(
-    run: Annotated[Path, typer.Argument(help="A finished run of recipes/humanoid_walker2d.toml.")],
+    run: Annotated[
+        Path, typer.Argument(help="A finished run of a recipe of the humanoid, as runs/humanoid_walker2d.")
+    ],
     seed: Annotated[int, typer.Option(help="One of the run's seeds, and that of all randomness here.")] = 0,
     rounds: Annotated[int, typer.Option(help="Of teaching.")] = 40,
 ) -> None:
-    """Print why policies of the planar walker fall."""
+    """Print why policies of the humanoid fall."""
+    task = task_named(json.loads((run / "recipe.json").read_text())["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     model = load_grounding(run / "ground" / "nas" / f"seed_{seed}" / "grounding.safetensors")
     assert isinstance(model, GroundingModel)
-    env = TASK.target(HUMANOIDS, seed=seed)
+    env = task.target(HUMANOIDS, seed=seed)
     assert isinstance(env, HumanoidEnv)
-    print_falls("recorded", recorded(run / "pair" / f"seed_{seed}", seed), model)
+    print_falls(task, "recorded", recorded(run / "pair" / f"seed_{seed}", seed), model)
     for row in ROWS:
-        print_falls(row, walks(row_acts(run, row, seed, HUMANOIDS), env), model)
-    teach(row_acts(run, "full_obs", seed, HUMANOIDS), env, rounds)
+        print_falls(task, row, walks(row_acts(task, run, row, seed, HUMANOIDS), env), model)
+    teach(task, row_acts(task, run, "full_obs", seed, HUMANOIDS), env, rounds)
 
 
 if __name__ == "__main__":
