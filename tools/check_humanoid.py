@@ -88,9 +88,9 @@ def walks(act: Act, env: HumanoidEnv) -> list[Walk]:
     return [Walk(state[:length], action[:length], not stands) for state, action, length, stands in each]
 
 
-def recorded(dataset: Path, seed: int) -> list[Walk]:
+def recorded(dataset: Path, held_out_share: float, seed: int) -> list[Walk]:
     """Return the episodes of `dataset` that `ground` holds out."""
-    _, held_out = PairedEpisodes.load(dataset).split(0.1, seed)
+    _, held_out = PairedEpisodes.load(dataset).split(held_out_share, seed)
     each = zip(
         held_out.target_state,
         held_out.windows.action,
@@ -109,10 +109,8 @@ def foretold_heights(task: Task, falls: list[Walk], before: int, model: Groundin
         start = len(fall.state) - 1 - before
         seen = task.abstraction(fall.state[: start + 1])
         earlier = torch.cat([torch.zeros_like(fall.action[:1]), fall.action[:start]])
-        memory = torch.zeros(1, model.shape.latent_size)
-        for state, action in zip(seen[:-1], earlier[:-1], strict=True):
-            memory = model.encoder.step(model.encoder_input(state[None], no_goals(1), action[None]), memory)
-        hidden.append(memory[0])
+        _, memories = model.encoder(model.encoder_input(seen, no_goals(len(seen)), earlier)[None])
+        hidden.append(memories[0, -2])
         starts.append(seen[-1])
         previous.append(earlier[-1])
     simulator = GroundedSimulator(task.simulator(len(falls)), model)
@@ -131,7 +129,7 @@ def foretold_heights(task: Task, falls: list[Walk], before: int, model: Groundin
 
 def print_falls(task: Task, name: str, walked: list[Walk], model: GroundingModel) -> None:
     """Print how humanoids lean before they fall, and what height the grounded simulator foretells."""
-    falls = [walk for walk in walked if walk.fell and len(walk.state) > max(BEFORE_FALL)]
+    falls = [walk for walk in walked if walk.fell and len(walk.state) > max(BEFORE_FALL) + 1]
     last = torch.stack([fall.state[-1, 2] for fall in falls])
     for before in BEFORE_FALL:
         ahead, left, up = rotation(torch.stack([fall.state[-1 - before, 3:7] for fall in falls]))[:, 2].T
@@ -230,14 +228,20 @@ def main(
     rounds: Annotated[int, typer.Option(help="Of teaching.")] = 40,
 ) -> None:
     """Print why policies of the humanoid fall."""
-    task = task_named(json.loads((run / "recipe.json").read_text())["task"])
+    recipe = json.loads((run / "recipe.json").read_text())
+    task = task_named(recipe["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     model = load_grounding(run / "ground" / "nas" / f"seed_{seed}" / "grounding.safetensors")
     assert isinstance(model, GroundingModel)
     env = task.target(HUMANOIDS, seed=seed)
     assert isinstance(env, HumanoidEnv)
-    print_falls(task, "recorded", recorded(run / "pair" / f"seed_{seed}", seed), model)
+    print_falls(
+        task,
+        "recorded",
+        recorded(run / "pair" / f"seed_{seed}", recipe["ground"]["held_out_share"], seed),
+        model,
+    )
     for row in ROWS:
         print_falls(task, row, walks(row_acts(task, run, row, seed, HUMANOIDS), env), model)
     teach(task, row_acts(task, run, "full_obs", seed, HUMANOIDS), env, rounds)
