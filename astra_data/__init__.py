@@ -12,8 +12,8 @@ exchange    importers/  exporters/ (one file per format of other libraries and l
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, varied, scattered, grounded)
 learning    task  antmaze_tasks  nao_tasks  humanoid_tasks  tasks  simulators  world  target_world
             training_world  policy_file  deployment  behaviors  suboptimal  gap  mismatch  outcome
-            gymnasium_faces  pairing  relocation  replays  telemetry  fitting  training  target_training
-            method  learners/
+            gymnasium_faces  pairing  relocation  replays  telemetry  descent  fitting  training
+            target_training  method  learners/
 methods     methods/ (one file each: what is different about it)
 prediction  prediction/ (open-loop prediction of a real robot's recorded walk)
 stages      stages/ (one file per step: collect augment pair subset ground train align evaluate report)

@@ -9,33 +9,26 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.descent import Descent, DescentConfig
 from astra_data.grounding_file import Grounding
 from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Number, Positive, Share
 from astra_data.seeding import derive
-from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
 from astra_data.telemetry import telemetry
 
-_CHECKPOINT_EVERY = 250
+_KEEP_EVERY = 250
 
 
-class GroundConfig(Config):
-    """How the grounding model is fitted. The paper prints none of these."""
+class GroundConfig(DescentConfig):
+    """How the grounding model is fitted."""
 
-    updates: Count = 1500
-    """Gradient updates in all."""
     batch_windows: Count = 48
     """Windows per update."""
     window: Count = 100
     """Steps per window, in backpropagation through time."""
-    learning_rate: Positive = 1e-3
-    """At the start; falls to zero along a half cosine."""
-    gradient_norm: Positive = 1.0
-    """Gradients are clipped to this norm."""
     latent_weight: Positive = 0.1
     """λ1, of the loss of the next latent. At 1 it crowds out the correction: on the Long Maze held-out R²
     0.826 against 0.835 of NAS, 200-step position error 0.92 m against 0.65 m; at 0.1: 0.833, 0.72 m."""
@@ -178,54 +171,28 @@ def what_rewards_lack(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
 
 
 def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:
-    config, folder = fitting.config, fitting.folder
-    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
-    epochs: list[dict[str, float | None]] = []
-    spent, first = None, 0
-    checkpoint = folder / "checkpoint.safetensors"
-    if checkpoint.exists():
-        with resumed(checkpoint) as (state, told):
-            model.load_state_dict(state["model"])
-            optimizer.load_state_dict(state["optimizer"])
-            schedule.load_state_dict(told["schedule"])
-            epochs, spent, first = told["epochs"], told["spent"], told["update"]
-    stopwatch = Stopwatch(spent)
-    for update in range(first, config.updates):
-        torch.manual_seed(derive(fitting.seed, f"grounding update {update}"))
+    config = fitting.config
+    descent = Descent(model, config, checkpoint=fitting.folder / "checkpoint.safetensors")
+    while not descent.is_over:
+        torch.manual_seed(derive(fitting.seed, f"grounding update {descent.done}"))
         windows, _ = fitting.training.draw_windows(config.batch_windows, config.window)
         loss, parts = model.losses(windows, weights)
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm)
-        optimizer.step()
-        schedule.step()
+        descent.update(loss)
         model.update_target(config.ema_rate)
-        done = update + 1
-        if done % _CHECKPOINT_EVERY == 0 or done == config.updates:
+        if descent.done % _KEEP_EVERY == 0 or descent.is_over:
             losses = {f"loss_{name}": float(value.detach()) for name, value in parts.items()}
-            epochs.append({"step": done, **losses, **telemetry(model, fitting.held_out, weights)})
-            state = {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            told = {
-                "update": done,
-                "spent": stopwatch.spent(),
-                "epochs": epochs,
-                "schedule": {k: v for k, v in schedule.state_dict().items() if not k.startswith("_get")},
-            }
-            save_tensors(checkpoint, flatten(state), told)
-        if done % 10 == 0:
-            rate = done * config.batch_windows / stopwatch.seconds
-            note = f"{rate:,.0f} windows/s"
-            explained = epochs[-1]["r2_state"] if epochs else None
+            descent.keep(**losses, **telemetry(model, fitting.held_out, weights))
+        if descent.done % 10 == 0:
+            note = f"{descent.done * config.batch_windows / descent.stopwatch.seconds:,.0f} windows/s"
+            explained = descent.points[-1]["r2_state"] if descent.points else None
             if explained is not None:
                 note += f"  held-out R² of the correction {explained:.3f}"
-            fitting.progress(done / config.updates, note)
+            fitting.progress(descent.share, note)
     return {
-        "windows_per_second": config.updates * config.batch_windows / stopwatch.seconds,
-        **stopwatch.spent(),
-        "parameters": sum(parameter.numel() for parameter in parameters),
-        "epochs": epochs,
+        "windows_per_second": config.updates * config.batch_windows / descent.stopwatch.seconds,
+        **descent.stopwatch.spent(),
+        "parameters": sum(parameter.numel() for parameter in descent.parameters),
+        "epochs": descent.points,
     }
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from astra_data.fitting import Fit, HistoryFit
 from astra_data.target_training import InTarget
 from astra_data.training import InSimulator, Learn
+from astra_data.world import RewardSource
 
 IN_RAW_SIMULATOR = InSimulator()
 
@@ -54,7 +55,7 @@ class Method:
         """Whether its policy is trained in the target itself."""
         return isinstance(self.learn, InTarget)
 
-    @property
-    def predicts_reward(self) -> bool:
-        """Whether its grounding learns to predict the target's reward."""
-        return isinstance(self.fit, HistoryFit) and self.fit.reward
+    def learns_from(self, reward: RewardSource | None) -> bool:
+        """Tell whether it can be trained with `reward`: "predicted" needs a grounding that predicts it."""
+        predicts = isinstance(self.fit, HistoryFit) and self.fit.reward
+        return reward != "predicted" or predicts or not self.in_simulator

@@ -202,6 +202,16 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
+    def _has_rewards_to_learn_from(self) -> Self:
+        for row in self.methods:
+            table = "plus" if is_plus(row) else "train"
+            if not METHODS[base_method(row)].learns_from(getattr(self, table).reward):
+                raise ValueError(
+                    f"{table}.reward: {row} predicts none: expected 'abstract' or 'blend', got 'predicted'"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _limits_all_commands(self) -> Self:
         rows = {row: METHODS[base_method(row)] for row in self.methods}
         elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]

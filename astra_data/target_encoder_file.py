@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
-from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.checkpoint import save_tensors, understood
 from astra_data.models.alignment import TargetEncoder
+
+_KIND = "target encoder"
 
 
 def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
@@ -19,12 +21,16 @@ def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
         "latent_size": encoder.encoder.latent_size,
         "position_octaves": waves // 4,
     }
-    save_tensors(path, encoder.state_dict(), sizes)
+    save_tensors(path, encoder.state_dict(), {"kind": _KIND, "sizes": sizes})
 
 
 def load_target_encoder(path: Path, device: str = "cpu") -> TargetEncoder:
-    """Read a target encoder; its parameters are frozen."""
-    tensors, sizes = load_tensors(path)
-    encoder = TargetEncoder(**sizes)
-    encoder.load_state_dict(tensors)
+    """Read a target encoder; its parameters are frozen.
+
+    Raises:
+        BadInputError: it is something else, or from an older version.
+    """
+    with understood(path, "a target encoder", (_KIND,), device) as (tensors, told):
+        encoder = TargetEncoder(**told["sizes"])
+        encoder.load_state_dict(tensors)
     return encoder.to(device).requires_grad_(False).eval()

@@ -35,6 +35,7 @@ class FakeConfig(Config):
     learner: str = "ppo"
     limits_commands: bool = False
     doubt_penalty: float = 0.0
+    reward: str | None = None
     correction_heads: int = 1
 
 
@@ -58,6 +59,9 @@ class FakeMethod:
         self.in_simulator = trains and initial is None and not steps_target
         self.steps_target, self.table = steps_target, table
         self.grounded_as, self.initial = grounded_as, initial
+
+    def learns_from(self, reward: str | None) -> bool:
+        return True
 
 
 METHODS = {

@@ -37,6 +37,19 @@ def test_a_limit_of_commands_that_does_not_reach_all_rows_is_refused() -> None:
         read(**tables, train=limit)
 
 
+def test_rows_that_predict_no_reward_are_not_trained_with_it() -> None:
+    predicted, rows = {"reward": "predicted"}, ["astra", "iql", "target", "direct_transfer_plus"]
+    tables = {"task": "antmaze-umaze", "methods": rows}
+    assert read(**tables, train=predicted, plus={"reward": "blend"}).train.reward == "predicted"
+    for asked in ({"train": predicted}, {"plus": predicted}):
+        with pytest.raises(
+            RecipeError, match=r"plus\.reward: direct_transfer_plus predicts none: expected"
+        ):
+            read(**tables, **asked)
+    with pytest.raises(RecipeError, match=r"train\.reward: nas predicts none"):
+        read(**tables | {"methods": ["nas"]}, train=predicted)
+
+
 @pytest.mark.parametrize(
     ("tables", "message"),
     [

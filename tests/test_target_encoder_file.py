@@ -1,7 +1,10 @@
 from pathlib import Path
 
+import pytest
 import torch
 
+from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.errors import BadInputError
 from astra_data.models.alignment import TargetEncoder
 from astra_data.target_encoder_file import load_target_encoder, save_target_encoder
 
@@ -16,3 +19,17 @@ def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
     inputs = loaded.encoder_input(state, goal, action)
     assert torch.equal(inputs, encoder.encoder_input(state, goal, action))
     assert torch.equal(loaded.encoder(inputs[None])[0], encoder.encoder(inputs[None])[0])
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [("kind", r"\(kind target encoder\), found a file without a kind"), ("sizes", "found no 'sizes'")],
+)
+def test_what_is_no_target_encoder_is_refused(missing: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "encoder.safetensors"
+    save_target_encoder(path, TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8))
+    tensors, told = load_tensors(path)
+    del told[missing]
+    save_tensors(path, tensors, told)
+    with pytest.raises(BadInputError, match=f"expected a target encoder .*{message}"):
+        load_target_encoder(path)

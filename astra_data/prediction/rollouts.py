@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from astra_data.descent import Descent, DescentConfig
 from astra_data.errors import BadInputError
 from astra_data.models.grounding import LossWeights
 from astra_data.prediction.histories import HistoryModel
@@ -14,18 +15,18 @@ from astra_data.prediction.predictors import Gains, Predictor
 from astra_data.prediction.walks import Stretch, Walks
 from astra_data.prediction.windows import WindowModel
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, NotNegative, Positive
+from astra_data.recipe import Count, NotNegative, Positive
 from astra_data.seeding import derive
 
 STRENGTHS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Of ridge regression, from which the best is taken."""
 
 
-class FitConfig(Config):
+class FitConfig(DescentConfig):
     """How models are fitted; all that learn by gradients alike."""
 
     updates: Count = 400
-    """Gradient updates."""
+    """Gradient updates in all."""
     batch: Count = 64
     """Stretches per update."""
     steps: Count = 6
@@ -34,8 +35,6 @@ class FitConfig(Config):
     """At the start; falls to zero along a half cosine."""
     weight_decay: NotNegative = 0.01
     """Of AdamW."""
-    gradient_norm: Positive = 1.0
-    """Gradients are clipped to this norm."""
     noise: NotNegative = 1.0
     """Standard deviation of noise on the history, in units of `NOISE`, against learning it by heart."""
     latent_size: Count = 64
@@ -167,28 +166,20 @@ def _descend[M: (WindowModel, HistoryModel)](
     """Fit by gradients: open-loop errors after 1, 2, ... steps, each in units of its spread; `own_loss`."""
     spread = chained(_sample(walks, history, config.steps).motion).std(0)
     sequence, step = walks.starts(history, 1)
-    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
-    for update in range(config.updates):
+    descent = Descent(model, config, weight_decay=config.weight_decay)
+    while not descent.is_over:
         chosen = torch.randint(len(sequence), (config.batch,))
         stretch = walks.stretches(sequence[chosen], step[chosen], history, config.steps)
         stretch = stretch.mirrored(torch.rand(config.batch) < 0.5)
         # What follows a jump within a stretch cannot be judged.
         judged = stretch.is_walking.long().cumprod(1)[..., None].bool().expand_as(stretch.motion)
         error = (rollout(model, _noisy(stretch, config.noise)) - chained(stretch.motion)) / spread
-        loss = error[judged].square().mean() + own_loss(stretch)
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm)
-        optimizer.step()
-        schedule.step()
+        missed = error[judged].square().mean()
+        descent.update(missed + own_loss(stretch))
         if isinstance(model, HistoryModel):
             model.grounding.update_target(_EMA_RATE)
-        if (update + 1) % 20 == 0:
-            progress(
-                (update + 1) / config.updates, f"error² {float(error[judged].square().mean().detach()):.3f}"
-            )
+        if descent.done % 20 == 0:
+            progress(descent.share, f"error² {float(missed.detach()):.3f}")
     return model.requires_grad_(False)
 
 

@@ -10,20 +10,22 @@ from torch import Tensor
 
 from astra_data.checkpoint import finished_folder
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.descent import Descent, DescentConfig
 from astra_data.grounding_file import load_history_model
 from astra_data.models.alignment import TargetEncoder, gaussian_mmd
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.windows import Windows
 from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, NotNegative, Positive
+from astra_data.recipe import Count, NotNegative, Positive
 from astra_data.results.provenance import origin
 from astra_data.seeding import derive
-from astra_data.stopwatch import Stopwatch
 from astra_data.target_encoder_file import save_target_encoder
 
+_KEEP_EVERY = 50
 
-class AlignConfig(Config):
-    """How the target encoder is fitted. The paper prints none of these."""
+
+class AlignConfig(DescentConfig):
+    """How the target encoder is fitted."""
 
     updates: Count = 600
     """Gradient updates in all."""
@@ -31,10 +33,6 @@ class AlignConfig(Config):
     """Windows per update."""
     window: Count = 100
     """Steps per window, in backpropagation through time."""
-    learning_rate: Positive = 1e-3
-    """At the start; falls to zero along a half cosine."""
-    gradient_norm: Positive = 1.0
-    """Gradients are clipped to this norm."""
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
     """Of the MMD's kernels, in units of the square root of the latent's size."""
     paired_weight: NotNegative = 0.0
@@ -76,36 +74,31 @@ def align(
     encoder.set_scales(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
-    optimizer = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    stopwatch = Stopwatch()
-    points: list[dict[str, float]] = []
     with finished_folder(out) as folder:
-        for update in range(config.updates):
-            torch.manual_seed(derive(seed, f"alignment update {update}"))
+        checkpoint = folder / "checkpoint.safetensors"
+        descent = Descent(encoder, config, checkpoint=checkpoint)
+        while not descent.is_over:
+            torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
             windows, state = training.draw_windows(config.batch_windows, config.window)
             discrepancy, distance = _losses(model, encoder, windows, state, bandwidths)
-            loss = discrepancy + config.paired_weight * distance
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(encoder.parameters(), config.gradient_norm)
-            optimizer.step()
-            schedule.step()
-            if (update + 1) % 50 == 0:
-                points.append({"step": update + 1, **_agreement(model, encoder, held_out, bandwidths)})
-                rate = (update + 1) * config.batch_windows / stopwatch.seconds
-                note = f"{rate:,.0f} windows/s  paired latent RMSE {points[-1]['latent_rmse']:.3f}"
-                progress((update + 1) / config.updates, note)
+            descent.update(discrepancy + config.paired_weight * distance)
+            if descent.done % _KEEP_EVERY == 0:
+                agreement = _agreement(model, encoder, held_out, bandwidths)
+                descent.keep(**agreement)
+                rate = descent.done * config.batch_windows / descent.stopwatch.seconds
+                note = f"{rate:,.0f} windows/s  paired latent RMSE {agreement['latent_rmse']:.3f}"
+                progress(descent.share, note)
         save_target_encoder(folder / "target_encoder.safetensors", encoder)
         metrics: dict[str, Any] = made | {
-            "windows_per_second": config.updates * config.batch_windows / stopwatch.seconds,
-            **stopwatch.spent(),
-            "points": points,
+            "windows_per_second": config.updates * config.batch_windows / descent.stopwatch.seconds,
+            **descent.stopwatch.spent(),
+            "points": descent.points,
             **_agreement(model, encoder, held_out, bandwidths),
         }
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
+        checkpoint.unlink(missing_ok=True)
 
 
 def _losses(

@@ -58,7 +58,7 @@ def train(
         raise BadInputError(f"method '{method}' trains in a grounded simulator: run the stage `ground` first")
     if base.initial and initial is None:
         raise BadInputError(f"method '{method}' goes on from the policy of {base.initial}: train that first")
-    if config.reward == "predicted" and not base.predicts_reward:
+    if not base.learns_from(config.reward):
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()
     with finished_folder(out) as folder:

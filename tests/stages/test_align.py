@@ -1,9 +1,10 @@
 import json
 from pathlib import Path
 
+import pytest
 from small_run import ALIGN
 
-from astra_data.progress import silent
+from astra_data.progress import Progress, silent
 from astra_data.stages.align import align
 from astra_data.target_encoder_file import load_target_encoder
 
@@ -31,3 +32,31 @@ def test_the_same_seed_gives_the_same_bytes(
     align(ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
     name = "target_encoder.safetensors"
     assert (out / name).read_bytes() == (aligned / name).read_bytes()
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+def stop(fraction: float, note: str) -> None:
+    raise Stopped
+
+
+def test_after_an_interruption_it_goes_on(
+    paired: Path, grounded: Path, aligned: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "interrupted"
+
+    def begin(progress: Progress) -> None:
+        align(ALIGN, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=progress)
+
+    with pytest.raises(Stopped):
+        begin(stop)
+    assert not out.exists()
+    seen: list[float] = []
+    begin(lambda done, note: seen.append(done))
+    assert seen == [1.0]
+    name = "target_encoder.safetensors"
+    assert (out / name).read_bytes() == (aligned / name).read_bytes()
+    told, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, aligned))
+    assert told["points"] == expected["points"]
