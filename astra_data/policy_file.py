@@ -50,14 +50,15 @@ class PolicyFile:
     Attributes:
         policy: the networks.
         simulation: where it was trained; None for a policy trained in the target or on data alone.
-        dataset, content_hash: the dataset that everything was learned from.
+        dataset, content_hash: the dataset that everything was learned from; None for one that was learned
+            from none, to collect one.
         observed: what it is shown of the target.
     """
 
     policy: Policy
     simulation: Simulation | None
-    dataset: str
-    content_hash: str
+    dataset: str | None
+    content_hash: str | None
     observed: Observed = "abstract"
 
     def save(self, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How long work takes, of the clock and of the processor."""
+"""How long work takes, of the clock and of the processor; and when it is time again."""
 
 import time
 from collections.abc import Mapping
@@ -20,3 +20,19 @@ class Stopwatch:
     def spent(self) -> dict[str, float]:
         """Return `wall_seconds`, and `cpu_seconds` of all threads of this process."""
         return {"wall_seconds": self.seconds, "cpu_seconds": time.process_time() - self._cpu_began}
+
+
+class Alarm:
+    """Goes off every few `seconds`, for work that is to be done now and then, such as a checkpoint."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._set = time.perf_counter()
+
+    def goes_off(self) -> bool:
+        """Tell whether the time is up; if so, it begins anew."""
+        now = time.perf_counter()
+        if now - self._set < self._seconds:
+            return False
+        self._set = now
+        return True

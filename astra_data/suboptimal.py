@@ -1,22 +1,28 @@
 """Policies that were stopped early: better than chance, far from good."""
 
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from astra_data.behaviors import PolicyBehavior
-from astra_data.deployment import DeployedPolicy
+from astra_data.checkpoint import flatten, resumed, save_tensors
+from astra_data.deployment import DeployedPolicy, Observed
 from astra_data.errors import BadInputError
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.sac import Sac, SacConfig
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.policy import Policy, PolicyShape
 from astra_data.models.soft_actor import SoftActor
+from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Config
 from astra_data.seeding import derive
+from astra_data.stopwatch import Alarm, Stopwatch
 from astra_data.target_world import TargetWorld
 from astra_data.task import Task
+from astra_data.training import CHECKPOINT_SECONDS
 
 _PPO_ENVS = 128
 _SAC_ENVS = 32
@@ -35,9 +41,11 @@ _TRIALS = 32
 
 
 def suboptimal_by_ppo(
-    task: Task, *, steps: int, seed: int, num_threads: int | None, progress: Progress
-) -> tuple[DeployedPolicy, Told]:
+    task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
+) -> tuple[PolicyFile, Told]:
     """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
+
+    A checkpoint in `folder` lets the same call go on after an interruption.
 
     Returns:
         the policy, and how it was trained.
@@ -47,20 +55,28 @@ def suboptimal_by_ppo(
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
     config = PpoConfig(total_steps=steps)
     ppo = Ppo(world, policy, config, horizon=task.objective.horizon, seed=seed)
-    while not ppo.done:
-        metrics = ppo.iterate()
-        note = f"training the behaviour: reward per step {metrics['reward']:.3f}"
-        progress(min(1.0, ppo.steps / steps), note)
-    told = _told(steps, policy, world, config)
-    return DeployedPolicy(task, policy.requires_grad_(False)), told
+
+    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
+        return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
+
+    _train(ppo, world, judge, folder, progress)
+    return _finished(policy, "abstract"), _told(ppo, policy, config)
 
 
 def suboptimal_by_sac(
-    task: Task, *, steps: int, episode_steps: int, seed: int, num_threads: int | None, progress: Progress
-) -> tuple[DeployedPolicy, Told]:
+    task: Task,
+    *,
+    steps: int,
+    episode_steps: int,
+    seed: int,
+    folder: Path,
+    num_threads: int | None,
+    progress: Progress,
+) -> tuple[PolicyFile, Told]:
     """Train a policy without memory by SAC in the target, on its full state.
 
-    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest.
+    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest. A checkpoint in
+    `folder` lets the same call go on after an interruption.
 
     Returns:
         the policy, and how it was trained.
@@ -76,15 +92,36 @@ def suboptimal_by_sac(
     config = _SAC.model_copy(update={"total_steps": steps})
     sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
     deployed = DeployedPolicy(task, actor, observed="full")
-    lasted = 0.0
-    while not sac.done and lasted < episode_steps:
-        sac.iterate()
+
+    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
         lasted = _lasts(deployed, derive(seed, f"trial {sac.steps}"), num_threads)
-        share = max(sac.steps / steps, lasted / episode_steps)
-        progress(min(1.0, share), f"training the behaviour: episodes last {lasted:.0f} steps")
-    told = _told(sac.steps, actor, world, config)
-    actor.requires_grad_(False)
-    return deployed, told
+        return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
+
+    _train(sac, world, judge, folder, progress)
+    return _finished(actor, "full"), _told(sac, actor, config)
+
+
+def _train(
+    learner: Ppo | Sac,
+    world: TargetWorld,
+    judge: Callable[[Mapping[str, float]], tuple[float, str]],
+    folder: Path,
+    progress: Progress,
+) -> None:
+    """Train until `judge`, given the figures of an iteration, says that a share of 1 is done, and a note."""
+    checkpoint, share, spent = folder / "training.safetensors", 0.0, None
+    if checkpoint.exists():
+        with resumed(checkpoint) as (state, told):
+            learner.load_state_dict(state["learner"], world.load_state_dict(state["world"]))
+            share, spent = told["share"], told["spent"]
+    stopwatch, alarm = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS)
+    while share < 1.0:
+        share, note = judge(learner.iterate())
+        rate = learner.steps / stopwatch.seconds
+        progress(min(1.0, share), f"training the behaviour: {rate:,.0f} steps/s  {note}")
+        if alarm.goes_off() or share >= 1.0:
+            state = {"learner": learner.state_dict(), "world": world.state_dict()}
+            save_tensors(checkpoint, flatten(state), {"share": share, "spent": stopwatch.spent()})
 
 
 def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:
@@ -105,7 +142,11 @@ def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> floa
     return lasted / _TRIALS
 
 
-def _told(steps: int, policy: Policy, world: TargetWorld, config: Config) -> Told:
+def _finished(policy: Policy, observed: Observed) -> PolicyFile:
+    return PolicyFile(policy.requires_grad_(False), None, None, None, observed)
+
+
+def _told(learner: Ppo | Sac, policy: Policy, config: Config) -> Told:
     sizes = list(policy.shape.hidden_sizes)
-    learner = {"num_envs": world.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
-    return {"trained_steps": steps, "learner": learner}
+    settings = {"num_envs": learner.env.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
+    return {"trained_steps": learner.steps, "learner": settings}

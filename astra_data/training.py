@@ -30,13 +30,14 @@ from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Number, choice
 from astra_data.seeding import derive
-from astra_data.stopwatch import Stopwatch
+from astra_data.stopwatch import Alarm, Stopwatch
 from astra_data.task import Task
 from astra_data.training_world import WorldConfig, recorded_steps, training_world, world_parts
 from astra_data.variation import Variation
 from astra_data.world import RewardSource, SimulatorWorld
 
-_CHECKPOINT_EVERY = 20
+CHECKPOINT_SECONDS = 60.0
+"""So much of a training is lost at most when it is interrupted."""
 
 
 class TrainConfig(WorldConfig):
@@ -227,7 +228,7 @@ def optimise(
             world = {name: values.to(device) for name, values in state["world"].items()}
             learner.load_state_dict(state["learner"], env.load_state_dict(world))
             points, spent = told["points"], told["spent"]
-    stopwatch, first = Stopwatch(spent), learner.steps
+    stopwatch, alarm, first = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS), learner.steps
     is_lasting = training.task.objective.is_lasting
     while not learner.done:
         if isinstance(env, SimulatorWorld):
@@ -243,7 +244,7 @@ def optimise(
         lately = _lately(points, "episode_steps" if is_lasting else "success")
         note = f"{rate:,.0f} steps/s  {lately}"
         training.progress(learner.steps / learner.total_steps, note)
-        if len(points) % _CHECKPOINT_EVERY == 0 or learner.done:
+        if alarm.goes_off() or learner.done:
             state = {"learner": learner.state_dict(), "world": env.state_dict()}
             save_tensors(checkpoint, flatten(state), {"points": points, "spent": stopwatch.spent()})
     return {

@@ -42,9 +42,7 @@ def test_rows_that_predict_no_reward_are_not_trained_with_it() -> None:
     tables = {"task": "antmaze-umaze", "methods": rows}
     assert read(**tables, train=predicted, plus={"reward": "blend"}).train.reward == "predicted"
     for asked in ({"train": predicted}, {"plus": predicted}):
-        with pytest.raises(
-            RecipeError, match=r"plus\.reward: direct_transfer_plus predicts none: expected"
-        ):
+        with pytest.raises(RecipeError, match=r"plus\.reward: direct_transfer_plus predicts none: expected"):
             read(**tables, **asked)
     with pytest.raises(RecipeError, match=r"train\.reward: nas predicts none"):
         read(**tables | {"methods": ["nas"]}, train=predicted)

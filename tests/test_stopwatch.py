@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from astra_data.stopwatch import Stopwatch
+from astra_data.stopwatch import Alarm, Stopwatch
 
 
 def test_waiting_takes_wall_time_and_computing_both(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,3 +18,10 @@ def test_it_goes_on_from_what_was_spent_before(monkeypatch: pytest.MonkeyPatch) 
     spent = {"wall_seconds": 30.0, "cpu_seconds": 40.0}
     assert Stopwatch(spent).spent() == spent
     assert Stopwatch(spent).seconds == 30.0
+
+
+def test_an_alarm_goes_off_once_its_time_is_up_and_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([100.0, 159.0, 161.0, 162.0, 221.0, 222.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(times))
+    alarm = Alarm(60.0)
+    assert [alarm.goes_off() for _ in range(5)] == [False, True, False, True, False]

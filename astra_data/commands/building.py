@@ -40,7 +40,10 @@ SacEpisodeSteps = Annotated[
     int | None,
     typer.Option(help="How long episodes last when suboptimal_sac stops learning.", show_default="500"),
 ]
-Policy = Annotated[str | None, typer.Option(help="Folder of the trained policy.", show_default=False)]
+Policy = Annotated[
+    str | None,
+    typer.Option(help="Folder of the policy: of a training, or meta/astra of a dataset.", show_default=False),
+]
 Grounding = Annotated[
     str | None, typer.Option(help="Folder of its grounding, if it has one.", show_default=False)
 ]

@@ -16,6 +16,7 @@ from astra_data.dataset.format import (
     DEFAULT_COLUMNS,
     INFO_PATH,
     METADATA_PATH,
+    POLICY_PATH,
     STATS_PATH,
     SUBSETS_PATH,
     TASKS_PATH,
@@ -39,7 +40,7 @@ from astra_data.dataset.report import Report
 from astra_data.dataset.statistics import global_statistics
 from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 
-_META_FILES = (INFO_PATH, STATS_PATH, TASKS_PATH, DATASET_PATH, METADATA_PATH, SUBSETS_PATH)
+_META_FILES = (INFO_PATH, STATS_PATH, TASKS_PATH, DATASET_PATH, METADATA_PATH, SUBSETS_PATH, POLICY_PATH)
 
 
 def check(root: Path) -> Report:

@@ -2,6 +2,7 @@
 
 <parent>/.<name>.staged/plan.json            what is being recorded
 <parent>/.<name>.staged/000012.arrow         one finished episode
+<parent>/.<name>.staged/...                  whatever else the recording needs to go on
 """
 
 import json
@@ -26,6 +27,8 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.lock import held
 
+_PLAN = "plan.json"
+
 
 class StagedWriter:
     """Writes a dataset whose episodes must not be lost, such as a robot's.
@@ -38,7 +41,8 @@ class StagedWriter:
 
     Attributes:
         staged: metadata of the episodes that are safe, by their position in the dataset.
-        made: as in `DatasetWriter`.
+        made, policy: as in `DatasetWriter`.
+        folder: where they wait, and what else is needed to go on after an interruption may.
     """
 
     def __init__(
@@ -74,8 +78,9 @@ class StagedWriter:
         )
         self.root = root
         self.made: dict[str, Any] = {}
+        self.policy: Path | None = None
         self.staged: dict[int, Mapping[str, Scalar]] = {}
-        self._folder = root.with_name(f".{root.name}.staged")
+        self.folder = root.with_name(f".{root.name}.staged")
         self._columns = list(columns)
         self._schema = layout.data_schema(columns)
         self._plan = {
@@ -93,22 +98,23 @@ class StagedWriter:
 
     def __enter__(self) -> "StagedWriter":
         """Start the recording, or go on with it."""
-        waiting = len(list(self._folder.glob("*.arrow")))
-        if waiting and not self._resume and not self.root.exists():
+        if self._holds_work() and not self._resume and not self.root.exists():
+            waiting = len(list(self.folder.glob("*.arrow")))
+            left = f"{waiting} episodes" if waiting else "what it had begun"
             raise BadInputError(
-                f"{self.root}: an interrupted recording left {waiting} episodes; "
-                f"resume it (--resume), or delete {self._folder} to start anew."
+                f"{self.root}: an interrupted recording left {left}; "
+                f"resume it (--resume), or delete {self.folder} to start anew."
             )
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            if not stack.enter_context(held(self._folder)):
+            if not stack.enter_context(held(self.folder)):
                 raise BadInputError(
                     f"{self.root} is being recorded right now; wait or choose another folder."
                 )
             if self.root.exists():
                 self._refuse_root()
             self._agree_on_the_plan()
-            for path in sorted(self._folder.glob("*.arrow")):
+            for path in sorted(self.folder.glob("*.arrow")):
                 episode = self._load(path)
                 self._admission.admit(episode)
                 self.staged[int(path.stem)] = episode.metadata
@@ -124,14 +130,14 @@ class StagedWriter:
         with self._exit:
             try:
                 if error is None:
-                    self._writer.made = self.made
+                    self._writer.made, self._writer.policy = self.made, self.policy
                     with self._writer:
                         for position in sorted(self.staged):
                             self._writer.add(self._load(self._path(position)))
                     self.staged.clear()
             finally:
-                if not self.staged:
-                    shutil.rmtree(self._folder)
+                if not self.staged and (error is None or not self._holds_work()):
+                    shutil.rmtree(self.folder)
 
     def add(self, episode: Episode, position: int | None = None) -> None:
         """Make `episode` safe; one that is refused changes nothing.
@@ -160,20 +166,24 @@ class StagedWriter:
             sync(partial)
         os.replace(partial, path)
         if self._fsync:
-            sync(self._folder)
+            sync(self.folder)
         self.staged[place] = episode.metadata
+
+    def _holds_work(self) -> bool:
+        """Tell whether more than the plan waits to be gone on with."""
+        return any(path.name != _PLAN and path.suffix != ".partial" for path in self.folder.glob("*"))
 
     def _refuse_root(self) -> None:
         """Say that `root` exists, and clear what is staged only if it is the same recording, finished."""
         staged = {
-            episode.uid: len(episode) for episode in map(self._load, sorted(self._folder.glob("*.arrow")))
+            episode.uid: len(episode) for episode in map(self._load, sorted(self.folder.glob("*.arrow")))
         }
         if not staged or self._is_finished(staged):
-            shutil.rmtree(self._folder)
+            shutil.rmtree(self.folder)
             raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
         raise BadInputError(
             f"{self.root} exists already and is another dataset than the interrupted recording of "
-            f"{len(staged)} episodes in {self._folder}: move one of the two away."
+            f"{len(staged)} episodes in {self.folder}: move one of the two away."
         )
 
     def _is_finished(self, staged: Mapping[int, int]) -> bool:
@@ -187,7 +197,7 @@ class StagedWriter:
         return same and stored == staged
 
     def _path(self, position: int) -> Path:
-        return self._folder / f"{position:06d}.arrow"
+        return self.folder / f"{position:06d}.arrow"
 
     def _load(self, path: Path) -> Episode:
         try:
@@ -202,7 +212,7 @@ class StagedWriter:
         return Episode(told["uid"], values, told["metadata"])
 
     def _agree_on_the_plan(self) -> None:
-        path = self._folder / "plan.json"
+        path = self.folder / _PLAN
         text = json.dumps(self._plan, indent=1, sort_keys=True)
         if path.exists():
             before, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
@@ -210,7 +220,7 @@ class StagedWriter:
             if differing:
                 raise BadInputError(
                     f"{self.root}: the interrupted recording differs in {', '.join(differing)}; "
-                    f"resume it with the same settings, or delete {self._folder}."
+                    f"resume it with the same settings, or delete {self.folder}."
                 )
         partial = path.with_suffix(".partial")
         partial.write_text(text, encoding="utf-8")

@@ -1,6 +1,7 @@
 """Write a dataset: episodes stream into a hidden folder, which becomes the dataset when all is well."""
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -37,6 +38,7 @@ class DatasetWriter:
     Attributes:
         made: how the dataset was made, such as how long it took, for meta/astra/dataset.json beside the
             description; to be filled in before leaving the block.
+        policy: file of the policy that acted, if a copy of it belongs to the dataset; as `made`.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class DatasetWriter:
         self._task = task
         self._description = complete_description(description)
         self.made: dict[str, Any] = {}
+        self.policy: Path | None = None
         self._subset_seed = subset_seed
         self._compression = compression
         self._hash = ContentHash()
@@ -188,6 +191,8 @@ class DatasetWriter:
         for key, kind_ in sorted(self._admission.metadata_types.items()):
             metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
+        if self.policy:
+            shutil.copyfile(self.policy, self._folder / layout.POLICY_PATH)
         faults = Dataset.open(self._folder).verify()
         if faults:
             raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")

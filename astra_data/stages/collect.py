@@ -145,7 +145,7 @@ def collect(
         fsync=False,
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
-        behavior, told = _behavior(world, config, seed, num_threads, part(progress, 0.0, share))
+        behavior, told = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
         steps = 0
@@ -168,9 +168,14 @@ def collect(
 
 
 def _behavior(
-    task: Task, config: CollectConfig, seed: int, num_threads: int | None, progress: Progress
+    task: Task,
+    config: CollectConfig,
+    seed: int,
+    writer: StagedWriter,
+    num_threads: int | None,
+    progress: Progress,
 ) -> tuple[Behavior, dict[str, Any]]:
-    """Return what acts, and what is to be told about it."""
+    """Return what acts, and what is to be told about it; a policy trained for it goes into the dataset."""
     if config.behavior == "random":
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
@@ -185,8 +190,10 @@ def _behavior(
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
         else:
             by = partial(suboptimal_by_sac, steps=config.sac_steps, episode_steps=config.sac_episode_steps)
-        deployed, told = by(task, seed=seed, num_threads=num_threads, progress=progress)
-        return PolicyBehavior(deployed), told
+        policy, told = by(task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress)
+        writer.policy = writer.folder / "policy.safetensors"
+        policy.save(writer.policy)
+        return PolicyBehavior(deploy(task, policy)), told
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
     model = load_grounding(files["grounding"]) if "grounding" in files else None

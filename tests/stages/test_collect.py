@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from small_run import COLLECT, TASK
 
+from astra_data import suboptimal
 from astra_data.columns import (
     ACTION,
     DONE,
@@ -19,6 +20,7 @@ from astra_data.columns import (
     Episode,
 )
 from astra_data.dataset import Dataset, StagedWriter
+from astra_data.dataset.check import check
 from astra_data.errors import BadInputError
 from astra_data.progress import silent
 from astra_data.stages.collect import CollectConfig, collect
@@ -136,7 +138,75 @@ def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
     assert hashes[0] == hashes[1]
     dataset = Dataset.open(out)
     assert dataset.reference == f"{TASK}-suboptimal-ppo-seed0@data-1.0.0"
-    assert dataset.description["behavior"]["trained_steps"] == 1
+    assert dataset.description["behavior"]["trained_steps"] == 64 * 128  # an iteration
+
+
+class Stopped(Exception):  # noqa: N818 - stands for a kill
+    pass
+
+
+@pytest.fixture
+def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    sac = suboptimal._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
+    small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TRIALS": 2}
+    for name, value in small.items():
+        monkeypatch.setattr(suboptimal, name, value)
+    monkeypatch.setattr(suboptimal, "CHECKPOINT_SECONDS", 0.0)
+
+
+@pytest.mark.usefixtures("small_training")
+@pytest.mark.parametrize("learner", ["ppo", "sac"])
+def test_after_interruptions_the_policy_is_not_trained_again(
+    learner: str, task: str, lasting: str, tmp_path: Path
+) -> None:
+    """The first comes in the training, after two of its three iterations, the second while it is recorded."""
+    name, settings = {
+        "ppo": (task, {"behavior": "suboptimal_ppo", "ppo_steps": 3 * 64 * 4}),
+        "sac": (lasting, {"behavior": "suboptimal_sac", "sac_steps": 3 * 8 * 4, "sac_episode_steps": 71}),
+    }[learner]
+    config = CollectConfig(**settings, episodes=3, max_steps=3, start="task")  # type: ignore[arg-type]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    collect(name, config, seed=0, out=whole, progress=silent)
+
+    def notes_until(kind: str, count: int) -> int:
+        """Return how many notes on the training there are before the `count`-th note of a `kind` stops it."""
+        notes: list[str] = []
+
+        def stop(share: float, note: str) -> None:
+            notes.append(note)
+            if sum(kind in told for told in notes) == count:
+                raise Stopped
+
+        with pytest.raises(Stopped):
+            collect(name, config, seed=0, out=out, progress=stop)
+        assert not out.exists()
+        return sum("training" in note for note in notes)
+
+    assert notes_until("training", 3) == 3
+    with pytest.raises(BadInputError, match="left what it had begun; resume it"):
+        collect(name, config, seed=0, out=out, progress=silent, resume=False)
+    assert notes_until("target steps/s", 1) == 1
+    assert notes_until("target steps/s", 1) == 0
+    collect(name, config, seed=0, out=out, progress=silent)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+    policy = "meta/astra/policy.safetensors"
+    assert (out / policy).read_bytes() == (whole / policy).read_bytes()
+    one, other = Dataset.open(out), Dataset.open(whole)
+    assert one.content_hash == other.content_hash
+    for key in ("trained_steps", "learner"):
+        assert one.description["behavior"][key] == other.description["behavior"][key]
+
+
+@pytest.mark.usefixtures("small_training")
+def test_the_policy_that_acted_acts_again(lasting: str, tmp_path: Path) -> None:
+    short = {"start": "task", "episodes": 3, "max_steps": 3}
+    config = CollectConfig(behavior="suboptimal_sac", sac_steps=1, **short)  # type: ignore[arg-type]
+    first = Dataset.open(collect(lasting, config, seed=0, out=tmp_path / "first", progress=silent))
+    again = CollectConfig(behavior="policy", policy=str(first.root / "meta/astra"), **short)  # type: ignore[arg-type]
+    second = Dataset.open(collect(lasting, again, seed=0, out=tmp_path / "second", progress=silent))
+    assert second.content_hash == first.content_hash
+    assert not check(first.root).notes
+    assert not (second.root / "meta/astra/policy.safetensors").exists()
 
 
 @pytest.fixture

@@ -114,7 +114,7 @@ def test_the_same_seed_gives_the_same_bytes(task: str, paired: Path, grounded: P
 def test_after_an_interruption_it_goes_on(
     task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 10)
+    monkeypatch.setattr(stage, "_KEEP_EVERY", 10)
     out = tmp_path / "ground"
     with pytest.raises(Stopped):
         make(task, paired, out, progress=stop_after(20))

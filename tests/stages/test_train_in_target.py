@@ -52,7 +52,7 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     observed: str,
     size: int,
 ) -> None:
-    monkeypatch.setattr(stage, "_CHECKPOINT_EVERY", 2)
+    monkeypatch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     expected = make(task, row, paired, whole)
     with pytest.raises(Stopped):
