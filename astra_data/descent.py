@@ -11,7 +11,7 @@ from astra_data.stopwatch import Stopwatch
 
 
 class DescentConfig(Config):
-    """How a model is fitted by gradients. The paper prints none of these."""
+    """How a model is fitted by gradients. The paper prints none of it, nor of what stages add."""
 
     updates: Count = 1500
     """Gradient updates in all."""
@@ -25,9 +25,10 @@ class Descent:
     """A fit in progress, by AdamW.
 
     Attributes:
+        parameters: those that are fitted.
         done: updates so far.
         points: what was measured on the way.
-        stopwatch: runs from the first update on, also across an interruption.
+        stopwatch: runs from the beginning, on top of what was spent before an interruption.
     """
 
     def __init__(

@@ -203,7 +203,8 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_rewards_to_learn_from(self) -> Self:
-        for row in self.methods:
+        begun = [METHODS[base_method(row)].initial for row in self.methods]
+        for row in (*self.methods, *filter(None, begun)):
             table = "plus" if is_plus(row) else "train"
             if not METHODS[base_method(row)].learns_from(getattr(self, table).reward):
                 raise ValueError(

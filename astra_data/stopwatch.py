@@ -23,16 +23,17 @@ class Stopwatch:
 
 
 class Alarm:
-    """Goes off every few `seconds`, for work that is to be done now and then, such as a checkpoint."""
+    """Tells when it is time for what is to be done every few `seconds`, such as a checkpoint."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
-        self._set = time.perf_counter()
+        self.reset()
 
-    def goes_off(self) -> bool:
-        """Tell whether the time is up; if so, it begins anew."""
-        now = time.perf_counter()
-        if now - self._set < self._seconds:
-            return False
-        self._set = now
-        return True
+    def reset(self) -> None:
+        """Let the time begin anew: what it is for has been done."""
+        self._began = time.perf_counter()
+
+    @property
+    def rings(self) -> bool:
+        """Whether the time is up."""
+        return time.perf_counter() - self._began >= self._seconds

@@ -59,8 +59,8 @@ def suboptimal_by_ppo(
     def judge(figures: Mapping[str, float]) -> tuple[float, str]:
         return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
 
-    _train(ppo, world, judge, folder, progress)
-    return _finished(policy, "abstract"), _told(ppo, policy, config)
+    spent = _train(ppo, world, judge, folder, progress)
+    return _finished(policy, "abstract"), _told(ppo, policy, config, spent)
 
 
 def suboptimal_by_sac(
@@ -97,8 +97,8 @@ def suboptimal_by_sac(
         lasted = _lasts(deployed, derive(seed, f"trial {sac.steps}"), num_threads)
         return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
 
-    _train(sac, world, judge, folder, progress)
-    return _finished(actor, "full"), _told(sac, actor, config)
+    spent = _train(sac, world, judge, folder, progress)
+    return _finished(actor, "full"), _told(sac, actor, config, spent)
 
 
 def _train(
@@ -107,8 +107,12 @@ def _train(
     judge: Callable[[Mapping[str, float]], tuple[float, str]],
     folder: Path,
     progress: Progress,
-) -> None:
-    """Train until `judge`, given the figures of an iteration, says that a share of 1 is done, and a note."""
+) -> dict[str, float]:
+    """Train until `judge`, given the figures of an iteration, says that a share of 1 is done, and a note.
+
+    Returns:
+        the time that it took, with that before an interruption.
+    """
     checkpoint, share, spent = folder / "training.safetensors", 0.0, None
     if checkpoint.exists():
         with resumed(checkpoint) as (state, told):
@@ -119,9 +123,11 @@ def _train(
         share, note = judge(learner.iterate())
         rate = learner.steps / stopwatch.seconds
         progress(min(1.0, share), f"training the behaviour: {rate:,.0f} steps/s  {note}")
-        if alarm.goes_off() or share >= 1.0:
+        if alarm.rings or share >= 1.0:
             state = {"learner": learner.state_dict(), "world": world.state_dict()}
             save_tensors(checkpoint, flatten(state), {"share": share, "spent": stopwatch.spent()})
+            alarm.reset()
+    return stopwatch.spent()
 
 
 def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:
@@ -146,7 +152,7 @@ def _finished(policy: Policy, observed: Observed) -> PolicyFile:
     return PolicyFile(policy.requires_grad_(False), None, None, None, observed)
 
 
-def _told(learner: Ppo | Sac, policy: Policy, config: Config) -> Told:
+def _told(learner: Ppo | Sac, policy: Policy, config: Config, spent: Mapping[str, float]) -> Told:
     sizes = list(policy.shape.hidden_sizes)
     settings = {"num_envs": learner.env.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
-    return {"trained_steps": learner.steps, "learner": settings}
+    return {"trained_steps": learner.steps, "learner": settings, "spent": spent}

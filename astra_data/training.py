@@ -37,7 +37,7 @@ from astra_data.variation import Variation
 from astra_data.world import RewardSource, SimulatorWorld
 
 CHECKPOINT_SECONDS = 60.0
-"""So much of a training is lost at most when it is interrupted."""
+"""After so long, the next iteration ends with a checkpoint."""
 
 
 class TrainConfig(WorldConfig):
@@ -244,9 +244,10 @@ def optimise(
         lately = _lately(points, "episode_steps" if is_lasting else "success")
         note = f"{rate:,.0f} steps/s  {lately}"
         training.progress(learner.steps / learner.total_steps, note)
-        if alarm.goes_off() or learner.done:
+        if alarm.rings or learner.done:
             state = {"learner": learner.state_dict(), "world": env.state_dict()}
             save_tensors(checkpoint, flatten(state), {"points": points, "spent": stopwatch.spent()})
+            alarm.reset()
     return {
         "steps_per_second": learner.steps / stopwatch.seconds,
         "simulator_steps_per_second": (learner.steps - first) / max(learner.acting.world_seconds, 1e-9),

@@ -44,8 +44,9 @@ def test_rows_that_predict_no_reward_are_not_trained_with_it() -> None:
     for asked in ({"train": predicted}, {"plus": predicted}):
         with pytest.raises(RecipeError, match=r"plus\.reward: direct_transfer_plus predicts none: expected"):
             read(**tables, **asked)
-    with pytest.raises(RecipeError, match=r"train\.reward: nas predicts none"):
-        read(**tables | {"methods": ["nas"]}, train=predicted)
+    for row, trained in {"nas": "nas", "direct_transfer_iql": "direct_transfer"}.items():
+        with pytest.raises(RecipeError, match=rf"train\.reward: {trained} predicts none"):
+            read(**tables | {"methods": ["astra", row]}, train=predicted)
 
 
 @pytest.mark.parametrize(

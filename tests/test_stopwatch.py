@@ -20,8 +20,10 @@ def test_it_goes_on_from_what_was_spent_before(monkeypatch: pytest.MonkeyPatch) 
     assert Stopwatch(spent).seconds == 30.0
 
 
-def test_an_alarm_goes_off_once_its_time_is_up_and_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([100.0, 159.0, 161.0, 162.0, 221.0, 222.0])
+def test_an_alarm_rings_once_its_time_is_up_until_it_is_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([100.0, 159.0, 160.0, 161.0, 170.0, 229.0, 230.0])
     monkeypatch.setattr(time, "perf_counter", lambda: next(times))
     alarm = Alarm(60.0)
-    assert [alarm.goes_off() for _ in range(5)] == [False, True, False, True, False]
+    assert [alarm.rings for _ in range(3)] == [False, True, True]
+    alarm.reset()
+    assert [alarm.rings for _ in range(2)] == [False, True]

@@ -5,7 +5,7 @@
 <root>/meta/astra/dataset.json                  where the dataset comes from, and its content hash
 <root>/meta/astra/episodes.parquet              one row of metadata per episode, keyed by episode_uid
 <root>/meta/astra/subsets.json                  the permutation whose prefixes are the nested subsets
-<root>/meta/astra/policy.safetensors            the policy that acted, where it was trained to do so
+<root>/meta/astra/policy.safetensors            the policy that acted, if it was trained while collecting
 
 For training, `frames.Frames` holds columns as tensors and draws windows and transitions from them.
 """

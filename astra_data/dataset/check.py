@@ -38,6 +38,7 @@ from astra_data.dataset.provenance import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.report import Report
 from astra_data.dataset.statistics import global_statistics
+from astra_data.digest import file_digest
 from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 
 _META_FILES = (INFO_PATH, STATS_PATH, TASKS_PATH, DATASET_PATH, METADATA_PATH, SUBSETS_PATH, POLICY_PATH)
@@ -169,9 +170,10 @@ def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -
 
 def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
     try:
-        stored = read_description(root)["content_hash"]
-        if (found := checks.hash.hexdigest()) != stored:
+        description = read_description(root)
+        if (found := checks.hash.hexdigest()) != (stored := description["content_hash"]):
             report.fault("origin", f"the content hash is {found}, expected {stored}")
+        _policy_faults(root, description.get("behavior"), report)
     except CorruptDatasetError as error:
         report.fault("origin", str(error))
     table = read_small_table(root / METADATA_PATH)
@@ -190,3 +192,14 @@ def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
             report.fault(SUBSETS_PATH, f"{SUBSETS_PATH}: the uids are not in the order of their seed")
     except CorruptDatasetError as error:
         report.fault(SUBSETS_PATH, str(error))
+
+
+def _policy_faults(root: Path, behavior: object, report: Report) -> None:
+    """Compare the policy that acted with what is recorded of it, if it was trained while collecting."""
+    expected = behavior.get("policy_sha256") if isinstance(behavior, dict) else None
+    if expected is None:
+        return
+    policy = root / POLICY_PATH
+    found = file_digest(policy) if policy.is_file() else "not there"
+    if found != expected:
+        report.fault("origin", f"{POLICY_PATH} is {found}, expected the sha256 {expected}")

@@ -15,6 +15,7 @@ from astra_data.dataset.format import (
     DEFAULT_COLUMNS,
     INFO_PATH,
     METADATA_PATH,
+    POLICY_PATH,
     SUBSETS_PATH,
     TASKS_PATH,
 )
@@ -105,6 +106,7 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
                 "cannot be told"
             )
         writer.made = {"repaired": result.notes}
+        writer.policy = policy if (policy := folder / POLICY_PATH).is_file() else None
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
     if metadata and unknown:

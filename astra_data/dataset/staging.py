@@ -42,7 +42,7 @@ class StagedWriter:
     Attributes:
         staged: metadata of the episodes that are safe, by their position in the dataset.
         made, policy: as in `DatasetWriter`.
-        folder: where they wait, and what else is needed to go on after an interruption may.
+        folder: where they wait, and whatever else the recording needs to go on after an interruption.
     """
 
     def __init__(
@@ -99,10 +99,8 @@ class StagedWriter:
     def __enter__(self) -> "StagedWriter":
         """Start the recording, or go on with it."""
         if self._holds_work() and not self._resume and not self.root.exists():
-            waiting = len(list(self.folder.glob("*.arrow")))
-            left = f"{waiting} episodes" if waiting else "what it had begun"
             raise BadInputError(
-                f"{self.root}: an interrupted recording left {left}; "
+                f"{self.root}: an interrupted recording left {self._left()}; "
                 f"resume it (--resume), or delete {self.folder} to start anew."
             )
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -173,17 +171,22 @@ class StagedWriter:
         """Tell whether more than the plan waits to be gone on with."""
         return any(path.name != _PLAN and path.suffix != ".partial" for path in self.folder.glob("*"))
 
+    def _left(self) -> str:
+        """Tell what waits to be gone on with."""
+        waiting = len(list(self.folder.glob("*.arrow")))
+        return f"{waiting} episodes" if waiting else "what it had begun"
+
     def _refuse_root(self) -> None:
-        """Say that `root` exists, and clear what is staged only if it is the same recording, finished."""
+        """Say that `root` exists, and clear what waits only if it is the same recording, finished."""
         staged = {
             episode.uid: len(episode) for episode in map(self._load, sorted(self.folder.glob("*.arrow")))
         }
-        if not staged or self._is_finished(staged):
+        if not self._holds_work() or self._is_finished(staged):
             shutil.rmtree(self.folder)
             raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
         raise BadInputError(
-            f"{self.root} exists already and is another dataset than the interrupted recording of "
-            f"{len(staged)} episodes in {self.folder}: move one of the two away."
+            f"{self.root} exists already and is another dataset than the interrupted recording, which left "
+            f"{self._left()} in {self.folder}: move one of the two away."
         )
 
     def _is_finished(self, staged: Mapping[int, int]) -> bool:
@@ -194,7 +197,7 @@ class StagedWriter:
             return False
         stored = dict(zip(dataset.uids.tolist(), dataset.lengths.tolist(), strict=True))
         same = all(dataset.description.get(key) == value for key, value in self._plan["description"].items())
-        return same and stored == staged
+        return same and (not staged or stored == staged)
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"

@@ -121,7 +121,6 @@ def collect(
         BadInputError: the task is unknown, `out` exists, or the behaviour lacks something.
     """
     world = task_named(task)
-    stopwatch = Stopwatch()
     saved = {
         f"{kind}_sha256": file_digest(path) for kind, path in _saved_files(config).items() if path.is_file()
     }
@@ -146,6 +145,7 @@ def collect(
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         behavior, told = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))
+        stopwatch = Stopwatch(told.get("spent"))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
         steps = 0
@@ -193,6 +193,7 @@ def _behavior(
         policy, told = by(task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress)
         writer.policy = writer.folder / "policy.safetensors"
         policy.save(writer.policy)
+        told["policy_sha256"] = file_digest(writer.policy)
         return PolicyBehavior(deploy(task, policy)), told
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])

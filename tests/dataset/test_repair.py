@@ -15,7 +15,7 @@ from fake_dataset import fake_episodes, write_fake
 
 from astra_data.dataset import Dataset
 from astra_data.dataset.check import check
-from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.format import DATASET_PATH, POLICY_PATH
 from astra_data.dataset.repair import repair
 from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
 
@@ -220,6 +220,13 @@ def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: P
     lists[10] = [1.0]
     pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
     assert check(root).faults == ["action: expected 2 values in every row"]
+
+
+def test_the_policy_that_acted_is_kept(tmp_path: Path) -> None:
+    broken = write_fake(tmp_path / "broken").root
+    (broken / POLICY_PATH).write_bytes(b"weights")
+    repair(broken, out=tmp_path / "whole")
+    assert (tmp_path / "whole" / POLICY_PATH).read_bytes() == b"weights"
 
 
 def test_the_order_of_nested_subsets_is_kept(tmp_path: Path) -> None:

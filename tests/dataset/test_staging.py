@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, fake_episode, fake_episodes, staged_writer, write_fake
+from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, fake_episodes, staged_writer, write_fake
 
 from astra_data.columns import Episode
 from astra_data.dataset import Dataset
@@ -132,9 +132,26 @@ def test_another_dataset_in_its_place_does_not_cost_the_recording(tmp_path: Path
     interrupted(tmp_path / "set", fake_episodes()[:3])
     write_fake(tmp_path / "set")
     again = staged_writer(tmp_path / "set", resume=True)
-    with pytest.raises(BadInputError, match="another dataset than the interrupted recording of 3"), again:
+    with pytest.raises(BadInputError, match="interrupted recording, which left 3 episodes in"), again:
         pass
     assert len(list((tmp_path / ".set.staged").glob("*.arrow"))) == 3
+
+
+def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), staged_writer(tmp_path / "set") as writer:
+        (writer.folder / "training.safetensors").write_text("half")
+        raise RuntimeError
+    with (
+        pytest.raises(BadInputError, match="left what it had begun; resume it"),
+        staged_writer(tmp_path / "set"),
+    ):
+        pass
+    write_fake(tmp_path / "other", description=DESCRIPTION | {"name": "other"})
+    (tmp_path / "other").rename(tmp_path / "set")
+    again = staged_writer(tmp_path / "set", resume=True)
+    with pytest.raises(BadInputError, match="another dataset .* which left what it had begun in"), again:
+        pass
+    assert (tmp_path / ".set.staged" / "training.safetensors").read_text() == "half"
 
 
 def test_a_dataset_that_comes_between_does_not_cost_the_recording(tmp_path: Path) -> None:

@@ -58,4 +58,5 @@ def test_what_a_method_borrows_is_there() -> None:
     for method in METHODS.values():
         assert METHODS[method.grounded_as or method.name].fit == method.fit
         assert method.initial is None or METHODS[method.initial].trains
-        assert not method.predicts_reward or method.grounds
+        if method.in_simulator:
+            assert not method.learns_from("predicted") or method.grounds

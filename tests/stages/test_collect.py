@@ -1,4 +1,5 @@
 import hashlib
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -195,6 +196,7 @@ def test_after_interruptions_the_policy_is_not_trained_again(
     assert one.content_hash == other.content_hash
     for key in ("trained_steps", "learner"):
         assert one.description["behavior"][key] == other.description["behavior"][key]
+    assert one.description["wall_seconds"] > one.description["behavior"]["spent"]["wall_seconds"] > 0
 
 
 @pytest.mark.usefixtures("small_training")
@@ -205,7 +207,12 @@ def test_the_policy_that_acted_acts_again(lasting: str, tmp_path: Path) -> None:
     again = CollectConfig(behavior="policy", policy=str(first.root / "meta/astra"), **short)  # type: ignore[arg-type]
     second = Dataset.open(collect(lasting, again, seed=0, out=tmp_path / "second", progress=silent))
     assert second.content_hash == first.content_hash
-    assert not check(first.root).notes
+    report = check(first.root)
+    assert not report.notes and not report.faults
+    (first.root / "meta/astra/policy.safetensors").write_bytes(b"another")
+    assert re.search(r"policy\.safetensors is [0-9a-f]{64}, expected the sha256", check(first.root).faults[0])
+    (first.root / "meta/astra/policy.safetensors").unlink()
+    assert "policy.safetensors is not there, expected the sha256" in check(first.root).faults[0]
     assert not (second.root / "meta/astra/policy.safetensors").exists()
 
 
