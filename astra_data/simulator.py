@@ -1,7 +1,7 @@
 """What the toolkit needs of an abstract simulator."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -34,6 +34,14 @@ class PlacedSimulator(SteppedSimulator, Protocol):
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
         ...
+
+
+@runtime_checkable
+class RememberingSimulator(Protocol):
+    """A simulator whose next steps depend on more than its states."""
+
+    memory: Tensor
+    """What they depend on besides, (B, M); `reset_to` and `settle` forget what was."""
 
 
 class AbstractSimulator(SteppedSimulator, Protocol):

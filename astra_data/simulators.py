@@ -11,7 +11,7 @@ from astra_data.models.windows import Windows
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
 from astra_data.sims.randomized import RandomizedSimulator
-from astra_data.simulator import PlacedSimulator
+from astra_data.simulator import PlacedSimulator, RememberingSimulator
 from astra_data.task import Task
 from astra_data.variation import Variation, VariedSimulator
 
@@ -106,3 +106,11 @@ def varied_within(simulator: Simulator) -> VariedSimulator | None:
     """Return the simulator with varying parameters inside `simulator`, if there is one."""
     inner = simulator.simulator if isinstance(simulator, RandomizedSimulator) else simulator
     return inner if isinstance(inner, VariedSimulator) else None
+
+
+def remembering_within(simulator: Simulator) -> RememberingSimulator | None:
+    """Return the simulator inside `simulator` that remembers more than states tell, if there is one."""
+    inner: object = simulator
+    while hasattr(inner, "simulator"):
+        inner = inner.simulator
+    return inner if isinstance(inner, RememberingSimulator) else None

@@ -13,7 +13,7 @@ from astra_data.free_space import FreeSpace
 from astra_data.objective import Objective, PlanarObjective
 from astra_data.sims.augmented import AugmentedSimulator
 from astra_data.sims.grounded import GroundedSimulator
-from astra_data.simulators import Simulator, start_simulator, varied_within
+from astra_data.simulators import Simulator, remembering_within, start_simulator, varied_within
 
 RewardSource = Literal["abstract", "predicted", "blend"]
 
@@ -204,6 +204,9 @@ class SimulatorWorld:
         varied = varied_within(self.simulator)
         if varied is not None:
             state |= {"true": varied.true_state, "parameters": varied.parameters}
+        remembering = remembering_within(self.simulator)
+        if remembering is not None:
+            state["memory"] = remembering.memory
         return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
@@ -219,4 +222,7 @@ class SimulatorWorld:
         varied = varied_within(self.simulator)
         if varied is not None:
             varied.true_state, varied.parameters = state["true"].clone(), state["parameters"].clone()
+        remembering = remembering_within(self.simulator)
+        if remembering is not None:
+            remembering.memory = state["memory"].clone()
         return self._observe()

@@ -49,6 +49,29 @@ def test_resumes_where_it_was() -> None:
     assert observation.shape == (4, 8)
 
 
+@pytest.mark.parametrize("is_varied", [False, True])
+def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
+    task, worlds = TASKS["humanoid-walker2d"], []
+    for _ in range(2):
+        simulator = (
+            task.varied_simulator(3, task.varied.wide, "cpu") if is_varied else task.simulator(3, "cpu")
+        )
+        worlds.append(SimulatorWorld(task.objective, simulator))
+    first, second = worlds
+    first.reset()
+    low = first.simulator.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]])
+    first.simulator.reset_to(low)
+    for _ in range(4):
+        first.step(torch.zeros(3, 4))
+    second.load_state_dict(first.state_dict())
+    for _ in range(4):
+        after = []
+        for one in worlds:
+            torch.manual_seed(0)
+            after.append(one.step(torch.zeros(3, 4)).observation)
+        assert torch.equal(*after)
+
+
 def test_thin_data_costs_what_it_is_said_to() -> None:
     thinness = torch.zeros(U_MAZE.fine_walls.shape)
     thinness[:, : thinness.shape[1] // 2] = 0.25  # x < 0

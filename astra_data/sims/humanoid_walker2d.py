@@ -16,9 +16,9 @@ It leaves out:
   at joint angles at which the walker stands on both. Contacts that a step leads to come from the joints and
   the torso here, others than those of a humanoid in that pose.
 * How the waist and the hips' other axes lower the feet. At the humanoid's height of the torso the walker's
-  would often be inside the floor, which would throw it into the air: a step is taken as if the floor were
-  lower by that much.
-* The memory of MuJoCo's solver from step to step: a state says all about what follows from it.
+  would often be inside the floor, which would throw it into the air. So where it is set with its feet too
+  low, the floor is lower by that much, until it is set anew.
+* The memory of MuJoCo's solver from step to step.
 """
 
 from copy import copy
@@ -47,6 +47,7 @@ class HumanoidWalker2d(FreeStates):
 
     Attributes:
         state: (B, 15) float32, as `humanoid_to_walker2d` makes it.
+        memory: how much lower than at 0 the floors are, in m, (B, 1) float64.
     """
 
     action_size = 4
@@ -85,6 +86,7 @@ class HumanoidWalker2d(FreeStates):
         """
         standing = humanoid_to_walker2d(torch.tensor(STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
+        self.memory = self._sunk(self.state)
         self.ranges = ranges or CommandRanges()
         self._model = walker_model()
         self._models = [self._model]
@@ -113,6 +115,17 @@ class HumanoidWalker2d(FreeStates):
             model.dof_damping[:] = factor * plain.dof_damping
             model.opt.timestep = scale * plain.opt.timestep
 
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, 15), on floors that bear their feet."""
+        super().reset_to(state, rows)
+        sunk = self._sunk(state)
+        self.memory = sunk if rows is None else self.memory.index_copy(0, rows, sunk)
+
+    @staticmethod
+    def _sunk(state: Tensor) -> Tensor:
+        """Return how far feet are inside the floor, (B, 1) float64 in m."""
+        return (-sole_clearance(state[:, _POSE].double()).amin(-1, keepdim=True)).clamp_min(0.0)
+
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move to `landed` (B, 15), its contacts rounded to 1 or 0; return it."""
         contacts = (landed[:, _CONTACTS] > 0.5).to(landed.dtype)
@@ -122,8 +135,7 @@ class HumanoidWalker2d(FreeStates):
         """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, 15)."""
         model, count = self._model, len(self.state)
         initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
-        motion = self.state[:, _MOTION].cpu().double()
-        sunk = (-sole_clearance(motion[:, _POSE]).amin(-1)).clamp_min(0.0)
+        motion, sunk = self.state[:, _MOTION].cpu().double(), self.memory[:, 0].cpu()
         motion[:, 0] += sunk
         # Behind the time, and x, where every step begins anew.
         initial[:, 2 : 2 + _MOTION.stop] = motion.numpy()

@@ -101,6 +101,46 @@ def test_equals_mujoco_stepped_one_by_one(num_threads: int) -> None:
     assert some_sunk
 
 
+def test_walking_on_it_equals_mujoco_that_is_not_interrupted() -> None:
+    """From poses of the humanoid, whose feet are often lower than the walker's floor was; for 0.9 s."""
+    state, _, _ = recorded(6, 20)
+    abstract = humanoid_to_walker2d(state[-24:])
+    walker = HumanoidWalker2d(24, num_threads=2)
+    walker.reset_to(abstract)
+    assert (walker.memory > 0.01).any() and (walker.memory == 0.0).any()
+    generator = torch.Generator().manual_seed(0)
+    actions = (2 * torch.rand(6, 24, 4, generator=generator) - 1).repeat_interleave(10, 0)
+    states = torch.stack([walker.step(action) for action in actions])
+    model, apart = walker_model(), []
+    for row in range(24):
+        data = mujoco.MjData(model)
+        data.qpos[1:], data.qvel[:] = abstract[row, :6].numpy(), abstract[row, 6:13].numpy()
+        sunk = float(walker.memory[row])
+        data.qpos[1] += sunk
+        for step, action in enumerate(actions[:, row]):
+            data.ctrl[:] = CommandRanges().targets(action.double()).numpy()
+            mujoco.mj_step(model, data, 5)
+            apart.append(abs(float(states[step, row, 0]) - (data.qpos[1] - sunk)))
+    # Rollouts do not hand the solver's last answer on, and states are rounded.
+    assert np.quantile(apart, 0.9) < 1e-5
+    assert np.max(apart) < 1e-3
+
+
+def test_a_floor_stays_where_it_is_until_the_walker_is_set_anew() -> None:
+    walker = HumanoidWalker2d(3, num_threads=1)
+    low = walker.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.16], [0.2]])
+    walker.reset_to(low)
+    sunk = walker.memory.clone()
+    assert sunk[0] == 0.0
+    assert float(sunk[2] - sunk[1]) == pytest.approx(0.04, abs=1e-6)
+    walker.step(HELD.expand(3, 4))
+    assert torch.equal(walker.memory, sunk)
+    walker.reset_to(low[[2]], torch.tensor([1]))
+    assert torch.equal(walker.memory, sunk[[0, 2, 2]])
+    walker.settle(walker.state, low[[0, 0, 0]])
+    assert not walker.memory.any()
+
+
 def test_contacts_are_those_of_the_feet() -> None:
     walker = HumanoidWalker2d(3, num_threads=1)
     state = walker.state
