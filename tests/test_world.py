@@ -51,22 +51,20 @@ def test_resumes_where_it_was() -> None:
 
 @pytest.mark.parametrize("is_varied", [False, True])
 def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
-    task, worlds = TASKS["humanoid-walker2d"], []
-    for _ in range(2):
-        simulator = (
-            task.varied_simulator(3, task.varied.wide, "cpu") if is_varied else task.simulator(3, "cpu")
-        )
-        worlds.append(SimulatorWorld(task.objective, simulator))
-    first, second = worlds
+    task = TASKS["humanoid-walker2d"]
+    simulator, another = (
+        task.varied_simulator(3, task.varied.wide, "cpu") if is_varied else task.simulator(3, "cpu")
+        for _ in range(2)
+    )
+    first, second = (SimulatorWorld(task.objective, one) for one in (simulator, another))
     first.reset()
-    low = first.simulator.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]])
-    first.simulator.reset_to(low)
+    simulator.reset_to(simulator.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]]))
     for _ in range(4):
         first.step(torch.zeros(3, 4))
     second.load_state_dict(first.state_dict())
     for _ in range(4):
         after = []
-        for one in worlds:
+        for one in (first, second):
             torch.manual_seed(0)
             after.append(one.step(torch.zeros(3, 4)).observation)
         assert torch.equal(*after)

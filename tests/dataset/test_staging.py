@@ -146,7 +146,7 @@ def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(t
         staged_writer(tmp_path / "set"),
     ):
         pass
-    write_fake(tmp_path / "other", description=DESCRIPTION | {"name": "other"})
+    write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
     (tmp_path / "other").rename(tmp_path / "set")
     again = staged_writer(tmp_path / "set", resume=True)
     with pytest.raises(BadInputError, match=r"another dataset .* which left what it had begun in"), again:
