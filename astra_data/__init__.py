@@ -4,9 +4,9 @@ The house, from the ground up; a file uses only what is below it or beside it, n
 
 words       errors  extras  columns  layouts  seeding  recipe  rows  batched  simulator  progress  statistics
             digest  lock  cores  stopwatch  score
-knowledge   geometry  mazes  free_space  objective  navigation  ant  physics  abstraction  checkpoint  models/
-            recording  import_mapping  conversion  variation  planar  free_states  ball  kicking  nao/
-            humanoid/
+knowledge   geometry  mazes  free_space  objective  navigation  ant  physics  abstraction  checkpoint
+            logbook  models/  recording  import_mapping  conversion  variation  planar  free_states  ball
+            kicking  nao/  humanoid/
 data        dataset/  inspection  grounding_file  target_encoder_file  figures/  results/  sharing/
 exchange    importers/  exporters/ (one file per format of other libraries and logs)  cutting  imports
 worlds      envs/ (targets)  sims/ (abstract simulators: raw, varied, scattered, grounded)

@@ -1,13 +1,13 @@
 """Descent: fit a model by gradients, at a rate that falls to nothing; go on after an interruption."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from astra_data.checkpoint import flatten, resumed, save_tensors
+from astra_data.logbook import Logbook
 from astra_data.recipe import Config, Count, Positive
-from astra_data.stopwatch import Stopwatch
 
 
 class DescentConfig(Config):
@@ -50,19 +50,19 @@ class Descent:
         Raises:
             BadInputError: the checkpoint is of another model, or from an older version.
         """
-        self.done, self.points = 0, list[dict[str, float | None]]()
-        self._model, self._config, self._checkpoint = model, config, checkpoint
+        self.done = 0
+        self._model, self._config = model, config
         self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.AdamW(self.parameters, config.learning_rate, weight_decay=weight_decay)
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimizer, config.updates)
-        spent: dict[str, float] | None = None
-        if checkpoint and checkpoint.exists():
-            with resumed(checkpoint) as (state, told):
-                model.load_state_dict(state["model"])
-                self._optimizer.load_state_dict(state["optimizer"])
-                self._schedule.load_state_dict(told["schedule"])
-                self.done, self.points, spent = told["update"], told["points"], told["spent"]
-        self.stopwatch = Stopwatch(spent)
+        self._logbook = Logbook(checkpoint, self._go_on)
+        self.points, self.stopwatch = self._logbook.points, self._logbook.stopwatch
+
+    def _go_on(self, state: dict[str, Any]) -> None:
+        self._model.load_state_dict(state["model"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._schedule.load_state_dict(state["schedule"])
+        self.done = state["done"]
 
     @property
     def is_over(self) -> bool:
@@ -86,10 +86,11 @@ class Descent:
     def keep(self, **measured: float | None) -> None:
         """Add what was `measured` after this many updates to the points, and write the checkpoint."""
         self.points.append({"step": self.done, **measured})
-        if self._checkpoint is None:
-            return
-        state = {"model": self._model.state_dict(), "optimizer": self._optimizer.state_dict()}
-        # Of the schedule, functions are left out: JSON has none.
-        schedule = {k: v for k, v in self._schedule.state_dict().items() if not k.startswith("_get")}
-        told = {"schedule": schedule, "update": self.done, "points": self.points}
-        save_tensors(self._checkpoint, flatten(state), told | {"spent": self.stopwatch.spent()})
+        self._logbook.keep(
+            {
+                "model": self._model.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+                "schedule": self._schedule.state_dict(),
+                "done": self.done,
+            }
+        )

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 
 from astra_data.behaviors import PolicyBehavior
-from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.deployment import DeployedPolicy, Observed
 from astra_data.errors import BadInputError
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.sac import Sac, SacConfig
+from astra_data.logbook import Logbook
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.policy import Policy, PolicyShape
 from astra_data.models.soft_actor import SoftActor
@@ -19,10 +19,8 @@ from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress
 from astra_data.recipe import Config
 from astra_data.seeding import derive
-from astra_data.stopwatch import Alarm, Stopwatch
 from astra_data.target_world import TargetWorld
 from astra_data.task import Task
-from astra_data.training import CHECKPOINT_SECONDS
 
 _PPO_ENVS = 128
 _SAC_ENVS = 32
@@ -113,21 +111,20 @@ def _train(
     Returns:
         the time that it took, with that before an interruption.
     """
-    checkpoint, share, spent = folder / "training.safetensors", 0.0, None
-    if checkpoint.exists():
-        with resumed(checkpoint) as (state, told):
-            learner.load_state_dict(state["learner"], world.load_state_dict(state["world"]))
-            share, spent = told["share"], told["spent"]
-    stopwatch, alarm = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS)
+
+    def go_on(state: dict[str, Any]) -> None:
+        learner.load_state_dict(state["learner"], world.load_state_dict(state["world"]))
+
+    logbook = Logbook(folder / "training.safetensors", go_on)
+    share = logbook.points[-1]["share"] if logbook.points else 0.0
     while share < 1.0:
         share, note = judge(learner.iterate())
-        rate = learner.steps / stopwatch.seconds
+        logbook.points.append({"steps": learner.steps, "share": share})
+        rate = learner.steps / logbook.stopwatch.seconds
         progress(min(1.0, share), f"training the behaviour: {rate:,.0f} steps/s  {note}")
-        if alarm.rings or share >= 1.0:
-            state = {"learner": learner.state_dict(), "world": world.state_dict()}
-            save_tensors(checkpoint, flatten(state), {"share": share, "spent": stopwatch.spent()})
-            alarm.reset()
-    return stopwatch.spent()
+        if logbook.is_due or share >= 1.0:
+            logbook.keep({"learner": learner.state_dict(), "world": world.state_dict()})
+    return logbook.stopwatch.spent()
 
 
 def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:

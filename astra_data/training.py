@@ -16,13 +16,13 @@ from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
 from astra_data.batched import BatchedEnv
-from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.grounding_file import Grounding
 from astra_data.learners.learner import Learner
 from astra_data.learners.ppo import Ppo, PpoConfig
 from astra_data.learners.recorded import Recorded
 from astra_data.learners.sac import Sac, SacConfig
+from astra_data.logbook import Logbook
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.policy import Policy, PolicyShape
 from astra_data.models.soft_actor import SoftActor
@@ -30,14 +30,10 @@ from astra_data.policy_file import PolicyFile, Simulation
 from astra_data.progress import Progress
 from astra_data.recipe import Config, Count, Number, choice
 from astra_data.seeding import derive
-from astra_data.stopwatch import Alarm, Stopwatch
 from astra_data.task import Task
 from astra_data.training_world import WorldConfig, recorded_steps, training_world, world_parts
 from astra_data.variation import Variation
 from astra_data.world import RewardSource, SimulatorWorld
-
-CHECKPOINT_SECONDS = 60.0
-"""After so long, the next iteration ends with a checkpoint."""
 
 
 class TrainConfig(WorldConfig):
@@ -219,16 +215,13 @@ def optimise(
 
     The checkpoint of the end is left in the folder, for what comes after.
     """
-    folder, device = training.folder, training.device
-    points: list[dict[str, float | None]] = []
-    spent: dict[str, float] | None = None
-    checkpoint = folder / checkpoint_name
-    if checkpoint.exists():
-        with resumed(checkpoint) as (state, told):
-            world = {name: values.to(device) for name, values in state["world"].items()}
-            learner.load_state_dict(state["learner"], env.load_state_dict(world))
-            points, spent = told["points"], told["spent"]
-    stopwatch, alarm, first = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS), learner.steps
+
+    def go_on(state: dict[str, Any]) -> None:
+        world = {name: values.to(training.device) for name, values in state["world"].items()}
+        learner.load_state_dict(state["learner"], env.load_state_dict(world))
+
+    logbook = Logbook(training.folder / checkpoint_name, go_on)
+    points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
     is_lasting = training.task.objective.is_lasting
     while not learner.done:
         if isinstance(env, SimulatorWorld):
@@ -244,10 +237,8 @@ def optimise(
         lately = _lately(points, "episode_steps" if is_lasting else "success")
         note = f"{rate:,.0f} steps/s  {lately}"
         training.progress(learner.steps / learner.total_steps, note)
-        if alarm.rings or learner.done:
-            state = {"learner": learner.state_dict(), "world": env.state_dict()}
-            save_tensors(checkpoint, flatten(state), {"points": points, "spent": stopwatch.spent()})
-            alarm.reset()
+        if logbook.is_due or learner.done:
+            logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
     return {
         "steps_per_second": learner.steps / stopwatch.seconds,
         "simulator_steps_per_second": (learner.steps - first) / max(learner.acting.world_seconds, 1e-9),

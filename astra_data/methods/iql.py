@@ -14,16 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.learners.iql import FINE_TUNING, Experience, Iql, IqlConfig
+from astra_data.logbook import Logbook
 from astra_data.method import Method
 from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.models.history import PositionFeatures
 from astra_data.models.policy import Policy
 from astra_data.policy_file import PolicyFile
 from astra_data.seeding import derive
-from astra_data.stopwatch import Stopwatch
 from astra_data.task import Task
 from astra_data.training import Training
 from astra_data.world import policy_observation
@@ -95,14 +94,8 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
 
 def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
     """Learn to the end, from the checkpoint in the folder if there is one; return the losses."""
-    checkpoint = training.folder / "checkpoint.safetensors"
-    points: list[dict[str, float | None]] = []
-    spent: dict[str, float] | None = None
-    if checkpoint.exists():
-        with resumed(checkpoint) as (state, told):
-            iql.load_state_dict(state)
-            points, spent = told["points"], told["spent"]
-    stopwatch = Stopwatch(spent)
+    logbook = Logbook(training.folder / "checkpoint.safetensors", iql.load_state_dict)
+    points, stopwatch = logbook.points, logbook.stopwatch
     while not iql.done:
         losses = iql.iterate()
         if iql.updates % 10 == 0 or iql.done:
@@ -112,9 +105,7 @@ def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
         if iql.updates % _CHECKPOINT_EVERY == 0 or iql.done:
             # Nobody acts while learning from records, so there is no success to tell.
             points.append({"steps": iql.updates, "success": None, **losses})
-            save_tensors(
-                checkpoint, flatten(iql.state_dict()), {"points": points, "spent": stopwatch.spent()}
-            )
+            logbook.keep(iql.state_dict())
     return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}
 
 

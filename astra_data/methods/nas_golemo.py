@@ -7,14 +7,13 @@ from typing import Any
 
 import torch
 
-from astra_data.checkpoint import flatten, resumed, save_tensors
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.fitting import Fitting, scatter_factor
+from astra_data.logbook import Logbook
 from astra_data.method import Method
 from astra_data.models.residual import ResidualModel, ResidualShape
 from astra_data.recipe import Config, Count, Positive
 from astra_data.seeding import derive, generator
-from astra_data.stopwatch import Stopwatch
 from astra_data.telemetry import correction_r2
 
 
@@ -55,15 +54,13 @@ def fit_residual(fitting: Fitting) -> tuple[ResidualModel, dict[str, Any]]:
 def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> dict[str, Any]:
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     episodes, count = fitting.training, len(fitting.training)
-    points: list[dict[str, float | None]] = []
-    spent: dict[str, float] | None = None
-    checkpoint = fitting.folder / "checkpoint.safetensors"
-    if checkpoint.exists():
-        with resumed(checkpoint) as (state, told):
-            model.load_state_dict(state["model"])
-            optimizer.load_state_dict(state["optimizer"])
-            points, spent = told["epochs"], told["spent"]
-    stopwatch = Stopwatch(spent)
+
+    def go_on(state: dict[str, Any]) -> None:
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+
+    logbook = Logbook(fitting.folder / "checkpoint.safetensors", go_on)
+    points, stopwatch = logbook.points, logbook.stopwatch
     for epoch in range(len(points), config.epochs):
         order = generator(fitting.seed, f"grounding epoch {epoch}").permutation(count)
         losses = 0.0
@@ -76,8 +73,7 @@ def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> d
                 note += f"  held-out R² of the correction {explained:.3f}"
             fitting.progress(done / (config.epochs * count), note)
         points.append({"step": done, "loss_state": losses, "r2_state": _r2(model, fitting.held_out)})
-        state = {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
-        save_tensors(checkpoint, flatten(state), {"epochs": points, "spent": stopwatch.spent()})
+        logbook.keep({"model": model.state_dict(), "optimizer": optimizer.state_dict()})
     return {
         "episodes_per_second": config.epochs * count / stopwatch.seconds,
         **stopwatch.spent(),

@@ -152,7 +152,7 @@ def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TRIALS": 2}
     for name, value in small.items():
         monkeypatch.setattr(suboptimal, name, value)
-    monkeypatch.setattr(suboptimal, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
 
 
 @pytest.mark.usefixtures("small_training")

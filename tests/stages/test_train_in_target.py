@@ -4,7 +4,6 @@ from pathlib import Path
 import pytest
 from small_run import TRAIN
 
-from astra_data import training as stage
 from astra_data.policy_file import PolicyFile
 from astra_data.progress import Progress, silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
@@ -52,7 +51,7 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     observed: str,
     size: int,
 ) -> None:
-    monkeypatch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     expected = make(task, row, paired, whole)
     with pytest.raises(Stopped):
