@@ -8,6 +8,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.versions import Version
 from astra_data.errors import AstraDataError, BadInputError, SharingError
+from astra_data.extras import cure
 from astra_data.progress import Progress
 from astra_data.sharing.store import RemoteFolder
 from astra_data.sharing.sums import SUMS_PATH, dataset_files
@@ -35,8 +36,8 @@ class UrlStore:
                 self._filesystem, self._path = fsspec.core.url_to_fs(url, **options)
             except ImportError as error:
                 extra = EXTRAS.get(protocol)
-                cure = f'pip install "astra-data[{extra}]"' if extra else error
-                raise BadInputError(f"{url}: what reads {protocol}:// is not installed: {cure}") from error
+                how = cure(extra) if extra else error
+                raise BadInputError(f"{url}: what reads {protocol}:// is not installed: {how}") from error
             except ValueError as error:
                 raise BadInputError(f"{url}: {error}; expected a URL such as s3://bucket/folder") from error
 

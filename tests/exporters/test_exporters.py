@@ -216,7 +216,7 @@ def test_what_is_missing_is_told(dataset: Dataset, tmp_path: Path, monkeypatch: 
         export(write_fake(tmp_path / "bare"), tmp_path / "a", format="d4rl")
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(
-        BadInputError, match=r'h5py is needed and not installed: pip install "astra-data\[hdf5\]"'
+        BadInputError, match=r"h5py is needed and not installed: uv sync --extra hdf5 in a checkout, else"
     ):
         export(dataset, tmp_path / "a", format="d4rl")
     monkeypatch.setitem(sys.modules, "minari", None)
