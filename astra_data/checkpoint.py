@@ -119,7 +119,7 @@ def understood(
 
 
 @contextmanager
-def finished_folder(out: Path, *, replace: bool = False) -> Iterator[Path]:
+def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds.
 
     After a failure the working folder, `.<name>.partial` beside `out`, stays: the next call yields it again
@@ -129,9 +129,10 @@ def finished_folder(out: Path, *, replace: bool = False) -> Iterator[Path]:
     Args:
         out: the finished folder.
         replace: whether an `out` that is already there is replaced.
+        config: what it is made with, written to `config.json`; what was begun with another is refused.
 
     Raises:
-        BadInputError: `out` is already there and is not to be replaced.
+        BadInputError: `out` is already there and is not to be replaced, or was begun with another config.
     """
     partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
     if old.exists() and not out.exists():  # a kill came between the two renames below
@@ -141,6 +142,11 @@ def finished_folder(out: Path, *, replace: bool = False) -> Iterator[Path]:
     if replace:
         _remove(partial, old)
     partial.mkdir(parents=True, exist_ok=True)
+    if config is not None:
+        told = partial / "config.json"
+        if told.exists() and told.read_text() != config:
+            raise BadInputError(f"{partial} was begun with other settings, see its config.json: remove it")
+        told.write_text(config)
     yield partial
     if out.exists():
         os.replace(out, old)

@@ -44,10 +44,10 @@ class Config(BaseModel):
     )
 
 
-def as_json(**configs: Config | None) -> str:
-    """Return the settings of several parts, by their names; of a part that has none, null."""
-    told = {name: config and config.model_dump(mode="json") for name, config in configs.items()}
-    return json.dumps(told, indent=1)
+def as_json(**told: Config | str | int | None) -> str:
+    """Return settings, and what else is told, by their names; of a part that has none, null."""
+    plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in told.items()}
+    return json.dumps(plain, indent=1)
 
 
 def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:

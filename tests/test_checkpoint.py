@@ -142,6 +142,20 @@ def test_an_interrupted_folder_is_found_again(tmp_path: Path) -> None:
         assert (folder / "checkpoint").exists()
 
 
+def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt), finished_folder(out, config="1") as folder:
+        raise KeyboardInterrupt
+    with (
+        pytest.raises(BadInputError, match=f"{folder} was begun with other settings"),
+        finished_folder(out, config="2"),
+    ):
+        pass
+    with finished_folder(out, config="1"):
+        pass
+    assert [(path.name, path.read_text()) for path in out.iterdir()] == [("config.json", "1")]
+
+
 def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").touch()

@@ -16,7 +16,7 @@ from astra_data.models.alignment import TargetEncoder, gaussian_mmd
 from astra_data.models.grounding import GroundingModel
 from astra_data.models.windows import Windows
 from astra_data.progress import Progress
-from astra_data.recipe import Count, NotNegative, Positive
+from astra_data.recipe import Count, NotNegative, Positive, as_json
 from astra_data.results.provenance import origin
 from astra_data.seeding import derive
 from astra_data.target_encoder_file import save_target_encoder
@@ -55,7 +55,7 @@ def align(
     """Fit ψ^t on index-matched target and abstract histories; write it and how well it agrees to `out`.
 
     Raises:
-        BadInputError: an input is not there or not what was expected.
+        BadInputError: an input is not there or not what was expected, or `out` was begun otherwise.
     """
     made = origin(device)
     model = load_history_model(grounding / "grounding.safetensors", device)
@@ -75,7 +75,8 @@ def align(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    with finished_folder(out) as folder:
+    told = as_json(seed=seed, dataset=episodes.reference, content_hash=episodes.content_hash, align=config)
+    with finished_folder(out, config=told) as folder:
         checkpoint = folder / "checkpoint.safetensors"
         descent = Descent(encoder, config, checkpoint=checkpoint)
         while not descent.is_over:
@@ -97,7 +98,6 @@ def align(
             **_agreement(model, encoder, held_out, bandwidths),
         }
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
-        (folder / "config.json").write_text(config.model_dump_json(indent=1))
         checkpoint.unlink(missing_ok=True)
 
 

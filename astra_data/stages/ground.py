@@ -43,7 +43,7 @@ def ground(
         progress: told the share done.
 
     Raises:
-        BadInputError: the method does not ground, or the dataset is not paired.
+        BadInputError: the method does not ground, the dataset is not paired, or `out` was begun otherwise.
     """
     fit = method_named(method).fit
     if fit is None:
@@ -51,7 +51,16 @@ def ground(
     world, made = task_named(task), origin(device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
-    with finished_folder(out) as folder:
+    told = as_json(
+        task=task,
+        method=method,
+        seed=seed,
+        dataset=episodes.reference,
+        content_hash=episodes.content_hash,
+        ground=config,
+        settings=settings,
+    )
+    with finished_folder(out, config=told) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()
         grounding, metrics = fit(fitting)
@@ -61,5 +70,4 @@ def ground(
         save_grounding(folder / "grounding.safetensors", grounding, episodes)
         (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
-        (folder / "config.json").write_text(as_json(ground=config, settings=settings))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)

@@ -49,7 +49,8 @@ def train(
         num_threads: of the target's physics, for methods that train in the target.
 
     Raises:
-        BadInputError: the method has no policy to train, or needs an artefact and got none.
+        BadInputError: the method has no policy to train, needs an artefact and got none, or `out` was begun
+            otherwise.
     """
     base, world, made = method_named(method), task_named(task), origin(device)
     if base.learn is None:
@@ -61,12 +62,22 @@ def train(
     if not base.learns_from(config.reward):
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()
-    with finished_folder(out) as folder:
+    episodes = PairedEpisodes.load(dataset, device)
+    told = as_json(
+        task=task,
+        method=method,
+        seed=seed,
+        dataset=episodes.reference,
+        content_hash=episodes.content_hash,
+        train=config,
+        settings=settings,
+    )
+    with finished_folder(out, config=told) as folder:
         training = Training(
             task=world,
             config=config,
             settings=settings,
-            episodes=PairedEpisodes.load(dataset, device),
+            episodes=episodes,
             grounding=load_grounding(grounding / "grounding.safetensors", device) if grounding else None,
             initial=PolicyFile.load(initial / "policy.safetensors", device) if initial else None,
             seed=seed,
@@ -78,6 +89,5 @@ def train(
         policy, curve = base.learn(training)
         policy.save(folder / "policy.safetensors")
         (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
-        (folder / "config.json").write_text(as_json(train=config, settings=settings))
         for checkpoint in folder.glob("*checkpoint.safetensors"):
             checkpoint.unlink()

@@ -49,10 +49,18 @@ def stop(fraction: float, note: str) -> None:
         raise Stopped
 
 
-def test_the_artefact_is_complete(trained: Path) -> None:
+def test_the_artefact_is_complete(task: str, trained: Path) -> None:
     assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
     told = json.loads((trained / "config.json").read_text())
-    assert told == {"train": json.loads(TRAIN.model_dump_json()), "settings": None}
+    assert len(told.pop("content_hash")) == 64
+    assert told == {
+        "task": task,
+        "method": "astra",
+        "seed": 0,
+        "dataset": "antmaze-short-random-seed0@data-2.0.0",
+        "train": json.loads(TRAIN.model_dump_json()),
+        "settings": None,
+    }
     curve = json.loads((trained / "curve.json").read_text())
     assert {"git_commit", "packages", "machine"} <= curve.keys()
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
@@ -174,6 +182,16 @@ def test_a_checkpoint_of_another_version_is_told(
         make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN)
 
 
+def test_what_was_begun_with_other_settings_is_left_alone(task: str, paired: Path, tmp_path: Path) -> None:
+    with pytest.raises(Stopped):
+        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    longer = TRAIN.model_copy(update={"total_steps": 2 * TRAIN.total_steps})
+    with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
+        make(task, "direct_transfer", paired, None, tmp_path / "out", longer)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
+
+
 def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Path, tmp_path: Path) -> None:
     make(task, "rma", paired, None, tmp_path / "train")
     assert {file.name for file in (tmp_path / "train").iterdir()} == {
@@ -182,7 +200,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
         "policy.safetensors",
     }
     told = json.loads((tmp_path / "train" / "config.json").read_text())
-    assert told == {"train": json.loads(TRAIN.model_dump_json()), "settings": RMA.model_dump()}
+    assert told["settings"] == RMA.model_dump()
     curve = json.loads((tmp_path / "train" / "curve.json").read_text())
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     adaptation = curve["adaptation"]["points"]
