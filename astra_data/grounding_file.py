@@ -19,7 +19,7 @@ Grounding = GroundingModel | ResidualModel | Variation
 
 def save_grounding(path: Path, grounding: Grounding, episodes: PairedEpisodes) -> None:
     """Write `grounding`, fitted on `episodes`, to `path`."""
-    told: dict[str, Any] = {"dataset": episodes.reference, "hash": episodes.content_hash}
+    told: dict[str, Any] = dict(episodes.named)
     if isinstance(grounding, Variation):
         told |= {"kind": "variation", "variation": grounding.model_dump()}
         save_tensors(path, {"ranges": grounding.ranges()}, told)

@@ -54,6 +54,11 @@ class PairedEpisodes:
     held_out: Tensor | None = None
     dropped_place: tuple[int, ...] = ()
 
+    @property
+    def named(self) -> dict[str, str]:
+        """What files made from these episodes tell of them: `dataset` and `hash`."""
+        return {"dataset": self.reference, "hash": self.content_hash}
+
     @classmethod
     def load(cls, root: Path, device: str = "cpu") -> "PairedEpisodes":
         """Read the paired dataset at `root`.

@@ -75,7 +75,7 @@ def align(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    told = as_json(seed=seed, dataset=episodes.reference, content_hash=episodes.content_hash, align=config)
+    told = as_json(seed=seed, **episodes.named, align=config)
     with finished_folder(out, config=told) as folder:
         checkpoint = folder / "checkpoint.safetensors"
         descent = Descent(encoder, config, checkpoint=checkpoint)

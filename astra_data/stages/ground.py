@@ -51,15 +51,8 @@ def ground(
     world, made = task_named(task), origin(device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
-    told = as_json(
-        task=task,
-        method=method,
-        seed=seed,
-        dataset=episodes.reference,
-        content_hash=episodes.content_hash,
-        ground=config,
-        settings=settings,
-    )
+    named = {"task": task, "method": method, **episodes.named}
+    told = as_json(**named, seed=seed, ground=config, settings=settings)
     with finished_folder(out, config=told) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()

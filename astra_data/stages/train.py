@@ -63,15 +63,8 @@ def train(
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
-    told = as_json(
-        task=task,
-        method=method,
-        seed=seed,
-        dataset=episodes.reference,
-        content_hash=episodes.content_hash,
-        train=config,
-        settings=settings,
-    )
+    named = {"task": task, "method": method, **episodes.named}
+    told = as_json(**named, seed=seed, train=config, settings=settings)
     with finished_folder(out, config=told) as folder:
         training = Training(
             task=world,
