@@ -241,7 +241,8 @@ def test_a_missing_back_end_is_told(
     # fsspec remembers what it has imported before.
     known = sys.modules["fsspec.registry"].__dict__["_registry"]
     monkeypatch.delitem(known, url.partition(":")[0], raising=False)
-    with pytest.raises(BadInputError, match=f"is not installed: uv sync --extra {extra} in"):
+    told = rf'is not installed: uv sync --extra {extra} in .*, else pip install "astra-data\[{extra}\]"'
+    with pytest.raises(BadInputError, match=told):
         UrlStore(url)
 
 

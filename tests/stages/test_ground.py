@@ -160,7 +160,8 @@ def test_whole_episodes_go_on_after_an_interruption(
     for name in ("grounding.safetensors", "gap.json", "config.json"):
         assert (out / name).read_bytes() == (augmented / name).read_bytes()
     told = json.loads((out / "config.json").read_text())
-    assert told["settings"] == GOLEMO.model_dump()
+    assert (told["method"], told["settings"]) == ("nas_golemo", GOLEMO.model_dump())
+    assert told["ground"] == json.loads(GROUND.model_dump_json())
     epochs = [json.loads((folder / "metrics.json").read_text())["epochs"] for folder in (out, augmented)]
     assert epochs[0] == epochs[1]
     with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):

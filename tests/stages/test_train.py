@@ -197,7 +197,8 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
         "policy.safetensors",
     }
     told = json.loads((tmp_path / "train" / "config.json").read_text())
-    assert told["settings"] == RMA.model_dump()
+    assert (told["method"], told["settings"]) == ("rma", RMA.model_dump())
+    assert told["train"] == json.loads(TRAIN.model_dump_json())
     curve = json.loads((tmp_path / "train" / "curve.json").read_text())
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     adaptation = curve["adaptation"]["points"]
