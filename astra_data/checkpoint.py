@@ -75,7 +75,10 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
         BadInputError: it cannot be read, or the block does not find in it what it needs, as in one from an
             older version.
     """
-    tensors, metadata = load_tensors(checkpoint)
+    try:
+        tensors, metadata = load_tensors(checkpoint)
+    except BadInputError as error:
+        raise BadInputError(f"{error}: remove {checkpoint.parent}") from None
     try:
         yield unflatten(tensors), metadata
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -129,10 +132,11 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
     Args:
         out: the finished folder.
         replace: whether an `out` that is already there is replaced.
-        config: what it is made with, written to `config.json`; what was begun with another is refused.
+        config: what it is made with, written to `config.json`; what was begun otherwise is
+            refused.
 
     Raises:
-        BadInputError: `out` is already there and is not to be replaced, or was begun with another config.
+        BadInputError: `out` is already there and is not to be replaced, or was begun otherwise.
     """
     partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
     if old.exists() and not out.exists():  # a kill came between the two renames below
@@ -144,7 +148,8 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
     partial.mkdir(parents=True, exist_ok=True)
     if config is not None:
         told = partial / "config.json"
-        if told.exists() and told.read_text() != config:
+        is_begun = any(partial.iterdir())
+        if is_begun and not (told.exists() and told.read_text() == config):
             raise BadInputError(f"{partial} was begun with other settings, see its config.json: remove it")
         told.write_text(config)
     yield partial

@@ -44,8 +44,8 @@ class GroundConfig(DescentConfig):
     """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
     where a task has no positions."""
     correction_heads: Count = 1
-    """Heads that correct the state, each of which learns from windows of its own; their mean corrects, and
-    `doubt_penalty` keeps policies from where they disagree."""
+    """Heads that correct the state, each of which learns from half of every batch, drawn for it; their mean
+    corrects, and `doubt_penalty` keeps policies from where they disagree."""
     reward: Literal["whole", "correction"] = "whole"
     """What R_pred learns: "whole", the target's reward, as in the paper; "correction", what the task's own
     reward on recorded abstract states lacks of it, as f_abs corrects the state. Only for policies that learn

@@ -32,8 +32,9 @@ of 100 k steps it would take 300 MB."""
 class WorldConfig(Config):
     """Switches of the training world; all off is the method as it is published.
 
-    Each may be given to any method, but the raw simulator has no model to predict from: there `topple` is
-    without effect, the reward "blend" is the abstract one, and "predicted" is refused.
+    Each may be given to any method, but the raw simulator has no model to predict from: there `topple` and
+    `doubt_penalty` are without effect, the reward "blend" is the abstract one, and "predicted" is refused. Of
+    policies that are trained in the target, `data_start_share` alone reaches any.
     """
 
     reward: RewardSource | None = None

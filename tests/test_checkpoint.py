@@ -156,6 +156,18 @@ def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
     assert [(path.name, path.read_text()) for path in out.iterdir()] == [("config.json", "1")]
 
 
+def test_a_folder_begun_without_a_config_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), finished_folder(tmp_path / "out") as folder:
+        (folder / "checkpoint").touch()
+        raise KeyboardInterrupt
+    with (
+        pytest.raises(BadInputError, match="begun with other"),
+        finished_folder(tmp_path / "out", config="1"),
+    ):
+        pass
+    assert [path.name for path in folder.iterdir()] == ["checkpoint"]
+
+
 def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").touch()

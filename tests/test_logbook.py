@@ -34,6 +34,9 @@ def test_what_does_not_fit_is_refused_with_what_to_do(tmp_path: Path) -> None:
     Logbook(checkpoint, never).keep({"weight": torch.zeros(2)})
     with pytest.raises(BadInputError, match=f"remove {tmp_path}"):
         Logbook(checkpoint, lambda state: state["bias"])
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-4])
+    with pytest.raises(BadInputError, match=f"not a whole safetensors file: .*: remove {tmp_path}"):
+        Logbook(checkpoint, never)
 
 
 def test_without_a_file_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

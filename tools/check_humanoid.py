@@ -20,11 +20,13 @@ from typing import Annotated
 
 import torch
 import typer
+from timing import complain
 from torch import Tensor, nn
 
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.deployment import target_observation
 from astra_data.envs.humanoid import HumanoidEnv
+from astra_data.errors import AstraDataError, BadInputError
 from astra_data.grounding_file import load_grounding
 from astra_data.humanoid.skeleton import rotation
 from astra_data.methods import method_named
@@ -129,7 +131,11 @@ def foretold_heights(task: Task, falls: list[Walk], before: int, model: Groundin
 
 def print_falls(task: Task, name: str, walked: list[Walk], model: GroundingModel) -> None:
     """Print how humanoids lean before they fall, and what height the grounded simulator foretells."""
-    falls = [walk for walk in walked if walk.fell and len(walk.state) > max(BEFORE_FALL) + 1]
+    all_falls = [walk for walk in walked if walk.fell]
+    falls = [fall for fall in all_falls if len(fall.state) > max(BEFORE_FALL) + 1]
+    print(f"{name}: {len(all_falls)} falls, {len(falls)} of them after {max(BEFORE_FALL) + 1} steps")
+    if not falls:
+        return
     last = torch.stack([fall.state[-1, 2] for fall in falls])
     for before in BEFORE_FALL:
         ahead, left, up = rotation(torch.stack([fall.state[-1 - before, 3:7] for fall in falls]))[:, 2].T
@@ -139,7 +145,7 @@ def print_falls(task: Task, name: str, walked: list[Walk], model: GroundingModel
             wrong = foretold_heights(task, falls, before, model) - last
             rmse = wrong.square().mean().sqrt()
             told += f"; height foretold for the fall: {wrong.mean():+.2f} m (RMSE {rmse:.2f})"
-        print(f"{name:17s} {len(falls):3d} falls, {told}", flush=True)
+        print(f"  {told}", flush=True)
 
 
 class Student(nn.Module):
@@ -228,7 +234,22 @@ def main(
     rounds: Annotated[int, typer.Option(help="Of teaching.")] = 40,
 ) -> None:
     """Print why policies of the humanoid fall."""
-    recipe = json.loads((run / "recipe.json").read_text())
+    try:
+        check(run, seed, rounds)
+    except AstraDataError as error:
+        raise typer.Exit(complain(str(error))) from None
+
+
+def check(run: Path, seed: int, rounds: int) -> None:
+    """Print what there is to tell of one seed of a run.
+
+    Raises:
+        AstraDataError: something that is needed has not been run.
+    """
+    told = run / "recipe.json"
+    if not told.is_file():
+        raise BadInputError(f"{told} does not exist: expected a run's folder, such as runs/humanoid_walker2d")
+    recipe = json.loads(told.read_text())
     task = task_named(recipe["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)

@@ -61,7 +61,8 @@ class SacConfig(Config):
     """Share by which the target critics follow, per update."""
     imitation_weight: NotNegative = 0.0
     """Of the mean squared distance from recorded actions in what the actor minimises, times the size of the
-    mean action value, entropy included. 0.4 is what Fujimoto and Gu (2021) take, of the mean size."""
+    mean action value, entropy included. 0.4 is what Fujimoto and Gu (2021) take, of the mean size. Without
+    effect in the target: upper bounds learn from no data."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:

@@ -261,7 +261,7 @@ class GroundingModel(nn.Module):
         error = ((opinions - windows.next_state) / self.correction_std).square().mean(-1)
         mask = windows.mask.expand_as(error)
         if len(opinions) > 1:
-            # Each head learns from windows of its own, so that heads differ in what the data leaves open.
+            # Heads that are fitted to other halves of every batch differ in what the data leaves open.
             mask = mask * (torch.rand(*error.shape[:2], 1, device=error.device) < 0.5)
         return _masked_mean(error, mask)
 

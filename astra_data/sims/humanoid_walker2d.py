@@ -17,7 +17,8 @@ It leaves out:
   the torso here, others than those of a humanoid in that pose.
 * How the waist and the hips' other axes lower the feet. At the humanoid's height of the torso the walker's
   would often be inside the floor, which would throw it into the air. So where it is set with its feet too
-  low, the floor is lower by that much, until it is set anew, as by `[plus] residual_noise` in every step.
+  low, the floor is lower by that much, until it is set anew: in every step, where it is corrected or
+  `[plus] residual_noise` scatters it.
 * The memory of MuJoCo's solver from step to step.
 """
 

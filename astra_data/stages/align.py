@@ -11,6 +11,7 @@ from torch import Tensor
 from astra_data.checkpoint import finished_folder
 from astra_data.dataset.pairs import PairedEpisodes
 from astra_data.descent import Descent, DescentConfig
+from astra_data.digest import file_digest
 from astra_data.grounding_file import load_history_model
 from astra_data.models.alignment import TargetEncoder, gaussian_mmd
 from astra_data.models.grounding import GroundingModel
@@ -58,7 +59,8 @@ def align(
         BadInputError: an input is not there or not what was expected, or `out` was begun otherwise.
     """
     made = origin(device)
-    model = load_history_model(grounding / "grounding.safetensors", device)
+    grounding_file = grounding / "grounding.safetensors"
+    model = load_history_model(grounding_file, device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "alignment"))
@@ -75,7 +77,7 @@ def align(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    told = as_json(seed=seed, **episodes.named, align=config)
+    told = as_json(**episodes.named, grounding_sha256=file_digest(grounding_file), seed=seed, align=config)
     with finished_folder(out, config=told) as folder:
         checkpoint = folder / "checkpoint.safetensors"
         descent = Descent(encoder, config, checkpoint=checkpoint)

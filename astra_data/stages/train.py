@@ -5,6 +5,7 @@ from pathlib import Path
 
 from astra_data.checkpoint import finished_folder
 from astra_data.dataset.pairs import PairedEpisodes
+from astra_data.digest import file_digest
 from astra_data.errors import BadInputError
 from astra_data.grounding_file import load_grounding
 from astra_data.methods import method_named
@@ -63,16 +64,28 @@ def train(
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
-    named = {"task": task, "method": method, **episodes.named}
-    told = as_json(**named, seed=seed, train=config, settings=settings)
+    grounding_file = grounding and grounding / "grounding.safetensors"
+    initial_file = initial and initial / "policy.safetensors"
+    correction = load_grounding(grounding_file, device) if grounding_file else None
+    beginning = PolicyFile.load(initial_file, device) if initial_file else None
+    told = as_json(
+        task=task,
+        method=method,
+        **episodes.named,
+        grounding_sha256=file_digest(grounding_file) if grounding_file else None,
+        initial_sha256=file_digest(initial_file) if initial_file else None,
+        seed=seed,
+        train=config,
+        settings=settings,
+    )
     with finished_folder(out, config=told) as folder:
         training = Training(
             task=world,
             config=config,
             settings=settings,
             episodes=episodes,
-            grounding=load_grounding(grounding / "grounding.safetensors", device) if grounding else None,
-            initial=PolicyFile.load(initial / "policy.safetensors", device) if initial else None,
+            grounding=correction,
+            initial=beginning,
             seed=seed,
             device=device,
             folder=folder,

@@ -1,11 +1,13 @@
 """The artefacts of one small run, each made once."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from small_run import ALIGN, COLLECT, GOLEMO, GROUND, TASK, TRAIN, short_task
 
+from astra_data.checkpoint import load_tensors, save_tensors
 from astra_data.progress import silent
 from astra_data.stages.align import align
 from astra_data.stages.collect import collect
@@ -41,6 +43,16 @@ def grounded(paired: Path) -> Path:
     out = paired.with_name("ground")
     with short_task():
         ground(TASK, "astra", GROUND, dataset=paired, seed=0, out=out, device="cpu", progress=silent)
+    return out
+
+
+@pytest.fixture(scope="session")
+def grounded_anew(grounded: Path, paired: Path) -> Path:
+    """A grounding with the same settings and other weights."""
+    out = paired.with_name("ground_anew")
+    shutil.copytree(grounded, out)
+    tensors, told = load_tensors(out / "grounding.safetensors")
+    save_tensors(out / "grounding.safetensors", {name: value * 0.5 for name, value in tensors.items()}, told)
     return out
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 from small_run import ALIGN
 
+from astra_data.errors import BadInputError
 from astra_data.progress import Progress, silent
 from astra_data.stages.align import align
 from astra_data.target_encoder_file import load_target_encoder
@@ -60,3 +61,16 @@ def test_after_an_interruption_it_goes_on(
     assert (out / name).read_bytes() == (aligned / name).read_bytes()
     told, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, aligned))
     assert told["points"] == expected["points"]
+
+
+def test_what_was_begun_with_another_grounding_is_refused(
+    paired: Path, grounded: Path, grounded_anew: Path, tmp_path: Path
+) -> None:
+    def begin(grounding: Path, progress: Progress) -> None:
+        out = tmp_path / "out"
+        align(ALIGN, dataset=paired, grounding=grounding, seed=0, out=out, device="cpu", progress=progress)
+
+    with pytest.raises(Stopped):
+        begin(grounded, stop)
+    with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
+        begin(grounded_anew, silent)

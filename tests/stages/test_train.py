@@ -6,6 +6,7 @@ import torch
 from small_run import TRAIN
 
 from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.digest import file_digest
 from astra_data.errors import BadInputError
 from astra_data.learners.rma import RmaConfig
 from astra_data.models.adaptation import Student
@@ -49,12 +50,13 @@ def stop(fraction: float, note: str) -> None:
         raise Stopped
 
 
-def test_the_artefact_is_complete(task: str, trained: Path) -> None:
+def test_the_artefact_is_complete(task: str, grounded: Path, trained: Path) -> None:
     assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
     told = json.loads((trained / "config.json").read_text())
     assert len(told.pop("hash")) == 64
     assert told == {
         **{"task": task, "method": "astra", "dataset": "antmaze-short-random-seed0@data-2.0.0", "seed": 0},
+        **{"grounding_sha256": file_digest(grounded / "grounding.safetensors"), "initial_sha256": None},
         "train": json.loads(TRAIN.model_dump_json()),
         "settings": None,
     }
@@ -187,6 +189,16 @@ def test_what_was_begun_with_other_settings_is_left_alone(task: str, paired: Pat
     with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
         make(task, "direct_transfer", paired, None, tmp_path / "out", longer)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
+
+
+def test_what_was_begun_with_another_grounding_is_refused(
+    task: str, paired: Path, grounded: Path, grounded_anew: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(Stopped):
+        make(task, "nas", paired, grounded, tmp_path / "out", TRAIN, stop)
+    with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
+        make(task, "nas", paired, grounded_anew, tmp_path / "out")
+    make(task, "nas", paired, grounded, tmp_path / "out")
 
 
 def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Path, tmp_path: Path) -> None:
