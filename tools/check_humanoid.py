@@ -4,10 +4,11 @@
 
 reads a finished run and prints
 
-1. how humanoids lean some steps before they fall, in held-out recorded episodes and by the policies of rows,
+1. how long a humanoid lasts whose legs are told to stay straight;
+2. how humanoids lean some steps before they fall, in held-out recorded episodes and by the policies of rows,
    and what height NAS's simulator, if it knows of heights, foretells for the fall, given the true history and
    actions;
-2. how long a humanoid lasts that is shown φ alone, and remembers, once Full Obs has told it on its own way
+3. how long a humanoid lasts that is shown φ alone, and remembers, once Full Obs has told it on its own way
    what to do (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
 """
 
@@ -15,7 +16,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, pstdev
 from typing import Annotated
 
 import torch
@@ -28,6 +29,7 @@ from astra_data.deployment import target_observation
 from astra_data.envs.humanoid import HumanoidEnv
 from astra_data.errors import AstraDataError, BadInputError
 from astra_data.grounding_file import load_grounding
+from astra_data.humanoid.model import CommandRanges
 from astra_data.humanoid.skeleton import rotation
 from astra_data.methods import method_named
 from astra_data.models.grounding import GroundingModel
@@ -70,6 +72,15 @@ def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
     deployed = deploy(task, trained, load_grounding(folder / "grounding.safetensors") if grounds else None)
     deployed.start(count)
     return lambda state: deployed.act(state, no_goals(len(state)))
+
+
+def straight(state: Tensor) -> Tensor:
+    """Return the actions (B, 4) that tell hips and knees to stay at 0 and -2 degrees."""
+    ranges = CommandRanges()
+    low, high = torch.tensor([ranges.hip_deg, ranges.knee_deg] * 2).T
+    told = torch.tensor([0.0, -2.0] * 2)
+    action: Tensor = 2 * (told - low) / (high - low) - 1
+    return action.expand(len(state), -1)
 
 
 @torch.no_grad()
@@ -257,6 +268,8 @@ def check(run: Path, seed: int, rounds: int) -> None:
     assert isinstance(model, GroundingModel)
     env = task.target(HUMANOIDS, seed=seed)
     assert isinstance(env, HumanoidEnv)
+    stood = [float(len(walk.state)) for walk in walks(straight, env)]
+    print(f"straight legs last {fmean(stood):.0f} ± {pstdev(stood):.0f} steps")
     print_falls(
         task,
         "recorded",
