@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rliable import library, metrics  # type: ignore[import-untyped]
-from scipy.stats import rankdata
 
 from astra_data.errors import BadInputError
 
@@ -78,6 +76,8 @@ def summarise(scores: Floats, *, replicates: int = REPLICATES) -> Summary:
     Raises:
         BadInputError: there is no score, or one that is not finite.
     """
+    from rliable import metrics  # type: ignore[import-untyped]
+
     matrix = _matrix(scores)
     mean, iqm = float(matrix.mean()), float(metrics.aggregate_iqm(matrix))
     if len(matrix) == 1:
@@ -94,6 +94,8 @@ def probability_of_improvement(scores: Floats, others: Floats, *, replicates: in
     Raises:
         BadInputError: there is no score, or one that is not finite.
     """
+    from rliable import metrics
+
     matrix, other_matrix = _matrix(scores), _matrix(others)
     probability = float(metrics.probability_of_improvement(matrix, other_matrix))
     if min(len(matrix), len(other_matrix)) == 1:
@@ -118,6 +120,8 @@ def correlation(
     Returns:
         None where there are fewer than three seeds in all, or one side does not vary.
     """
+    from scipy.stats import rankdata
+
     rng = np.random.default_rng(0)
 
     def of(rows: NDArray[np.intp], seeds: Sequence[NDArray[np.intp]]) -> float:
@@ -152,6 +156,8 @@ def _matrix(scores: Floats) -> Floats:
 def _interval(
     scores: Floats | tuple[Floats, Floats], statistic: Callable[..., float], replicates: int
 ) -> tuple[float, float]:
+    from rliable import library
+
     def as_array(*samples: Floats) -> Floats:
         return np.array([statistic(*samples)])
 

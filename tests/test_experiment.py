@@ -1,6 +1,8 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -274,3 +276,8 @@ def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_
     for stage in ("train", "evaluate"):
         shutil.rmtree(folder / stage / "full_obs")
     assert check(base, root=tmp_path)["train/astra/seed_0"]
+
+
+def test_recipes_are_read_without_what_only_trainings_and_tables_need() -> None:
+    code = "import sys, astra_data.experiment; assert not {'torchrl', 'rliable'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

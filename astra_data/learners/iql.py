@@ -11,15 +11,11 @@ uninterrupted run would have done.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from pydantic import model_validator
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import IQLLoss, SoftUpdate
 
 from astra_data.errors import BadInputError
 from astra_data.learners.recorded import Recorded
@@ -27,6 +23,10 @@ from astra_data.models.history import mlp
 from astra_data.models.policy import Policy
 from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
 from astra_data.seeding import derive
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+    from torchrl.objectives import IQLLoss
 
 
 class IqlConfig(Config):
@@ -105,6 +105,8 @@ class Iql:
 
     def __init__(self, policy: Policy, experience: Experience, config: IqlConfig, *, seed: int) -> None:
         """Prepare to train `policy` in place on `experience`, with all randomness from `seed`."""
+        from torchrl.objectives import SoftUpdate
+
         self.policy, self.config, self.seed = policy, config, seed
         self.updates = 0
         self._experience = experience
@@ -153,6 +155,8 @@ class Iql:
         return {"value": float(value.detach()), "action_value": float(action_value.detach())}
 
     def _learn_policy(self, update: int) -> dict[str, float]:
+        from tensordict import TensorDict
+
         config = self.config
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate * (1 + math.cos(math.pi * update / config.policy_updates)) / 2
@@ -167,6 +171,8 @@ class Iql:
     @torch.no_grad()
     def values(self, observation: Tensor) -> Tensor:
         """Return the state values (...) of `observation` (..., O)."""
+        from tensordict import TensorDict
+
         batch = TensorDict({"observation": observation}, batch_size=observation.shape[:-1])
         with self._loss.value_network_params.to_module(self._loss.value_network):
             return torch.as_tensor(self._loss.value_network(batch)["state_value"].squeeze(-1))
@@ -188,7 +194,7 @@ class Iql:
         self.updates = state["updates"]
 
 
-def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
+def transitions(experience: Experience, config: IqlConfig) -> "TensorDict":
     """Return steps of `experience` with the return of `config.return_steps` steps and what comes then, (N,).
 
     Steps whose return the end of the record cuts short are left out; the end of the task does not cut it.
@@ -196,6 +202,8 @@ def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
     Raises:
         BadInputError: no step is left.
     """
+    from tensordict import TensorDict
+
     count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
     reward = (experience.reward * config.reward_scale + config.reward_shift) * (step < lengths)
@@ -223,7 +231,11 @@ def transitions(experience: Experience, config: IqlConfig) -> TensorDict:
     return TensorDict(table, batch_size=reward.shape)[whole]
 
 
-def _iql_loss(policy: Policy, experience: Experience, config: IqlConfig) -> IQLLoss:
+def _iql_loss(policy: Policy, experience: Experience, config: IqlConfig) -> "IQLLoss":
+    from tensordict.nn import TensorDictModule
+    from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+    from torchrl.objectives import IQLLoss
+
     observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
     actor = ProbabilisticActor(
         TensorDictModule(

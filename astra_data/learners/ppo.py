@@ -4,13 +4,10 @@ One iteration collects a stretch of steps from every environment and makes a few
 stretches are kept together, so the same code trains policies with and without memory.
 """
 
+from typing import TYPE_CHECKING
+
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from astra_data.batched import BatchedEnv
 from astra_data.learners.acting import Acting
@@ -18,6 +15,9 @@ from astra_data.learners.learner import Learner
 from astra_data.models.actor_critic import ActorCritic
 from astra_data.recipe import Config, Count, NotNegative, Positive, Share
 from astra_data.seeding import derive
+
+if TYPE_CHECKING:
+    from torchrl.objectives import ClipPPOLoss
 
 
 class PpoConfig(Config):
@@ -89,6 +89,8 @@ class Ppo(Learner):
 
     @torch.no_grad()
     def _collect(self) -> dict[str, Tensor]:
+        from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
         acting, policy = self.acting, self.policy
         columns: dict[str, list[Tensor]] = {}
         first_hidden = acting.hidden
@@ -133,6 +135,8 @@ class Ppo(Learner):
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
+        from tensordict import TensorDict
+
         config, policy = self.config, self.policy
         advantage = rollout["advantage"]
         rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
@@ -154,7 +158,11 @@ class Ppo(Learner):
                 self._optimizer.step()
 
 
-def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> ClipPPOLoss:
+def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> "ClipPPOLoss":
+    from tensordict.nn import TensorDictModule
+    from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+    from torchrl.objectives import ClipPPOLoss
+
     actor = ProbabilisticActor(
         TensorDictModule(_Policy(policy), in_keys=["features"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

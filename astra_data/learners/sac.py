@@ -8,16 +8,12 @@ window as it was when it acted, for it goes on through whole episodes when it ac
 
 import copy
 from itertools import pairwise
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import torch
 from pydantic import model_validator
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.nn import functional
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SACLoss, SoftUpdate
 
 from astra_data.batched import BatchedEnv
 from astra_data.errors import BadInputError
@@ -29,6 +25,9 @@ from astra_data.models.policy import features_of
 from astra_data.models.soft_actor import SoftActor, gaussian
 from astra_data.recipe import Config, Count, NotNegative, Number, Positive, Share
 from astra_data.seeding import derive
+
+if TYPE_CHECKING:
+    from torchrl.objectives import SACLoss
 
 
 class SacConfig(Config):
@@ -103,6 +102,8 @@ class Sac(Learner):
         Raises:
             BadInputError: the buffer would hold no window.
         """
+        from torchrl.objectives import SoftUpdate
+
         self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
@@ -171,6 +172,8 @@ class Sac(Learner):
 
     def _learn(self) -> None:
         """Update actor, critics and temperature once."""
+        from tensordict import TensorDict
+
         config = self.config
         steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
         if not bool(learned.any()):
@@ -222,7 +225,11 @@ class Sac(Learner):
         return functional.mse_loss(self.policy.act(features[learned]), steps["action"][learned])
 
 
-def _sac_loss(policy: SoftActor, config: SacConfig) -> SACLoss:
+def _sac_loss(policy: SoftActor, config: SacConfig) -> "SACLoss":
+    from tensordict.nn import TensorDictModule
+    from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+    from torchrl.objectives import SACLoss
+
     actor = ProbabilisticActor(
         TensorDictModule(_Policy(policy), in_keys=["acting"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
