@@ -132,8 +132,7 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
     Args:
         out: the finished folder.
         replace: whether an `out` that is already there is replaced.
-        config: what it is made with, written to `config.json`; what was begun otherwise is
-            refused.
+        config: what it is made with, written to `config.json`; what was begun otherwise is refused.
 
     Raises:
         BadInputError: `out` is already there and is not to be replaced, or was begun otherwise.
@@ -150,7 +149,9 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         told = partial / "config.json"
         is_begun = any(partial.iterdir())
         if is_begun and not (told.exists() and told.read_text() == config):
-            raise BadInputError(f"{partial} was begun with other settings, see its config.json: remove it")
+            raise BadInputError(
+                f"{partial} was begun with other settings, see its config.json if it has one: remove it"
+            )
         told.write_text(config)
     yield partial
     if out.exists():
