@@ -76,11 +76,8 @@ def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
 
 def straight(state: Tensor) -> Tensor:
     """Return the actions (B, 4) that tell hips and knees to stay at 0 and -2 degrees."""
-    ranges = CommandRanges()
-    low, high = torch.tensor([ranges.hip_deg, ranges.knee_deg] * 2).T
-    told = torch.tensor([0.0, -2.0] * 2)
-    action: Tensor = 2 * (told - low) / (high - low) - 1
-    return action.expand(len(state), -1)
+    angles = torch.deg2rad(torch.tensor([0.0, -2.0] * 2))
+    return CommandRanges().commands(angles).expand(len(state), -1)
 
 
 @torch.no_grad()

@@ -93,6 +93,15 @@ class CommandRanges:
 
     def targets(self, action: Tensor) -> Tensor:
         """Return the angles (..., 4) in rad that commands (..., 4), clipped to ±1, stand for."""
-        ends = torch.tensor([self.hip_deg, self.knee_deg] * 2, dtype=action.dtype, device=action.device)
-        low, high = torch.deg2rad(ends).unbind(-1)
+        low, high = self._ends(action)
         return low + (high - low) * (action.clamp(-1.0, 1.0) + 1.0) / 2.0
+
+    def commands(self, target: Tensor) -> Tensor:
+        """Return the commands (..., 4) that stand for angles (..., 4) in rad."""
+        low, high = self._ends(target)
+        return 2.0 * (target - low) / (high - low) - 1.0
+
+    def _ends(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        ends = torch.tensor([self.hip_deg, self.knee_deg] * 2, dtype=like.dtype, device=like.device)
+        low, high = torch.deg2rad(ends).unbind(-1)
+        return low, high

@@ -41,6 +41,8 @@ def test_commands_span_their_ranges_and_are_clipped() -> None:
     degrees = torch.rad2deg(CommandRanges().targets(action))
     expected = torch.tensor([[-50.0, -70.0, -50.0, -70.0], [-15.0, -2.0, 20.0, -70.0]])
     torch.testing.assert_close(degrees, expected)
+    told = CommandRanges().commands(torch.deg2rad(expected))
+    torch.testing.assert_close(told, action.clamp(-1.0, 1.0))
 
 
 @pytest.mark.parametrize("end", [-1.0, 1.0])
