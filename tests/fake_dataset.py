@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.columns import (
+from astra_data.dataset import Dataset, DatasetWriter, StagedWriter, atomic
+from astra_data.dataset.columns import (
     ACTION,
     DONE,
     OUTCOME_COLUMNS,
@@ -22,7 +23,6 @@ from astra_data.columns import (
     Column,
     Episode,
 )
-from astra_data.dataset import Dataset, DatasetWriter, StagedWriter, atomic
 
 COLUMNS = (
     Column(

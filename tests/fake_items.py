@@ -5,9 +5,9 @@ import signal
 import time
 from pathlib import Path
 
-from astra_data.errors import MissingStageError
-from astra_data.lock import held
-from astra_data.progress import Progress
+from astra_data.core.errors import MissingStageError
+from astra_data.core.lock import held
+from astra_data.core.progress import Progress
 
 
 def touch(path: Path, needs: tuple[Path, ...], *, progress: Progress) -> None:
@@ -43,3 +43,21 @@ def hang(path: Path, *, progress: Progress) -> None:
     with held(path.parent):
         path.write_text(str(os.getpid()))
         time.sleep(600)
+
+
+class Record:
+    def __init__(self) -> None:
+        self.events: list[tuple[str, str]] = []
+
+    def started(self, key: str) -> None:
+        self.events.append(("started", key))
+
+    def progressed(self, key: str, fraction: float, note: str) -> None:
+        self.events.append((f"{fraction} {note}", key))
+
+    def finished(self, key: str, seconds: float) -> None:
+        assert seconds >= 0
+        self.events.append(("finished", key))
+
+    def failed(self, key: str) -> None:
+        self.events.append(("failed", key))

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 from fake_runs import FakeRecipe
 
-from astra_data.mazes import U_MAZE
-from astra_data.mismatch import CommandReplay
-from astra_data.results.page import HOW_TO_READ
-from astra_data.score import SUCCESS
+from astra_data.reports.command_replay import CommandReplay
+from astra_data.reports.page import HOW_TO_READ
 from astra_data.stages.report import ReportConfig, report
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.score import SUCCESS
 
 REPLAY = CommandReplay(
     np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4))

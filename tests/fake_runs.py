@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save_file
 
-from astra_data.results.model import MethodResults, Results
-from astra_data.rows import place
+from astra_data.core.naming import place
+from astra_data.reports.schema import MethodResults, Results
 
 ROWS = ("direct_transfer", "astra", "astra_plus", "follower")
 SEEDS = (0, 1, 2)

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from astra_data.errors import BadInputError
-from astra_data.progress import Progress
-from astra_data.recipe import Config
+from astra_data.core.config import Config
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
 
 
 @dataclass(frozen=True)

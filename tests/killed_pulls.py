@@ -16,8 +16,8 @@ import fsspec.implementations.local  # noqa: F401 - here, so that no child spend
 from shared_files import contents
 
 from astra_data.dataset import Dataset
-from astra_data.sharing import fetch
-from astra_data.sharing.pull import pull
+from astra_data.exchange.sharing import fetch
+from astra_data.exchange.sharing.pull import pull
 
 fetch.BLOCK_BYTES = 1024
 

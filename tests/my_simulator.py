@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from astra_data.columns import Array, Column
+from astra_data.dataset.columns import Array, Column
 
 
 class Glider:

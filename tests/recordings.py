@@ -8,9 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from astra_data.columns import Array
 from astra_data.dataset import Dataset
-from astra_data.imports import ImportReport, import_dataset
+from astra_data.dataset.columns import Array
+from astra_data.exchange.importing import ImportReport, import_dataset
 
 LENGTHS = (6, 9, 5)
 STEPS = (5, 9, 4)

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-from astra_data.fitting import GroundConfig
+from astra_data.grounding.fit import GroundConfig
 from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.collect import CollectConfig
-from astra_data.tasks import TASKS
-from astra_data.training import PpoTrainConfig
+from astra_data.training.train import PpoTrainConfig
+from astra_data.worlds.registry import TASKS
 
 TASK = "antmaze-short"
 _LONG = TASKS["antmaze-umaze"]

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from astra_data.checkpoint import load_tensors, save_tensors
+from astra_data.core.checkpoint import load_tensors, save_tensors
 
 SPENT = {"wall_seconds": 1000.0, "cpu_seconds": 2000.0}
 

@@ -5,7 +5,7 @@ import pytest
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from astra_data.cli import app
+from astra_data.cli.app import app
 
 HOUSE = Path(__file__).parents[1]
 README = (HOUSE / "README.md").read_text()

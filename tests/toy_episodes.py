@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.models.windows import Windows
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.paired_windows import Windows
 
 
 def toy_episodes(
@@ -46,3 +46,8 @@ def toy_episodes(
         reference="toy@data-1.0.0",
         content_hash="0",
     )
+
+
+def no_episodes() -> PairedEpisodes:
+    empty = torch.zeros(1, 1)
+    return PairedEpisodes(empty, empty, empty.bool(), Windows(*[empty] * 9), "toy@data-1.0.0", "abc")

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from astra_data.prediction.motion import chained, composed
-from astra_data.prediction.recordings import Piece
-from astra_data.sims.planar_walker import PlanarWalker
+from astra_data.studies.motion import chained, composed
+from astra_data.studies.planar_walker import PlanarWalker
+from astra_data.studies.recordings import Piece
 
 FPS = 60
 LATE_ROWS = 20

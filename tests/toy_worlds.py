@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from astra_data.batched import Step
+from astra_data.worlds.batched import Step
 
 
 class _World:

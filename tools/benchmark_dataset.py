@@ -31,15 +31,15 @@ from mujoco.rollout import Rollout
 from rich.console import Console
 from rich.table import Table
 
-from astra_data.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
-from astra_data.cores import cores
+from astra_data.core.cores import cores
 from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
 from astra_data.dataset.frames import Frames
-from astra_data.gymnasium_faces import SeededSimulatorWorld, WorldEnv
-from astra_data.pairing import Pairing, pairing_named
-from astra_data.sims.mujoco_model import MujocoModel
 from astra_data.stages.pair import pair_steps
-from astra_data.tasks import TASKS
+from astra_data.training.gymnasium import SeededSimulatorWorld, WorldEnv
+from astra_data.worlds.mujoco_model import MujocoModel
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.simulator_loader import Pairing, pairing_named
 
 PAIRED = 32_768
 BATCH_OF_PAIRS = 4096

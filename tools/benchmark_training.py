@@ -27,25 +27,25 @@ from single_file_iql import SingleFileIql
 from step_by_step import step_by_step
 from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
 
-from astra_data.ant import POSITIONS, VelocityController
-from astra_data.cores import cores
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import AstraDataError
-from astra_data.fitting import Fitting, HistoryFit
-from astra_data.learners.iql import Experience, Iql, IqlConfig
-from astra_data.learners.ppo import Ppo
-from astra_data.learners.sac import Sac, SacConfig
-from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.grounding import GroundingModel, GroundingShape
-from astra_data.models.policy import PolicyShape
-from astra_data.models.soft_actor import SoftActor
-from astra_data.progress import silent
-from astra_data.recipe import load_recipe
-from astra_data.request import Recipe
-from astra_data.simulators import simulator_of
-from astra_data.tasks import TASKS
-from astra_data.training import PpoTrainConfig
-from astra_data.world import SimulatorWorld
+from astra_data.core.config import load_recipe
+from astra_data.core.cores import cores
+from astra_data.core.errors import AstraDataError
+from astra_data.core.progress import silent
+from astra_data.experiments.recipe import Recipe
+from astra_data.grounding.build import simulator_of
+from astra_data.grounding.fit import Fitting, HistoryFit
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.iql import Experience, Iql, IqlConfig
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.policy import PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.learning.ppo import Ppo
+from astra_data.learning.sac import Sac, SacConfig
+from astra_data.training.simulator_env import SimulatorWorld
+from astra_data.training.train import PpoTrainConfig
+from astra_data.worlds.ant.body import POSITIONS, VelocityController
+from astra_data.worlds.registry import TASKS
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
 TASK = TASKS[SETTINGS.task]

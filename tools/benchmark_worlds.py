@@ -22,12 +22,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from astra_data.ant import CONTROL_SUBSTEPS, VelocityController, ant_model
-from astra_data.cores import cores
-from astra_data.envs.antmaze import AntMazeEnv
-from astra_data.objective import PlanarObjective
-from astra_data.physics import Floats
-from astra_data.tasks import TASKS
+from astra_data.core.cores import cores
+from astra_data.worlds.ant.body import CONTROL_SUBSTEPS, VelocityController, ant_model
+from astra_data.worlds.ant.target import AntMazeEnv
+from astra_data.worlds.batched_mujoco import Floats
+from astra_data.worlds.objective import PlanarObjective
+from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 GYMNASIUM_ID = "AntMaze_UMaze-v5"

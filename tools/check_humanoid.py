@@ -24,21 +24,21 @@ import typer
 from timing import complain
 from torch import Tensor, nn
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.deployment import target_observation
-from astra_data.envs.humanoid import HumanoidEnv
-from astra_data.errors import AstraDataError, BadInputError
-from astra_data.grounding_file import load_grounding
-from astra_data.humanoid.model import CommandRanges
-from astra_data.humanoid.skeleton import rotation
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.naming import base_method
+from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.simulator import GroundedSimulator
+from astra_data.learning.networks.grounding import GroundingModel
+from astra_data.learning.networks.history import HistoryEncoder, mlp
 from astra_data.methods import method_named
-from astra_data.models.grounding import GroundingModel
-from astra_data.models.history import HistoryEncoder, mlp
-from astra_data.policy_file import PolicyFile, deploy
-from astra_data.rows import base_method
-from astra_data.sims.grounded import GroundedSimulator
-from astra_data.task import Task
-from astra_data.tasks import task_named
+from astra_data.training.deployment import target_observation
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.worlds.humanoid.model import CommandRanges
+from astra_data.worlds.humanoid.skeleton import rotation
+from astra_data.worlds.humanoid.target import HumanoidEnv
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.task import Task
 
 ROWS = ("behavior_cloning", "nas", "astra", "nas_plus", "astra_plus")
 HUMANOIDS = 32

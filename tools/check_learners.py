@@ -26,12 +26,12 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from astra_data.learners.iql import Experience, Iql, IqlConfig
-from astra_data.learners.ppo import Ppo, PpoConfig
-from astra_data.learners.sac import Sac, SacConfig
-from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.policy import Policy, PolicyShape
-from astra_data.models.soft_actor import SoftActor
+from astra_data.learning.iql import Experience, Iql, IqlConfig
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.policy import Policy, PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.learning.ppo import Ppo, PpoConfig
+from astra_data.learning.sac import Sac, SacConfig
 
 EPISODES = 100
 UPDATES = 5_000

@@ -3,7 +3,7 @@
     uv run python tools/check_nao.py
     uv run python tools/check_nao.py --only speeds --only lag --seed 1
 
-Robots differ as `astra_data.nao.traits.Variation` says; speeds are the mean of 3.8 s after a start of 1.9 s.
+Robots differ as `worlds.nao.traits.Variation` says; speeds are the mean of 3.8 s after a start of 1.9 s.
 """
 
 import time
@@ -17,10 +17,10 @@ import numpy as np
 import typer
 from rich.progress import Progress, TaskID
 
-from astra_data.geometry import wrapped
-from astra_data.nao import BatchedNao, WalkLimits
-from astra_data.nao.robot import CONTROL_STEP_S
-from astra_data.nao.steps import Floats
+from astra_data.worlds.nao import BatchedNao, WalkLimits
+from astra_data.worlds.nao.robot import CONTROL_STEP_S
+from astra_data.worlds.nao.steps import Floats
+from astra_data.worlds.plane.geometry import wrapped
 
 Tick = Callable[[float], None]
 """Called with the fraction of a check that is done."""

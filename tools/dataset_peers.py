@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from minari.data_collector import EpisodeBuffer
 
-from astra_data.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
 
 COLUMNS = (
     Column(STATE, size=29),

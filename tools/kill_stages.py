@@ -24,10 +24,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
-from astra_data.progress import silent
-from astra_data.sharing.pull import pull
-from astra_data.sharing.push import push
+from astra_data.exchange.sharing.pull import pull
+from astra_data.exchange.sharing.push import push
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair

@@ -19,13 +19,22 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from astra_data.columns import ACTION, GOAL, NEXT_STATE, OUTCOME_COLUMNS, REWARD, STATE, Array, Episode
+from astra_data.core.progress import silent
 from astra_data.dataset import Dataset, DatasetWriter
-from astra_data.dataset.check import check
-from astra_data.progress import silent
+from astra_data.dataset.columns import (
+    ACTION,
+    GOAL,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    REWARD,
+    STATE,
+    Array,
+    Episode,
+)
+from astra_data.dataset.doctor.check import check
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.pair import PairConfig, pair
-from astra_data.tasks import TASKS
+from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 AMBLE_M = 0.4

@@ -15,8 +15,8 @@ import numpy as np
 import typer
 from PIL import Image
 
-from astra_data.nao import BatchedNao
-from astra_data.nao.robot import CONTROL_STEP_S
+from astra_data.worlds.nao import BatchedNao
+from astra_data.worlds.nao.robot import CONTROL_STEP_S
 
 STRIP = 6
 """Frames of a strip."""

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 
-from astra_data.nao import BatchedNao
-from astra_data.nao.robot import CONTROL_STEP_S
-from astra_data.prediction.motion import between
-from astra_data.prediction.recordings import Piece, WalkingConfig, read_recordings
-from astra_data.sims.planar_walker import PlanarWalker, walk_command
+from astra_data.studies.motion import between
+from astra_data.studies.planar_walker import PlanarWalker, walk_command
+from astra_data.studies.recordings import Piece, WalkingConfig, read_recordings
+from astra_data.worlds.nao import BatchedNao
+from astra_data.worlds.nao.robot import CONTROL_STEP_S
 
 MAPPING = Path(__file__).parents[1] / "recipes" / "imports" / "nao_guda.toml"
 AHEAD = 5

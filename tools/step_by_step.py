@@ -5,9 +5,9 @@ from itertools import cycle
 import torch
 from timing import Stretch
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.fitting import GroundConfig
-from astra_data.models.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.grounding.fit import GroundConfig
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
 
 
 def step_by_step(

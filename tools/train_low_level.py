@@ -17,11 +17,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors.numpy import save_file
 from torch import nn
 
-from astra_data.ant import VelocityController
-from astra_data.envs.ant_velocity import AntVelocityConfig, AntVelocityEnv
-from astra_data.learners.sac import Sac, SacConfig
-from astra_data.models.policy import PolicyShape
-from astra_data.models.soft_actor import SoftActor
+from astra_data.learning.networks.policy import PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.learning.sac import Sac, SacConfig
+from astra_data.worlds.ant.body import VelocityController
+from astra_data.worlds.ant.velocity import AntVelocityConfig, AntVelocityEnv
 
 SETTLED_STEPS = 20
 """One second after a command change, tracking counts as settled."""

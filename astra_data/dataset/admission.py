@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-from astra_data.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode
 from astra_data.dataset.format import METADATA_KEYS
-from astra_data.errors import BadInputError
 
 
 class Admission:

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from astra_data.errors import BadInputError
-from astra_data.lock import held
+from astra_data.core.errors import BadInputError
+from astra_data.core.lock import held
 
 
 @contextmanager

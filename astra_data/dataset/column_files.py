@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.columns import Array
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.lock import held
 from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.columns import Array
 from astra_data.dataset.reader import Dataset
-from astra_data.errors import CorruptDatasetError
-from astra_data.lock import held
 
 MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """Bytes that the processes of a container may take, or "max"; absent outside of one."""

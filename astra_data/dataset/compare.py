@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from astra_data.columns import Column
-from astra_data.dataset.provenance import changed_values
+from astra_data.dataset.columns import Column
+from astra_data.dataset.description import changed_values
 from astra_data.dataset.reader import Dataset
 
 _DESCRIBED = ("name", "version", "stage", "config", "seeds", "environment", "simulator", "parents")

@@ -8,13 +8,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from astra_data.columns import Column, Scalar
+from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import format as layout
+from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import read_tasks
 from astra_data.dataset.validate import file_faults
-from astra_data.errors import CorruptDatasetError
 
 Ints = NDArray[np.int64]
 _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")

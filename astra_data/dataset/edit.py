@@ -10,14 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from astra_data.columns import Episode, Scalar
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Episode, Scalar
 from astra_data.dataset.compare import schema_differences, world_differences
-from astra_data.dataset.provenance import permutation
+from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.errors import BadInputError
-from astra_data.recipe import did_you_mean
 
 MOST_UIDS = 8
 """Uids that a message lists."""

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from astra_data.columns import Array, Column
+from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import EPISODES_PATH, STATISTICS, STORED_STATISTICS, episodes_schema
 from astra_data.dataset.parquet import RotatingWriter, to_lists
 

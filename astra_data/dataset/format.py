@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from astra_data.columns import (
+from astra_data.dataset.columns import (
     EPISODE_INDEX,
     EPISODE_UID,
     FRAME_INDEX,

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from astra_data.columns import Column
 from astra_data.dataset.column_files import cache_folder, mapped_columns, memory_bytes
+from astra_data.dataset.columns import Column
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.windows import Padding, Transitions, Windows
+from astra_data.dataset.step_windows import Padding, Transitions, Windows
 
 MEMORY_SHARE = 0.5
 """Share of the machine's memory beyond which columns are mapped in from files."""

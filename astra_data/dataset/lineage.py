@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import place
-from astra_data.errors import CorruptDatasetError
 
 _Described = tuple[Path, Mapping[str, Any]]
 """Folder and description."""

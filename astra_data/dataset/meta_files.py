@@ -6,12 +6,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from astra_data.columns import Column
+from astra_data.core.config import Config, Count, validated
+from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError
+from astra_data.dataset.columns import Column
+from astra_data.dataset.description import NAME
 from astra_data.dataset.format import DATASET_PATH, INFO_PATH, SUBSETS_PATH
 from astra_data.dataset.plain import MOST_FPS, read_object
-from astra_data.dataset.provenance import NAME
-from astra_data.errors import BadInputError, CorruptDatasetError, RecipeError
-from astra_data.recipe import Config, Count, validated
 
 _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 

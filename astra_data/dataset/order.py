@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.errors import BadInputError
-from astra_data.seeding import generator
+from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import generator
 
 
 class Order:

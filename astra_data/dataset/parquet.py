@@ -8,9 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from astra_data.columns import Array
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset.columns import Array
 from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
-from astra_data.errors import CorruptDatasetError
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
 UNREADABLE = (OSError, ValueError, pa.ArrowException)

@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from astra_data import columns as names
-from astra_data.columns import Array
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array
 from astra_data.dataset.format import STATS_PATH, TASKS_PATH
 from astra_data.dataset.parquet import UNREADABLE, first_line, to_numpy
-from astra_data.errors import CorruptDatasetError
 
 TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own."""

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.columns import RESERVED, SUCCESS, Array, Column, Episode
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.validate import content_faults
-from astra_data.errors import BadInputError, CorruptDatasetError
 
 
 class Dataset(Contents):

@@ -16,16 +16,16 @@ from typing import Any
 
 import pyarrow as pa
 
-from astra_data.columns import Column, Episode, Scalar
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
+from astra_data.core.lock import held
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import sync
+from astra_data.dataset.columns import Column, Episode, Scalar
+from astra_data.dataset.description import changed_values
 from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
-from astra_data.dataset.provenance import changed_values
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.errors import AstraDataError, BadInputError, CorruptDatasetError
-from astra_data.lock import held
 
 _PLAN = "plan.json"
 

@@ -7,11 +7,11 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from astra_data import columns as names
-from astra_data.columns import Array, Column
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.description import ContentHash
 from astra_data.dataset.format import arrow_type
 from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
-from astra_data.dataset.provenance import ContentHash
 
 Ints = NDArray[np.int64]
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.reader import Dataset
-from astra_data.errors import BadInputError
-from astra_data.recipe import did_you_mean
 
 Change = Literal["columns", "episodes", "description"]
 

@@ -12,17 +12,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from astra_data import columns as names
-from astra_data.columns import Array, Column, Episode, Scalar
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.column_statistics import episode_statistics, global_statistics
+from astra_data.dataset.columns import Array, Column, Episode, Scalar
+from astra_data.dataset.description import ContentHash, complete_description, permutation
 from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
-from astra_data.dataset.provenance import ContentHash, complete_description, permutation
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.statistics import episode_statistics, global_statistics
-from astra_data.errors import BadInputError, CorruptDatasetError
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 

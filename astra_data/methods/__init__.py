@@ -1,18 +1,18 @@
 """Every method by name; each file holds only what is different about its method."""
 
-from astra_data.errors import BadInputError
-from astra_data.method import Method
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import PLUS, base_method
 from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
 from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
+from astra_data.methods.method import Method
 from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
-from astra_data.rows import PLUS, base_method
 
 METHODS: dict[str, Method] = {
     method.name: method

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from astra_data.fitting import HistoryFit
-from astra_data.method import Method
-from astra_data.training import InSimulator
+from astra_data.grounding.fit import HistoryFit
+from astra_data.methods.method import Method
+from astra_data.training.train import InSimulator
 
 ASTRA = Method(
     name="astra",

@@ -15,17 +15,17 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.checkpoint import resumed, save_tensors
-from astra_data.errors import BadInputError
-from astra_data.fitting import Fitting
-from astra_data.method import Method
-from astra_data.models.causal import CausalConfig, descend, fit_causes
-from astra_data.recipe import Count
-from astra_data.replays import Recorded, beginnings, trajectory_gaps
-from astra_data.seeding import derive
-from astra_data.stopwatch import Stopwatch
-from astra_data.training import InSimulator
-from astra_data.variation import AnyVariation, Variation
+from astra_data.core.checkpoint import resumed, save_tensors
+from astra_data.core.config import Count
+from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.fit import Fitting
+from astra_data.grounding.replays import Recorded, beginnings, trajectory_gaps
+from astra_data.learning.networks.causal import CausalConfig, descend, fit_causes
+from astra_data.methods.method import Method
+from astra_data.training.train import InSimulator
+from astra_data.worlds.variation import AnyVariation, Variation
 
 Mask = dict[str, dict[str, float]]
 """How probably each parameter reaches each gap, by their names. Gaps, the effects, are means over a window of

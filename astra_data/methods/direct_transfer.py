@@ -1,5 +1,5 @@
 """Direct transfer: a recurrent policy trained in the raw simulator and deployed as it is (the floor)."""
 
-from astra_data.method import Method
+from astra_data.methods.method import Method
 
 DIRECT_TRANSFER = Method(name="direct_transfer", title="Direct transfer")

@@ -4,8 +4,8 @@ The paper's N(0, 0.05) is read as a standard deviation of 0.05, of commands of Â
 episode. The task has the ranges.
 """
 
-from astra_data.method import Method
-from astra_data.training import InSimulator
+from astra_data.methods.method import Method
+from astra_data.training.train import InSimulator
 
 DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from astra_data.kicking import Kicking
-from astra_data.mazes import Maze
-from astra_data.method import Method
-from astra_data.task import Task
+from astra_data.methods.method import Method
+from astra_data.worlds.plane.kicking import Kicking
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.task import Task
 
 FOLLOWER = Method(name="follower", title="Careful follower", learn=None, planar=True)
 

@@ -14,18 +14,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.learners.iql import FINE_TUNING, Experience, Iql, IqlConfig
-from astra_data.logbook import Logbook
-from astra_data.method import Method
-from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.models.history import PositionFeatures
-from astra_data.models.policy import Policy
-from astra_data.policy_file import PolicyFile
-from astra_data.seeding import derive
-from astra_data.task import Task
-from astra_data.training import Training
-from astra_data.world import policy_observation
+from astra_data.core.logbook import Logbook
+from astra_data.core.seeding import derive
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.iql import FINE_TUNING, Experience, Iql, IqlConfig
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.history import PositionFeatures
+from astra_data.learning.networks.policy import Policy
+from astra_data.methods.method import Method
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.simulator_env import policy_observation
+from astra_data.training.train import Training
+from astra_data.worlds.task import Task
 
 _CHECKPOINT_EVERY = 500
 _POSITION_OCTAVES = 4

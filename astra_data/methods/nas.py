@@ -3,8 +3,8 @@
 The reward is the task's own on corrected states, as Golemo et al. recompute it.
 """
 
-from astra_data.fitting import HistoryFit
-from astra_data.method import Method
+from astra_data.grounding.fit import HistoryFit
+from astra_data.methods.method import Method
 
 NAS = Method(
     name="nas",

@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.fitting import Fitting, scatter_factor
-from astra_data.logbook import Logbook
-from astra_data.method import Method
-from astra_data.models.residual import ResidualModel, ResidualShape
-from astra_data.recipe import Config, Count, Positive
-from astra_data.seeding import derive, generator
-from astra_data.telemetry import correction_r2
+from astra_data.core.config import Config, Count, Positive
+from astra_data.core.logbook import Logbook
+from astra_data.core.seeding import derive, generator
+from astra_data.grounding.diagnostics import correction_r2
+from astra_data.grounding.fit import Fitting, scatter_factor
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.residual import ResidualModel, ResidualShape
+from astra_data.methods.method import Method
 
 
 class GolemoConfig(Config):

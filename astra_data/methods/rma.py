@@ -11,15 +11,15 @@ from typing import Any
 
 import torch
 
-from astra_data.errors import BadInputError
-from astra_data.learners.ppo import Ppo
-from astra_data.learners.rma import Adaptation, RmaConfig
-from astra_data.method import Method
-from astra_data.models.adaptation import AdaptiveShape, Teacher
-from astra_data.policy_file import PolicyFile
-from astra_data.progress import part
-from astra_data.seeding import derive
-from astra_data.training import InSimulator, PpoTrainConfig, Training, optimise
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import part
+from astra_data.core.seeding import derive
+from astra_data.learning.networks.adaptation import AdaptiveShape, Teacher
+from astra_data.learning.ppo import Ppo
+from astra_data.learning.rma import Adaptation, RmaConfig
+from astra_data.methods.method import Method
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimise
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Target and Full Obs: policies trained in the target on φ(s), or on the complete state (Section V-A)."""
 
-from astra_data.method import Method
-from astra_data.target_training import InTarget
+from astra_data.methods.method import Method
+from astra_data.training.train_in_target import InTarget
 
 TARGET = Method(name="target", title="Target", learn=InTarget("abstract"))
 

@@ -8,19 +8,19 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.checkpoint import finished_folder
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.descent import Descent, DescentConfig
-from astra_data.digest import file_digest
-from astra_data.grounding_file import load_history_model
-from astra_data.models.alignment import TargetEncoder, gaussian_mmd
-from astra_data.models.grounding import GroundingModel
-from astra_data.models.windows import Windows
-from astra_data.progress import Progress
-from astra_data.recipe import Count, NotNegative, Positive, as_json
-from astra_data.results.provenance import origin
-from astra_data.seeding import derive
-from astra_data.target_encoder_file import save_target_encoder
+from astra_data.core.checkpoint import finished_folder
+from astra_data.core.config import Count, NotNegative, Positive, as_json
+from astra_data.core.digest import file_digest
+from astra_data.core.progress import Progress
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import derive
+from astra_data.grounding.grounding_file import load_history_model
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.target_encoder_file import save_target_encoder
+from astra_data.learning.descent import Descent, DescentConfig
+from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
+from astra_data.learning.networks.grounding import GroundingModel
+from astra_data.learning.networks.paired_windows import Windows
 
 _KEEP_EVERY = 50
 

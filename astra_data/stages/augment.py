@@ -20,7 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
-from astra_data.columns import (
+from astra_data.core.config import Config, Count, NotNegative
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
+from astra_data.core.seeding import derive, generator
+from astra_data.dataset.columns import (
     ABSTRACT_STATE,
     DONE,
     GOAL,
@@ -36,14 +40,10 @@ from astra_data.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.errors import BadInputError
-from astra_data.geometry import PlanarMap
-from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, NotNegative
-from astra_data.relocation import Relocation, Rotations, outcomes, positions
-from astra_data.seeding import derive, generator
-from astra_data.task import Task
-from astra_data.tasks import TASKS, task_named
+from astra_data.worlds.plane.geometry import PlanarMap
+from astra_data.worlds.plane.relocation import Relocation, Rotations, outcomes, positions
+from astra_data.worlds.registry import TASKS, task_named
+from astra_data.worlds.task import Task
 
 DEFAULT_COPIES = 3
 _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)

@@ -10,9 +10,14 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
-from astra_data.batched import TargetEnv
-from astra_data.behaviors import Behavior, PolicyBehavior, RandomCommands, WallWatch
-from astra_data.columns import (
+from astra_data.core.config import Config, Count, NotNegative
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, part
+from astra_data.core.provenance import machine
+from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.dataset.columns import (
     ACTION,
     DONE,
     GOAL,
@@ -28,18 +33,13 @@ from astra_data.columns import (
 )
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
-from astra_data.digest import file_digest
-from astra_data.errors import BadInputError
-from astra_data.grounding_file import load_grounding
-from astra_data.policy_file import PolicyFile, deploy
-from astra_data.progress import Progress, part
-from astra_data.recipe import Config, Count, NotNegative
-from astra_data.results.provenance import machine
-from astra_data.seeding import derive
-from astra_data.stopwatch import Stopwatch
-from astra_data.target_encoder_file import load_target_encoder
-from astra_data.task import Task
-from astra_data.tasks import task_named
+from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.training.behaviors import Behavior, PolicyBehavior, RandomCommands, WallWatch
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.worlds.batched import TargetEnv
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.task import Task
 
 _TRAINING_SHARE = 0.8
 """Part of the progress that training the suboptimal policy takes."""
@@ -181,7 +181,7 @@ def _behavior(
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
         return RandomCommands(task.objective.action_size, (fewest, most), watch), {}
     if config.behavior.startswith("suboptimal"):
-        from astra_data.suboptimal import (  # noqa: PLC0415 - TorchRL is slow to import
+        from astra_data.training.suboptimal import (  # noqa: PLC0415 - TorchRL is slow to import
             suboptimal_by_ppo,
             suboptimal_by_sac,
         )

@@ -17,25 +17,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.checkpoint import finished_folder, save_tensors
-from astra_data.deployment import DeployedPolicy, EncoderKind
-from astra_data.errors import BadInputError
-from astra_data.grounding_file import Grounding, load_grounding
+from astra_data.core.checkpoint import finished_folder, save_tensors
+from astra_data.core.config import Config, Count, Positive
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.build import simulator_of
+from astra_data.grounding.grounding_file import Grounding, load_grounding
+from astra_data.grounding.target_encoder_file import load_target_encoder
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.outcome import EpisodeRecord, Outcome
-from astra_data.policy_file import PolicyFile, Simulation, deploy
-from astra_data.progress import Progress
-from astra_data.recipe import Config, Count, Positive
-from astra_data.results.provenance import origin
-from astra_data.seeding import derive
-from astra_data.simulators import simulator_of
-from astra_data.stopwatch import Stopwatch
-from astra_data.target_encoder_file import load_target_encoder
-from astra_data.task import Task
-from astra_data.tasks import task_named
-from astra_data.training_world import WorldParts, training_world
-from astra_data.world import SimulatorWorld
+from astra_data.training.build_env import WorldParts, training_world
+from astra_data.training.deployment import DeployedPolicy, EncoderKind
+from astra_data.training.episode_record import EpisodeRecord, Outcome
+from astra_data.training.policy_file import PolicyFile, Simulation, deploy
+from astra_data.training.simulator_env import SimulatorWorld
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.task import Task
 
 Act = Callable[[Tensor, Tensor], Tensor]
 Begin = Callable[[Tensor], Act]

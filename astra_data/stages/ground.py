@@ -3,18 +3,18 @@
 import json
 from pathlib import Path
 
-from astra_data.checkpoint import finished_folder
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import BadInputError
-from astra_data.fitting import Fitting, GroundConfig
-from astra_data.gap import gap_report
-from astra_data.grounding_file import save_grounding
+from astra_data.core.checkpoint import finished_folder
+from astra_data.core.config import Config, as_json
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
+from astra_data.core.provenance import origin
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.fit import Fitting, GroundConfig
+from astra_data.grounding.grounding_file import save_grounding
+from astra_data.grounding.open_loop_error import gap_report
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.progress import Progress
-from astra_data.recipe import Config, as_json
-from astra_data.results.provenance import origin
-from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import task_named
+from astra_data.worlds.registry import task_named
 
 
 def ground(

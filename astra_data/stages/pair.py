@@ -8,7 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from astra_data.columns import (
+from astra_data.core.config import Config, NotNegative
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
+from astra_data.core.provenance import machine
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
     ABSTRACT_STATE,
@@ -21,14 +26,9 @@ from astra_data.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.errors import BadInputError
-from astra_data.pairing import Pairing, built, checked_abstraction, explained, pairing_named
-from astra_data.progress import Progress
-from astra_data.recipe import Config, NotNegative
-from astra_data.results.provenance import machine
-from astra_data.simulator import AbstractSimulator
-from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import TASKS
+from astra_data.worlds.protocols import AbstractSimulator
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.simulator_loader import Pairing, built, checked_abstraction, explained, pairing_named
 
 BATCH = 4096
 """Simulators that are reset and stepped side by side."""

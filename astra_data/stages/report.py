@@ -7,27 +7,27 @@ from typing import Protocol
 
 from pydantic import Field, JsonValue
 
-from astra_data.checkpoint import finished_folder
-from astra_data.figures import dynamics_mismatch, png
+from astra_data.core.checkpoint import finished_folder
+from astra_data.core.config import Config, Share
+from astra_data.core.progress import Progress
 from astra_data.methods import method_named
-from astra_data.mismatch import replay_commands
-from astra_data.progress import Progress
-from astra_data.recipe import Config, Share
-from astra_data.results.assembly import assemble
-from astra_data.results.drawing import Camera, figure_of_sizes, figures_of
-from astra_data.results.files import (
+from astra_data.reports.assembly import assemble
+from astra_data.reports.command_replay import replay_commands
+from astra_data.reports.drawing import Camera, figure_of_sizes, figures_of
+from astra_data.reports.figures import dynamics_mismatch, png
+from astra_data.reports.files import (
     Found,
     publish_results,
     published_figures,
     read_published,
     write_results,
 )
-from astra_data.results.model import Results
-from astra_data.results.page import render
-from astra_data.results.sizes import SizeResults, SizesResults, by_size, render_sizes
-from astra_data.statistics import REPLICATES
-from astra_data.task import Task
-from astra_data.tasks import TASKS
+from astra_data.reports.page import render
+from astra_data.reports.schema import Results
+from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
+from astra_data.reports.statistics import REPLICATES
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
 
 
 class ReportConfig(Config):

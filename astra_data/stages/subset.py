@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from astra_data.core.progress import Progress
 from astra_data.dataset import edit
 from astra_data.dataset.reader import Dataset
-from astra_data.progress import Progress
 
 
 def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progress) -> Path:

@@ -3,19 +3,19 @@
 import json
 from pathlib import Path
 
-from astra_data.checkpoint import finished_folder
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.digest import file_digest
-from astra_data.errors import BadInputError
-from astra_data.grounding_file import load_grounding
+from astra_data.core.checkpoint import finished_folder
+from astra_data.core.config import Config, as_json
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
+from astra_data.core.provenance import origin
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.policy_file import PolicyFile
-from astra_data.progress import Progress
-from astra_data.recipe import Config, as_json
-from astra_data.results.provenance import origin
-from astra_data.stopwatch import Stopwatch
-from astra_data.tasks import task_named
-from astra_data.training import PpoTrainConfig, SacTrainConfig, Training
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
+from astra_data.worlds.registry import task_named
 
 
 def train(

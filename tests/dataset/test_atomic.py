@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from racing import ROUNDS, race
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.atomic import atomic_file, atomic_folder
-from astra_data.errors import BadInputError
 
 
 @pytest.mark.parametrize("writing", [atomic_folder, atomic_file])

@@ -2,8 +2,8 @@ from pathlib import Path
 
 from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write_fake, writer
 
-from astra_data.columns import STATE, Column, Episode
 from astra_data.dataset import Dataset
+from astra_data.dataset.columns import STATE, Column, Episode
 from astra_data.dataset.compare import Differences, differences
 
 

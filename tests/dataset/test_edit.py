@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, write_fake, writer
 
-from astra_data.columns import STATE, Column
+from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
+from astra_data.dataset.columns import STATE, Column
 from astra_data.dataset.edit import delete, filter_episodes, merge, subset
-from astra_data.errors import BadInputError
 
 
 def write(root: Path, uids: range) -> Dataset:

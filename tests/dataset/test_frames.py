@@ -9,12 +9,12 @@ import torch
 from fake_dataset import COLUMNS, LENGTHS, concatenated, write_fake
 from torch.utils.data import DataLoader
 
-from astra_data.columns import ACTION, INDEX, REWARD, STATE, TERMINATED
+from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, column_files
+from astra_data.dataset.columns import ACTION, INDEX, REWARD, STATE, TERMINATED
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.samples import Batch, Samples
-from astra_data.dataset.windows import Padding
-from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.step_windows import Padding
 
 NAMES = (STATE, ACTION, REWARD, TERMINATED, "mode", INDEX)
 

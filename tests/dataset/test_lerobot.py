@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import COLUMNS, LENGTHS, write_fake
 
-from astra_data.columns import ACTION, REWARD, STATE
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
+from astra_data.dataset.columns import ACTION, REWARD, STATE
 from astra_data.dataset.frames import Frames
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")

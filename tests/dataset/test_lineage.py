@@ -4,11 +4,11 @@ from pathlib import Path
 import pytest
 from fake_dataset import write_fake
 
+from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset
 from astra_data.dataset.edit import delete, merge, subset
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.lineage import lineage, tree_lines
-from astra_data.errors import CorruptDatasetError
 
 
 def test_ancestors_are_found_at_home_and_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

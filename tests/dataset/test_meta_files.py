@@ -6,15 +6,15 @@ from typing import Any
 import pytest
 from fake_dataset import write_fake
 
+from astra_data.core.errors import AstraDataError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.dataset.check import check
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.edit import subset
 from astra_data.dataset.format import DATA_PATH, DATASET_PATH, INFO_PATH, STATS_PATH, SUBSETS_PATH
+from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.lineage import lineage, tree_lines
 from astra_data.dataset.meta_files import is_data_path, read_description
-from astra_data.dataset.repair import repair
-from astra_data.errors import AstraDataError, CorruptDatasetError
-from astra_data.inspection import inspect_dataset
 
 VALUES: tuple[object, ...] = (
     *(None, True, -1, 0, 3, 0.5, 1e300, 10**400, float("nan"), float("inf")),

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.order import Order
-from astra_data.errors import BadInputError
 
 
 def epoch(order: Order) -> list[int]:

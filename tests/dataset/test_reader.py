@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_episodes, write_fake, writer
 
-from astra_data.columns import STATE, TIMESTAMP, Episode
+from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
-from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.columns import STATE, TIMESTAMP, Episode
 
 
 @pytest.fixture(scope="module")

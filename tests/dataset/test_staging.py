@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, fake_episodes, staged_writer, write_fake
 
-from astra_data.columns import Episode
+from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.columns import Episode
 
 STEPS_OF_THE_RECORDED = 20
 EPISODES_OF_THE_RECORDED = 30

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 from fake_dataset import write_fake
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.versions import Version, locate, names_at_home, open_dataset, place, successor
-from astra_data.errors import BadInputError
 
 
 @pytest.fixture

@@ -20,9 +20,9 @@ from fake_dataset import (
     writer,
 )
 
-from astra_data.columns import ACTION, DONE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
+from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset, DatasetWriter, episode_rows, parquet
-from astra_data.errors import BadInputError
+from astra_data.dataset.columns import ACTION, DONE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
 
 
 def files(root: Path) -> dict[str, bytes]:

@@ -8,17 +8,17 @@ import torch
 from spending import SPENT, spend
 from toy_episodes import toy_episodes
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import BadInputError, RecipeError
-from astra_data.fitting import Fitting, GroundConfig
+from astra_data.core.config import Config, load_recipe, validated
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.progress import Progress, silent
+from astra_data.experiments.plan import plan
+from astra_data.experiments.recipe import Recipe
+from astra_data.grounding.fit import Fitting, GroundConfig
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods.compass import CompassConfig, identify
-from astra_data.plan import plan
-from astra_data.progress import Progress, silent
-from astra_data.recipe import Config, load_recipe, validated
-from astra_data.request import Recipe
-from astra_data.task import Task
-from astra_data.tasks import TASKS
-from astra_data.variation import WIDE_RANGES, PlanarVariation, Variation
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
+from astra_data.worlds.variation import WIDE_RANGES, PlanarVariation, Variation
 
 TASK = TASKS["antmaze-umaze"]
 PLANTED = {"friction": 0.92, "action_scale": 0.05, "timestep_scale": 1.1, "heading_bias_deg": 3.0}

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from astra_data.methods.follower import CarefulFollower, CarefulKicker, careful
-from astra_data.tasks import TASKS
-from astra_data.world import SimulatorWorld
+from astra_data.training.simulator_env import SimulatorWorld
+from astra_data.worlds.registry import TASKS
 
 
 def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:

@@ -8,15 +8,15 @@ import torch
 from spending import SPENT, spend
 from toy_episodes import toy_episodes
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.learners.iql import IqlConfig
+from astra_data.core.progress import Progress, silent
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.iql import IqlConfig
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
-from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policy_file import PolicyFile, deploy
-from astra_data.progress import Progress, silent
-from astra_data.tasks import TASKS
-from astra_data.training import PpoTrainConfig, Training
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.train import PpoTrainConfig, Training
+from astra_data.worlds.registry import TASKS
 
 Learn = Callable[..., tuple[PolicyFile, dict[str, Any]]]
 

@@ -1,12 +1,12 @@
 import pytest
 
-from astra_data.errors import BadInputError
-from astra_data.figures import method_colour, method_title
-from astra_data.figures.style import SPARE_COLOURS
-from astra_data.fitting import GroundConfig, HistoryFit
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.fit import GroundConfig, HistoryFit
+from astra_data.learning.networks.grounding import LossWeights
 from astra_data.methods import METHODS, method_named
-from astra_data.models.grounding import LossWeights
-from astra_data.training import InSimulator
+from astra_data.reports.figures import method_colour, method_title
+from astra_data.reports.figures.style import SPARE_COLOURS
+from astra_data.training.train import InSimulator
 
 
 def weights(name: str) -> LossWeights | None:

@@ -7,13 +7,13 @@ from spending import SPENT, spend
 from torch import Tensor
 from toy_episodes import toy_episodes
 
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.fitting import Fitting, GroundConfig
+from astra_data.core.progress import silent
+from astra_data.grounding.diagnostics import correction_r2
+from astra_data.grounding.fit import Fitting, GroundConfig
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.residual import ResidualModel
 from astra_data.methods.nas_golemo import GolemoConfig, fit_residual
-from astra_data.models.residual import ResidualModel
-from astra_data.progress import silent
-from astra_data.tasks import TASKS
-from astra_data.telemetry import correction_r2
+from astra_data.worlds.registry import TASKS
 
 CONFIG = GolemoConfig(epochs=12, hidden_size=16, layers=2, learning_rate=0.01)
 STEPS = 40

@@ -1,7 +1,7 @@
 import pytest
 
 from astra_data.methods.rma import RMA
-from astra_data.tasks import TASKS
+from astra_data.worlds.registry import TASKS
 
 
 def test_the_ranges_are_those_printed_in_the_paper() -> None:

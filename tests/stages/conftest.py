@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from small_run import ALIGN, COLLECT, GOLEMO, GROUND, TASK, TRAIN, short_task
 
-from astra_data.checkpoint import load_tensors, save_tensors
-from astra_data.progress import silent
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.progress import silent
 from astra_data.stages.align import align
 from astra_data.stages.collect import collect
 from astra_data.stages.ground import ground

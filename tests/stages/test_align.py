@@ -4,10 +4,10 @@ from pathlib import Path
 import pytest
 from small_run import ALIGN
 
-from astra_data.errors import BadInputError
-from astra_data.progress import Progress, silent
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.grounding.target_encoder_file import load_target_encoder
 from astra_data.stages.align import align
-from astra_data.target_encoder_file import load_target_encoder
 
 
 def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:

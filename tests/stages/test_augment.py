@@ -8,8 +8,10 @@ import pytest
 import torch
 from small_run import TASK, short_task
 
-from astra_data.ant import WALL_REACH_M, rotation_matrix, up_cosine
-from astra_data.columns import (
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.columns import (
     ACTION,
     DONE,
     GOAL,
@@ -21,15 +23,13 @@ from astra_data.columns import (
     TRUNCATED,
     Episode,
 )
-from astra_data.dataset import Dataset, DatasetWriter
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import BadInputError
-from astra_data.navigation import Navigation
-from astra_data.progress import silent
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair
-from astra_data.tasks import TASKS
+from astra_data.worlds.ant.body import WALL_REACH_M, rotation_matrix, up_cosine
+from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.registry import TASKS
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
 MIRRORED = AugmentConfig(copies=3, rotations="quarter", reflections=True, min_steps=5)

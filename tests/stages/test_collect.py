@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from small_run import COLLECT, TASK
 
-from astra_data import suboptimal
-from astra_data.columns import (
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset, StagedWriter
+from astra_data.dataset.columns import (
     ACTION,
     DONE,
     NEXT_STATE,
@@ -20,12 +22,10 @@ from astra_data.columns import (
     TRUNCATED,
     Episode,
 )
-from astra_data.dataset import Dataset, StagedWriter
-from astra_data.dataset.check import check
-from astra_data.errors import BadInputError
-from astra_data.progress import silent
+from astra_data.dataset.doctor.check import check
 from astra_data.stages.collect import CollectConfig, collect
-from astra_data.tasks import TASKS
+from astra_data.training import suboptimal
+from astra_data.worlds.registry import TASKS
 
 TINY = CollectConfig(episodes=3, max_steps=15)
 
@@ -152,7 +152,7 @@ def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TRIALS": 2}
     for name, value in small.items():
         monkeypatch.setattr(suboptimal, name, value)
-    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
 
 
 @pytest.mark.usefixtures("small_training")

@@ -9,16 +9,16 @@ import torch
 from small_run import TRAIN
 from torch import Tensor
 
-from astra_data.checkpoint import load_tensors
-from astra_data.errors import BadInputError
-from astra_data.learners.rma import RmaConfig
-from astra_data.models.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.navigation import Navigation
-from astra_data.policy_file import PolicyFile
-from astra_data.progress import silent
+from astra_data.core.checkpoint import load_tensors
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.rma import RmaConfig
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.train import train
-from astra_data.tasks import TASKS
+from astra_data.training.policy_file import PolicyFile
+from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.registry import TASKS
 
 CONFIG = EvaluateConfig(episodes=3)
 HORIZON = 25

@@ -6,17 +6,17 @@ import pytest
 import torch
 from small_run import GOLEMO, GROUND, TRAIN
 
-from astra_data import fitting as stage
-from astra_data.dataset.pairs import PairedEpisodes
-from astra_data.errors import BadInputError
-from astra_data.grounding_file import load_grounding, load_history_model
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.grounding import fit as stage
+from astra_data.grounding.diagnostics import telemetry
+from astra_data.grounding.grounding_file import load_grounding, load_history_model
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.grounding import LossWeights
 from astra_data.methods.compass import CompassConfig
-from astra_data.models.grounding import LossWeights
-from astra_data.progress import Progress, silent
 from astra_data.stages.ground import ground
 from astra_data.stages.train import train
-from astra_data.telemetry import telemetry
-from astra_data.variation import WIDE_RANGES, Variation
+from astra_data.worlds.variation import WIDE_RANGES, Variation
 
 
 def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(

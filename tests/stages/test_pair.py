@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from astra_data.columns import (
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
     ABSTRACT_STATE,
@@ -13,12 +16,9 @@ from astra_data.columns import (
     NEXT_STATE,
     STATE,
 )
-from astra_data.dataset import Dataset
-from astra_data.errors import BadInputError, CorruptDatasetError
-from astra_data.pairing import pairing_named
-from astra_data.progress import silent
 from astra_data.stages.pair import PairConfig, pair, pair_steps
-from astra_data.tasks import TASKS
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.simulator_loader import pairing_named
 
 _PLANAR = [0, 1, 15, 16]
 """x, y, vx and vy in an ant's qpos (15) and qvel (14)."""

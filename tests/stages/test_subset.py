@@ -3,9 +3,9 @@ from pathlib import Path
 import pytest
 from fake_dataset import write_fake
 
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
-from astra_data.errors import BadInputError
-from astra_data.progress import silent
 from astra_data.stages.subset import subset
 
 

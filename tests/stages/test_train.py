@@ -5,17 +5,17 @@ import pytest
 import torch
 from small_run import TRAIN
 
-from astra_data.checkpoint import load_tensors, save_tensors
-from astra_data.digest import file_digest
-from astra_data.errors import BadInputError
-from astra_data.learners.rma import RmaConfig
-from astra_data.models.adaptation import Student
-from astra_data.models.soft_actor import SoftActor
-from astra_data.policy_file import PolicyFile
-from astra_data.progress import Progress, silent
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.learning.networks.adaptation import Student
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.learning.rma import RmaConfig
 from astra_data.stages.train import train
-from astra_data.tasks import TASKS
-from astra_data.training import PpoTrainConfig, SacTrainConfig
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.train import PpoTrainConfig, SacTrainConfig
+from astra_data.worlds.registry import TASKS
 
 SWITCHES = {
     "topple": True,
@@ -122,7 +122,7 @@ def test_after_an_interruption_it_goes_on(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     grounding = {"astra_plus": grounded, "nas_golemo_plus": augmented}.get(method)
     config = TRAIN.model_copy(update=SWITCHES)
     expected = make(task, method, paired, grounding, tmp_path / "whole", config)
@@ -145,7 +145,7 @@ def test_after_an_interruption_it_goes_on(
 def test_sac_goes_on_after_an_interruption(
     method: str, task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     grounding = grounded if method == "astra" else None
     config = SacTrainConfig(
         learner="sac",
@@ -171,7 +171,7 @@ def test_sac_goes_on_after_an_interruption(
 def test_a_checkpoint_of_another_version_is_told(
     task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
         make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop)
     (checkpoint,) = tmp_path.rglob("checkpoint.safetensors")
@@ -228,7 +228,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
 def test_rma_goes_on_after_an_interruption_in_either_phase(
     share: float, task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     expected = make(task, "rma", paired, None, tmp_path / "whole")
 
     def stop_at_share(fraction: float, note: str) -> None:

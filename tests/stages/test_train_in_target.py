@@ -4,11 +4,11 @@ from pathlib import Path
 import pytest
 from small_run import TRAIN
 
-from astra_data.policy_file import PolicyFile
-from astra_data.progress import Progress, silent
+from astra_data.core.progress import Progress, silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.train import train
-from astra_data.target_training import TargetConfig
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.train_in_target import TargetConfig
 
 CONFIG = TRAIN.model_copy(update={"data_start_share": 0.5, "episode_steps": 1})
 MEMORY = {"target": None, "full_obs": 0}
@@ -51,7 +51,7 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     observed: str,
     size: int,
 ) -> None:
-    monkeypatch.setattr("astra_data.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     expected = make(task, row, paired, whole)
     with pytest.raises(Stopped):

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from astra_data.gymnasium_faces import Array, WorldVectorEnv
+from astra_data.training.gymnasium import Array, WorldVectorEnv
 
 
 class Rows(VecEnv):  # type: ignore[misc]

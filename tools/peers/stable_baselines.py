@@ -18,13 +18,13 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from astra_data.gymnasium_faces import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
-from astra_data.models.grounding import GroundingModel, GroundingShape
-from astra_data.recipe import load_recipe
-from astra_data.request import Recipe
-from astra_data.simulators import simulator_of
-from astra_data.tasks import TASKS
-from astra_data.training import PpoTrainConfig
+from astra_data.core.config import load_recipe
+from astra_data.experiments.recipe import Recipe
+from astra_data.grounding.build import simulator_of
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.training.gymnasium import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
+from astra_data.training.train import PpoTrainConfig
+from astra_data.worlds.registry import TASKS
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "antmaze_long.toml"
 SINGLE_WORLDS = 16

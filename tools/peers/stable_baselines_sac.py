@@ -13,9 +13,9 @@ import typer
 from rows import Rows
 from stable_baselines3 import SAC
 
-from astra_data.gymnasium_faces import SeededSimulatorWorld, WorldVectorEnv
-from astra_data.simulators import simulator_of
-from astra_data.tasks import TASKS
+from astra_data.grounding.build import simulator_of
+from astra_data.training.gymnasium import SeededSimulatorWorld, WorldVectorEnv
+from astra_data.worlds.registry import TASKS
 
 
 def main(count: int, updates: int, steps: int) -> None:

@@ -18,9 +18,9 @@ from fake_runs import (
     write_evaluation,
 )
 
-from astra_data.errors import BadInputError
-from astra_data.results.sizes import SizesResults
-from astra_data.rows import place
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import place
+from astra_data.reports.sizes import SizesResults
 from astra_data.stages.report import report
 
 

@@ -14,13 +14,13 @@ from fake_runs import (
     write_elsewhere,
 )
 
-from astra_data.errors import BadInputError, MissingStageError
-from astra_data.results import assembly
-from astra_data.results.model import Results
-from astra_data.results.page import render
-from astra_data.score import RETURN, SURVIVED_STEPS
+from astra_data.core.errors import BadInputError, MissingStageError
+from astra_data.reports import assembly
+from astra_data.reports.page import render
+from astra_data.reports.schema import Results
 from astra_data.stages import report as stage
 from astra_data.stages.report import report
+from astra_data.worlds.score import RETURN, SURVIVED_STEPS
 
 
 def test_the_papers_figures_stand_beside_ours(root: Path, folder: Path) -> None:

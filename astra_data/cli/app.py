@@ -1,0 +1,108 @@
+"""The command line: its commands are in `astra_data.cli`.
+
+There imports stand inside functions, so that `astra-data --help` answers at once.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from astra_data.cli import (
+    augmenting,
+    building,
+    checking,
+    comparing,
+    editing,
+    exporting,
+    importing,
+    inspecting,
+    predicting,
+    recipes,
+    sharing,
+    sweeping,
+)
+from astra_data.core.errors import AstraDataError
+
+app = typer.Typer(
+    help="Robot trajectories into datasets, datasets into policies that transfer from an abstract simulator.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"astra-data {version('astra-data')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    show_version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    """Options before any command."""
+
+
+PANELS: dict[str, dict[str, Callable[..., None]]] = {
+    "Recipes": {
+        "run": recipes.run,
+        "sweep": sweeping.sweep,
+        "check": recipes.check,
+        "ground": recipes.ground,
+        "train": recipes.train,
+        "align": recipes.align,
+        "evaluate": recipes.evaluate,
+        "report": recipes.report,
+        "gap": predicting.gap,
+    },
+    "Recipes or datasets": {
+        "collect": building.collect,
+        "pair": building.pair,
+        "subset": editing.subset,
+    },
+    "Datasets": {
+        "augment": augmenting.augment,
+        "merge": editing.merge,
+        "delete": editing.delete,
+        "filter": editing.filter_,
+        "list": inspecting.list_,
+        "inspect": inspecting.inspect,
+        "validate": checking.validate,
+        "repair": checking.repair,
+        "log": comparing.log,
+        "diff": comparing.diff,
+    },
+    "Exchange": {
+        "import": importing.import_,
+        "export": exporting.export,
+        "card": sharing.card,
+        "push": sharing.push,
+        "pull": sharing.pull,
+    },
+}
+for panel, commands in PANELS.items():
+    for name, command in commands.items():
+        app.command(name, rich_help_panel=panel)(command)
+
+
+def main() -> None:
+    """Run the command line; a reported error becomes one line, unless ASTRA_DATA_DEBUG is set."""
+    try:
+        app()
+    except AstraDataError as error:
+        if os.environ.get("ASTRA_DATA_DEBUG"):
+            raise
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""The command that makes more episodes of few."""
+
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName, NewName, Out
+
+
+def augment(
+    dataset: DatasetName,
+    task: Annotated[
+        str | None,
+        typer.Option(help="Task that judges the copies.", show_default="what the dataset was collected for"),
+    ] = None,
+    name: NewName = None,
+    out: Out = None,
+    copies: Annotated[
+        int | None, typer.Option(help="Copies of each training episode.", show_default="3")
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Episodes in all, instead of --copies.", show_default=False)
+    ] = None,
+    rotations: Annotated[
+        str | None, typer.Option(help="any (angle), quarter (turns) or none.", show_default="any")
+    ] = None,
+    translations: Annotated[
+        bool | None,
+        typer.Option(
+            "--translations/--no-translations",
+            help="Put copies anywhere, or where they started.",
+            show_default="translations",
+        ),
+    ] = None,
+    reflections: Annotated[
+        bool | None,
+        typer.Option(
+            "--reflections/--no-reflections",
+            help="Mirror half of the copies.",
+            show_default="no-reflections",
+        ),
+    ] = None,
+    held_out_share: Annotated[
+        float | None, typer.Option(help="Share of episodes never to be copied.", show_default="0.1")
+    ] = None,
+    keep_originals: Annotated[
+        bool | None,
+        typer.Option(
+            "--keep-originals/--drop-originals",
+            help="Keep the training episodes themselves, or only their copies.",
+            show_default="keep-originals",
+        ),
+    ] = None,
+    margin_m: Annotated[
+        float | None,
+        typer.Option(help="Clearance from the walls, in m.", show_default="the robot's reach"),
+    ] = None,
+    min_steps: Annotated[
+        int | None, typer.Option(help="Shortest stretch that is copied.", show_default="20")
+    ] = None,
+    tries: Annotated[
+        int | None, typer.Option(help="Turns that are tried for a copy.", show_default="100")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+) -> None:
+    """Turn, move and mirror episodes into more of them; the dataset must not be paired yet."""
+    from astra_data.core.config import validated
+    from astra_data.dataset.versions import locate
+    from astra_data.experiments.display import shown
+    from astra_data.stages.augment import AugmentConfig
+    from astra_data.stages.augment import augment as augment_dataset
+
+    options = {
+        "copies": copies,
+        "episodes": episodes,
+        "rotations": rotations,
+        "translations": translations,
+        "reflections": reflections,
+        "held_out_share": held_out_share,
+        "keep_originals": keep_originals,
+        "margin_m": margin_m,
+        "min_steps": min_steps,
+        "tries": tries,
+    }
+    given = {key: value for key, value in options.items() if value is not None}
+    config = validated(given, AugmentConfig, "augment")
+    with shown("augment") as progress:
+        folder = augment_dataset(
+            task, config, dataset=locate(dataset), seed=seed, name=name, out=out, progress=progress
+        )
+    typer.echo(f"finished: {folder}")

@@ -1,0 +1,161 @@
+"""Commands that make datasets: of a recipe, or by themselves."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from astra_data.cli.arguments import NewName, Out, Source
+from astra_data.cli.recipes import RUNS, Jobs, Root, Seeds, refuse, resumable, run_stage
+from astra_data.core.errors import BadInputError
+
+Task = Annotated[
+    str,
+    typer.Argument(
+        metavar="RECIPE|TASK",
+        help="A recipe (.toml), or a task such as antmaze-umaze; what follows is for a task.",
+        show_default=False,
+    ),
+]
+SeedOrSeeds = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--seed",
+        help="Of everything random; of a recipe, only these of its seeds.",
+        show_default="0; all of a recipe",
+    ),
+]
+Behavior = Annotated[
+    str | None, typer.Option(help="random, policy, suboptimal_ppo or suboptimal_sac.", show_default="random")
+]
+Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
+MaxSteps = Annotated[int | None, typer.Option(help="Longest episode.", show_default="500")]
+Start = Annotated[
+    str | None, typer.Option(help="Where episodes start: anywhere or task.", show_default="anywhere")
+]
+PpoSteps = Annotated[
+    int | None, typer.Option(help="Steps after which suboptimal_ppo stops learning.", show_default="300000")
+]
+SacEpisodeSteps = Annotated[
+    int | None,
+    typer.Option(help="How long episodes last when suboptimal_sac stops learning.", show_default="500"),
+]
+Policy = Annotated[
+    str | None,
+    typer.Option(help="Folder of the policy: of a training, or meta/astra of a dataset.", show_default=False),
+]
+Grounding = Annotated[
+    str | None, typer.Option(help="Folder of its grounding, if it has one.", show_default=False)
+]
+Encoder = Annotated[
+    str | None, typer.Option(help="Folder of its target encoder, if it has one.", show_default=False)
+]
+Name = Annotated[
+    str | None, typer.Option(help="Name of the dataset.", show_default="task, behaviour and seed")
+]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with what an interrupted call of the same command left.")
+]
+
+
+def collect(
+    task: Task,
+    seeds: SeedOrSeeds = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
+    behavior: Behavior = None,
+    episodes: Episodes = None,
+    max_steps: MaxSteps = None,
+    start: Start = None,
+    ppo_steps: PpoSteps = None,
+    sac_episode_steps: SacEpisodeSteps = None,
+    policy: Policy = None,
+    grounding: Grounding = None,
+    target_encoder: Encoder = None,
+    name: Name = None,
+    out: Out = None,
+    resume: Resume = False,
+) -> None:
+    """Collect a dataset in the target environment."""
+    settings = {
+        "behavior": behavior,
+        "episodes": episodes,
+        "max_steps": max_steps,
+        "start": start,
+        "ppo_steps": ppo_steps,
+        "sac_episode_steps": sac_episode_steps,
+        "policy": policy,
+        "grounding": grounding,
+        "target_encoder": target_encoder,
+    }
+    given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
+    if task.endswith(".toml"):
+        refuse(given | _given(name=name, out=out, resume=resume), "collect")
+        run_stage(Path(task), "collect", seeds=seeds or (), jobs=jobs, root=root)
+        return
+    if len(seeds or ()) > 1 or jobs is not None:
+        raise BadInputError("collect: a task takes one --seed and no --jobs; a recipe takes them")
+    import torch
+
+    from astra_data.core.config import validated
+    from astra_data.experiments.display import shown
+    from astra_data.stages.collect import CollectConfig
+    from astra_data.stages.collect import collect as collect_dataset
+
+    config = validated(given, CollectConfig, "collect")
+    seed = seeds[0] if seeds else 0
+    # Idle threads of the networks would slow down the physics.
+    torch.set_num_threads(1)
+    how = "the same command with --resume goes on from here"
+    with resumable(how), shown("collect") as progress:
+        folder = collect_dataset(
+            task, config, seed=seed, out=out, name=name, resume=resume, progress=progress
+        )
+    typer.echo(f"finished: {folder}")
+
+
+def pair(
+    dataset: Source,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
+    simulator: Annotated[
+        str | None,
+        typer.Option(
+            help="A task, for its abstract simulator, or a class of yours: path.py:MySimulator.",
+            show_default=False,
+        ),
+    ] = None,
+    reset_tolerance: Annotated[
+        float | None,
+        typer.Option(help="Largest difference of a reset simulator from φ(s).", show_default="1e-6"),
+    ] = None,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Add to every transition where the abstract simulator lands from the same state."""
+    given = _given(reset_tolerance=reset_tolerance)
+    if dataset.endswith(".toml"):
+        refuse(given | _given(simulator=simulator, name=name, out=out), "pair")
+        run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
+        return
+    if seeds or jobs is not None:
+        raise BadInputError("pair: a dataset takes neither --seed nor --jobs; a recipe takes them")
+    from astra_data.core.config import validated
+    from astra_data.dataset.versions import locate
+    from astra_data.experiments.display import shown
+    from astra_data.stages.pair import PairConfig
+    from astra_data.stages.pair import pair as pair_dataset
+
+    config = validated(given, PairConfig, "pair")
+    if simulator is None:
+        raise BadInputError("pair: expected --simulator, a task or path.py:MySimulator")
+    with shown("pair") as progress:
+        folder = pair_dataset(
+            simulator, config, dataset=locate(dataset), name=name, out=out, progress=progress
+        )
+    typer.echo(f"finished: {folder}")
+
+
+def _given(**options: Any) -> dict[str, Any]:  # noqa: ANN401 - of any type
+    return {key: value for key, value in options.items() if value not in (None, False)}

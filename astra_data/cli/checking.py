@@ -1,0 +1,58 @@
+"""Commands that tell whether a dataset is whole, and save what is whole of a broken one."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName
+
+
+def validate(
+    dataset: DatasetName,
+    with_lerobot: Annotated[
+        bool, typer.Option("--with-lerobot", help="Also compare windows with lerobot's own loader; slow.")
+    ] = False,
+) -> None:
+    """Check every file and value of a LeRobot dataset, and list everything that is wrong."""
+    from astra_data.core.errors import CorruptDatasetError
+    from astra_data.dataset.doctor.check import check
+    from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
+    from astra_data.dataset.versions import locate
+
+    root = locate(dataset)
+    report = check(root)
+    if with_lerobot and not report.faults:
+        compare_with_lerobot(root, report)
+    for note in report.notes:
+        typer.echo(f"note: {note}")
+    if report.faults:
+        count = "1 fault" if report.fault_count == 1 else f"{report.fault_count} faults"
+        told = "\n  ".join([f"{root} has {count}:", *report.faults])
+        raise CorruptDatasetError(f"{told}\nTo save its whole episodes: astra-data repair {root} --out DIR")
+    typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
+
+
+def repair(
+    folder: Annotated[
+        Path, typer.Argument(help="The folder of a LeRobot dataset; it is not touched.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
+    like: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATASET",
+            help="The dataset that FOLDER was made from by LeRobot's tools: its origin and its episodes' "
+            "metadata are joined by uid.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Save the whole episodes of a broken dataset, of ours or of LeRobot's, to a new one."""
+    from astra_data.dataset.doctor.repair import repair as save
+    from astra_data.dataset.versions import open_dataset
+
+    repaired = save(folder, out=out, like=open_dataset(like) if like else None)
+    for note in repaired.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"finished: {out} ({repaired.episodes} episodes, {repaired.frames} steps)")

@@ -1,0 +1,40 @@
+"""Commands that tell where a dataset comes from, and how two differ."""
+
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName
+
+
+def log(dataset: DatasetName) -> None:
+    """Show what a dataset was made of, as a tree: name, version, start of the hash, stage and settings."""
+    from astra_data.dataset.lineage import lineage, tree_lines
+    from astra_data.dataset.versions import open_dataset
+
+    for line in tree_lines(lineage(open_dataset(dataset))):
+        typer.echo(line)
+
+
+def diff(
+    a: DatasetName,
+    b: Annotated[str, typer.Argument(metavar="DATASET", help="The other one.", show_default=False)],
+) -> None:
+    """Show how two datasets differ: columns, episodes by uid, origin."""
+    from astra_data.dataset.compare import differences
+    from astra_data.dataset.versions import open_dataset
+
+    first, second = open_dataset(a), open_dataset(b)
+    found = differences(first, second)
+    for dataset in (first, second):
+        typer.echo(f"{dataset.reference}: {len(dataset)} episodes, {dataset.lengths.sum()} steps")
+    listed = {
+        f"only in {first.reference}": found.only_in_a,
+        f"only in {second.reference}": found.only_in_b,
+        "changed": found.changed,
+    }
+    for title, uids in listed.items():
+        if uids:
+            typer.echo(f"{len(uids)} episodes {title}: {', '.join(map(str, uids))}")
+    for sentence in (*found.schema, *found.description):
+        typer.echo(sentence)

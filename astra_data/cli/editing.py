@@ -1,0 +1,146 @@
+"""Commands that write a new version of a dataset with other episodes."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName, NewName, Out, Source
+from astra_data.cli.recipes import RUNS, Jobs, Root, refuse, run_stage
+from astra_data.core.errors import BadInputError
+
+
+def subset(
+    dataset: Source,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="How many episodes.", show_default=False)
+    ] = None,
+    percent: Annotated[
+        int | None,
+        typer.Option(min=1, help="Or how many per cent of --of; may exceed 100.", show_default=False),
+    ] = None,
+    of: Annotated[
+        int | None,
+        typer.Option(min=1, help="What 100 per cent are.", show_default="all episodes of DATASET"),
+    ] = None,
+    seeds: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--seed",
+            help="Of the permutation; of a recipe, only these of its seeds.",
+            show_default="the one stored in DATASET; all of a recipe",
+        ),
+    ] = None,
+    stratify: Annotated[
+        str | None,
+        typer.Option(
+            help="Key of the episodes' metadata, such as success: each value keeps its share.",
+            show_default=False,
+        ),
+    ] = None,
+    name: NewName = None,
+    out: Out = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
+) -> None:
+    """Write a random subset; with one seed, smaller subsets lie inside larger ones."""
+    if dataset.endswith(".toml"):
+        options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
+        refuse(options | {"name": name, "out": out}, "subset", "sweep")
+        run_stage(Path(dataset), "subset", seeds=seeds or (), jobs=jobs, root=root)
+        return
+    if len(seeds or ()) > 1 or jobs is not None:
+        raise BadInputError("subset: a dataset takes one --seed and no --jobs; a recipe takes them")
+    from astra_data.dataset.edit import subset as write
+    from astra_data.dataset.versions import open_dataset
+
+    source = open_dataset(dataset)
+    _told(
+        write(
+            source,
+            episodes=episodes,
+            percent=percent,
+            of=of,
+            seed=seeds[0] if seeds else None,
+            stratify=stratify,
+            name=name,
+            out=out,
+        )
+    )
+
+
+def merge(
+    datasets: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DATASET...",
+            help="Two or more, with equal columns, fps, task, environment and simulator.",
+        ),
+    ],
+    new_uids: Annotated[
+        bool, typer.Option("--new-uids", help="Give episodes whose uid is taken a new one.")
+    ] = False,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write the episodes of several datasets into one."""
+    from astra_data.dataset.edit import merge as write
+    from astra_data.dataset.versions import open_dataset
+
+    _told(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, name=name, out=out))
+
+
+def delete(
+    dataset: DatasetName,
+    uids: Annotated[
+        list[int],
+        typer.Option("--episode", metavar="UID", help="An episode; may be repeated.", show_default=False),
+    ],
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write a dataset without some of its episodes."""
+    from astra_data.dataset.edit import delete as write
+    from astra_data.dataset.versions import open_dataset
+
+    _told(write(open_dataset(dataset), uids, name=name, out=out))
+
+
+def filter_(
+    dataset: DatasetName,
+    success: Annotated[
+        bool | None,
+        typer.Option("--success/--no-success", help="Only successes, or only failures.", show_default=False),
+    ] = None,
+    min_return: Annotated[float | None, typer.Option(help="Smallest return.", show_default=False)] = None,
+    max_return: Annotated[float | None, typer.Option(help="Largest return.", show_default=False)] = None,
+    min_length: Annotated[int | None, typer.Option(help="Fewest steps.", show_default=False)] = None,
+    max_length: Annotated[int | None, typer.Option(help="Most steps.", show_default=False)] = None,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write the episodes that meet every given condition."""
+    from astra_data.dataset.edit import filter_episodes
+    from astra_data.dataset.versions import open_dataset
+
+    _told(
+        filter_episodes(
+            open_dataset(dataset),
+            success=success,
+            min_return=min_return,
+            max_return=max_return,
+            min_length=min_length,
+            max_length=max_length,
+            name=name,
+            out=out,
+        )
+    )
+
+
+def _told(folder: Path) -> None:
+    from astra_data.dataset.reader import Dataset
+
+    written = Dataset.open(folder)
+    typer.echo(
+        f"finished: {folder} ({written.reference}, {len(written)} episodes, {written.lengths.sum()} steps)"
+    )

@@ -1,0 +1,23 @@
+"""The command that writes a dataset in another library's format."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName
+
+
+def export(
+    dataset: DatasetName,
+    format: Annotated[str, typer.Option(help="minari, d4rl, robomimic or d3rlpy.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option(help="The new file; for minari a folder, maze/random-v0.", show_default=False)
+    ],
+) -> None:
+    """Write a dataset in the format of another library."""
+    from astra_data.dataset.versions import open_dataset
+    from astra_data.exchange.exporters import export as write
+
+    write(open_dataset(dataset), out, format=format)
+    typer.echo(f"finished: {out}")

@@ -1,0 +1,48 @@
+"""`astra-data import`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import Out
+
+Recordings = Annotated[
+    list[Path],
+    typer.Argument(metavar="SOURCE...", help="Files, folders or archives of one format.", show_default=False),
+]
+MappingFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--mapping",
+        help="TOML file: which fields become which columns. D4RL, robomimic and Minari need none.",
+        show_default=False,
+    ),
+]
+FileFormat = Annotated[
+    str | None,
+    typer.Option(
+        "--format", help="csv, hdf5, json, mcap, minari or npz.", show_default="told by the files' names"
+    ),
+]
+Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
+Fps = Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")]
+Task = Annotated[str | None, typer.Option(help="What the episodes do.", show_default="the mapping's")]
+
+
+def import_(
+    recordings: Recordings,
+    mapping: MappingFile = None,
+    file_format: FileFormat = None,
+    out: Out = None,
+    name: Name = None,
+    fps: Fps = None,
+    task: Task = None,
+) -> None:
+    """Turn logs (CSV, NPZ, HDF5, Minari, MCAP, JSON) into a dataset."""
+    from astra_data.exchange.importing import import_dataset
+
+    report = import_dataset(
+        recordings, mapping, out=out, file_format=file_format, name=name, fps=fps, task=task
+    )
+    typer.echo(f"finished: {report}")

@@ -1,0 +1,81 @@
+"""An inspection for the terminal: a table of all values, and a map of where the robot was."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from astra_data.dataset.inspection import BINS, Inspection, Ints, Map, Spread
+
+_BARS = " ▁▂▃▄▅▆▇█"
+_SHADES = " ░▒▓█"
+
+
+def inspection_page(inspection: Inspection) -> RenderableType:
+    """Lay out an inspection."""
+    parts: list[RenderableType] = [Text(_summary(inspection)), *_tables(inspection.spreads)]
+    if inspection.positions is not None:
+        left, right, bottom, top = inspection.positions.extent
+        told = f"positions, x {left:.1f} to {right:.1f} m, y {bottom:.1f} to {top:.1f} m"
+        parts += [Text(told), Text(shaded(inspection.positions))]
+    return Group(*parts)
+
+
+def sparkline(counts: Ints) -> str:
+    """Draw counts (n,) as n bars; only a bin that nothing is in is empty."""
+    return _drawn(counts, _BARS)
+
+
+def shaded(planar: Map) -> str:
+    """Draw a map as lines of shades, the top first; a character is two cells high, for it is so tall."""
+    counts = planar.counts
+    if len(counts) % 2:
+        counts = np.concatenate([counts, np.zeros_like(counts[:1])])
+    pairs = counts[::2] + counts[1::2]
+    # Square roots, for a robot that rests somewhere would outshine all else.
+    drawn = _drawn(np.sqrt(pairs).ravel(), _SHADES)
+    width = counts.shape[1]
+    rows = [drawn[start : start + width] for start in range(0, len(drawn), width)]
+    return "\n".join(row.rstrip() for row in reversed(rows))
+
+
+def _drawn(counts: Ints, characters: str) -> str:
+    most = max(float(counts.max()), 1e-12)
+    levels = np.ceil(counts / most * (len(characters) - 1)).astype(int)
+    return "".join(characters[level] for level in levels)
+
+
+def _summary(inspection: Inspection) -> str:
+    lengths = inspection.lengths
+    histogram, _ = np.histogram(lengths, BINS)
+    minutes = lengths.sum() / inspection.fps / 60
+    lines = [
+        f"{inspection.reference}: {len(lengths)} episodes, {lengths.sum():,} steps, {minutes:.1f} min",
+        f"lengths {lengths.min()} to {lengths.max()}, median {np.median(lengths):g}  {sparkline(histogram)}",
+    ]
+    if inspection.success is not None:
+        share = inspection.success / len(lengths)
+        lines.append(f"success {inspection.success} of {len(lengths)} episodes ({share:.2f})")
+    return "\n".join(lines)
+
+
+def _tables(spreads: tuple[Spread, ...]) -> Iterator[RenderableType]:
+    """Yield the name of each column and a table of its values, all tables alike in width."""
+    width = max(len(name) for spread in spreads for name in (*(spread.column.names or ()), "value"))
+    for number, spread in enumerate(spreads):
+        column = spread.column
+        table = Table(box=None, pad_edge=False, show_header=number == 0)
+        table.add_column("value", min_width=width, no_wrap=True)
+        table.add_column("unit", min_width=5, no_wrap=True)
+        for name in ("min", "mean", "max"):
+            table.add_column(name, justify="right", min_width=10, no_wrap=True)
+        table.add_column("spread", min_width=BINS, no_wrap=True)
+        units = (column.astra or {}).get("unit", [""] * column.size)
+        labels = column.names or [str(index) if column.size > 1 else "" for index in range(column.size)]
+        for index, (label, unit) in enumerate(zip(labels, units, strict=True)):
+            figures = (f"{values[index]:.4g}" for values in (spread.low, spread.mean, spread.high))
+            table.add_row(*map(Text, (label, unit, *figures, sparkline(spread.counts[index]))))
+        yield Text(f"{column.name} ({column.size}) {column.dtype}", style="bold")
+        yield table

@@ -1,0 +1,40 @@
+"""`astra-data gap`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.recipes import RUNS, Publish, RecipePath, Root, Seeds, resumable
+
+Data = Annotated[
+    Path,
+    typer.Option(
+        help="Recordings to predict: a dataset, or a log, an archive or a folder of them as the recipe's "
+        "mapping describes them.",
+        show_default=False,
+    ),
+]
+Train = Annotated[
+    Path | None,
+    typer.Option(
+        help="Recordings to learn from, likewise.",
+        show_default="a part of the data itself, the rest is predicted",
+    ),
+]
+
+
+def gap(
+    recipe: RecipePath,
+    data: Data,
+    train: Train = None,
+    seeds: Seeds = None,
+    publish: Publish = False,
+    root: Root = RUNS,
+) -> None:
+    """Measure how well models predict a real robot's recordings; run again, it goes on."""
+    from astra_data.studies.run import measure_gap
+
+    with resumable():
+        page = measure_gap(recipe, data, train, seeds=seeds or (), publish=publish, root=root)
+        typer.echo(f"finished: {page}")

@@ -1,0 +1,185 @@
+"""Commands that work on recipes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.core.errors import AstraDataError, BadInputError
+
+RecipePath = Annotated[
+    Path, typer.Argument(metavar="RECIPE", help="A recipe, a TOML file.", show_default=False)
+]
+RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE...", help="Recipes, TOML files.")]
+Method = Annotated[str | None, typer.Option(help="Only this row of the recipe.", show_default=False)]
+Seeds = Annotated[
+    list[int] | None,
+    typer.Option("--seed", help="Only this seed of the recipe; may be repeated.", show_default=False),
+]
+Device = Annotated[str, typer.Option(help="Torch device of the networks: cpu, cuda, cuda:1, …")]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Items at a time, each in its own process; on a CUDA device, each with its own CUDA context.",
+        show_default="one per core; 2 with --device cuda",
+    ),
+]
+Root = Annotated[Path, typer.Option(help="Folder of all runs.")]
+Until = Annotated[str | None, typer.Option(help="The last stage to run.", show_default="all")]
+Publish = Annotated[
+    bool, typer.Option("--publish", help="Also copy the results to results/ beside the recipe.")
+]
+Add = Annotated[
+    bool, typer.Option("--add", help="Add to the published results: what they have and --root lacks stays.")
+]
+
+RUNS = Path("runs")
+
+
+def run(
+    recipe: RecipePath,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    device: Device = "cpu",
+    until: Until = None,
+    root: Root = RUNS,
+) -> None:
+    """Run all stages of a recipe; run it again to go on from where it stopped."""
+    from astra_data.experiments.run import run as run_recipe
+
+    with resumable():
+        folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
+        typer.echo(f"finished: {folder}")
+
+
+def check(recipes: RecipePaths, root: Root = RUNS) -> None:
+    """Check recipes without running them, and list what is finished and what is to do."""
+    from astra_data.experiments.run import check as check_recipe
+    from astra_data.studies.run import is_gap_recipe, load_gap_recipe
+
+    faults: list[str] = []
+    for recipe in recipes:
+        try:
+            if is_gap_recipe(recipe):
+                load_gap_recipe(recipe)
+                typer.echo(f"{recipe}: for `astra-data gap`, without faults")
+                continue
+            finished = check_recipe(recipe, root=root)
+        except AstraDataError as error:
+            faults.append(str(error))
+            continue
+        typer.echo(f"{recipe}: {sum(finished.values())} of {len(finished)} items are finished")
+        for key, is_finished in finished.items():
+            typer.echo(f"  {'finished' if is_finished else 'to do   '}  {key}")
+    if faults:
+        raise AstraDataError("\n".join(faults))
+
+
+def ground(
+    recipe: RecipePath,
+    method: Method = None,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    device: Device = "cpu",
+    root: Root = RUNS,
+) -> None:
+    """Learn to correct the abstract simulator from the pairs."""
+    run_stage(recipe, "ground", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+
+
+def train(
+    recipe: RecipePath,
+    method: Method = None,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    device: Device = "cpu",
+    root: Root = RUNS,
+) -> None:
+    """Train policies in the abstract simulator, grounded where the method grounds it."""
+    run_stage(recipe, "train", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+
+
+def align(
+    recipe: RecipePath,
+    method: Method = None,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    device: Device = "cpu",
+    root: Root = RUNS,
+) -> None:
+    """Learn the encoder of target histories that agrees with the simulator's."""
+    run_stage(recipe, "align", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+
+
+def evaluate(
+    recipe: RecipePath,
+    method: Method = None,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
+) -> None:
+    """Run the policies in the target environment."""
+    run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
+
+
+def report(
+    recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, add: Add = False, root: Root = RUNS
+) -> None:
+    """Write the recipe's tables and figures."""
+    run_stage(recipe, "report", seeds=seeds or (), publish=publish, add=add, root=root)
+
+
+def run_stage(
+    recipe: Path,
+    stage: str,
+    *,
+    root: Path,
+    method: str | None = None,
+    seeds: Sequence[int] = (),
+    jobs: int | None = None,
+    device: str = "cpu",
+    publish: bool = False,
+    add: bool = False,
+) -> None:
+    """Run one stage of a recipe, and say where its artefacts are."""
+    from astra_data.experiments.run import run_stage as run
+
+    with resumable():
+        folder = run(
+            recipe,
+            stage,
+            method=method,
+            seeds=seeds,
+            root=root,
+            jobs=jobs,
+            device=device,
+            publish=publish,
+            add=add,
+        )
+        typer.echo(f"finished: {folder}")
+
+
+def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
+    """Refuse `options` that are given, since a recipe says them itself.
+
+    Raises:
+        BadInputError: one is given.
+    """
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
+        raise BadInputError(
+            f"{stage}: a recipe says this itself, in [{table or stage}]: leave out {', '.join(given)}"
+        )
+
+
+@contextmanager
+def resumable(how: str = "run the same command again to go on from here") -> Iterator[None]:
+    """At Ctrl-C, say how to go on, and leave with exit code 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"stopped: {how}", err=True)
+        raise typer.Exit(130) from None

@@ -1,0 +1,80 @@
+"""`astra-data card`, `push` and `pull`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName, Out
+
+NotesPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"
+    ),
+]
+
+
+def card(
+    dataset: DatasetName,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The Markdown file; a figure goes beside it.", show_default="<name>.md here"),
+    ] = None,
+    notes: NotesPath = None,
+) -> None:
+    """Write a dataset's card: what it holds, where it comes from, how to load it."""
+    from astra_data.core.config import load_recipe
+    from astra_data.dataset.versions import open_dataset
+    from astra_data.exchange.sharing.card import write_card
+    from astra_data.exchange.sharing.notes import Notes
+
+    opened = open_dataset(dataset)
+    written = load_recipe(notes, Notes) if notes else Notes()
+    for path in write_card(opened, out or Path(f"{opened.description['name']}.md"), written):
+        typer.echo(f"written: {path}")
+
+
+def push(
+    dataset: DatasetName,
+    url: Annotated[
+        str,
+        typer.Argument(
+            metavar="URL",
+            help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared",
+            show_default=False,
+        ),
+    ],
+    notes: NotesPath = None,
+    private: Annotated[
+        bool, typer.Option("--private", help="Let nobody else see a repository that is made on the Hub.")
+    ] = False,
+) -> None:
+    """Share a version of a dataset, with its card; a version that is there never changes."""
+    from astra_data.exchange.sharing.push import push as send
+    from astra_data.experiments.display import shown
+
+    with shown("push") as progress:
+        source = send(dataset, url, notes=notes, private=private, progress=progress)
+    typer.echo(f"shared: {source}")
+
+
+def pull(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="user/name on the Hugging Face Hub, or URL or path of the dataset's folder.",
+            show_default=False,
+        ),
+    ],
+    out: Out = None,
+    version: Annotated[str | None, typer.Option(help="Such as 1.2.0.", show_default="the newest")] = None,
+) -> None:
+    """Fetch a shared dataset and verify it; run it again to go on from where it stopped."""
+    from astra_data.exchange.sharing.pull import pull as fetch
+    from astra_data.experiments.display import shown
+
+    with shown("pull") as progress:
+        dataset = fetch(source, out=out, version=version, progress=progress)
+    typer.echo(f"{dataset.reference}: {dataset.root}")

@@ -1,0 +1,71 @@
+"""The command that repeats a recipe's rows over seeds and sizes."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.recipes import RUNS, Device, Jobs, RecipePath, Root, Seeds, resumable
+from astra_data.core.errors import BadInputError
+
+
+class Engine(StrEnum):
+    """What runs the items."""
+
+    processes = "processes"
+    ray = "ray"
+
+
+def sweep(
+    recipe: RecipePath,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option("--method", help="Only this row of the recipe; may be repeated.", show_default=False),
+    ] = None,
+    seeds: Seeds = None,
+    percents: Annotated[
+        list[int] | None,
+        typer.Option("--percent", help="Only this size; may be repeated.", show_default=False),
+    ] = None,
+    unpublished: Annotated[
+        bool, typer.Option("--unpublished", help="Only the points that results/ beside the recipe lacks.")
+    ] = False,
+    jobs: Jobs = None,
+    device: Device = "cpu",
+    root: Root = RUNS,
+    engine: Annotated[
+        Engine, typer.Option(help="Processes of this machine, or tasks of a Ray cluster.")
+    ] = Engine.processes,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a Ray cluster whose machines share this folder and installation.",
+            show_default="one is started here",
+        ),
+    ] = None,
+    trackio: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PROJECT", help="Log each finished point to this project of trackio.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Run a recipe on every seed and size, with a table of its points; run it again to go on."""
+    if address is not None and engine is not Engine.ray:
+        raise BadInputError("sweep: --address is for --engine ray")
+    from astra_data.experiments.sweep import sweep as sweep_recipe
+
+    with resumable():
+        folder = sweep_recipe(
+            recipe,
+            methods=methods or (),
+            seeds=seeds or (),
+            percents=percents or (),
+            unpublished=unpublished,
+            root=root,
+            jobs=jobs,
+            device=device,
+            cluster=(address or "local") if engine is Engine.ray else None,
+            trackio=trackio,
+        )
+        typer.echo(f"finished: {folder} (points: {folder / 'sweep.csv'})")

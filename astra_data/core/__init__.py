@@ -1,0 +1,1 @@
+"""What every room uses: no robot and no data is known here."""

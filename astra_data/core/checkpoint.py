@@ -1,0 +1,245 @@
+"""Weights and training states on disk: safetensors and JSON, whole or not at all, nothing unpickled."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+
+type Nested = (
+    Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
+)
+"""What a training state is made of, such as an optimizer's `state_dict()`."""
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+    """Write `tensors` and `metadata` (JSON values) to `path`; a file already there is replaced at once.
+
+    Raises:
+        BadInputError: there are no tensors.
+    """
+    if not tensors:
+        raise BadInputError(f"{path}: expected at least one tensor to save")
+    partial = path.with_name(f".{path.name}.partial")
+    # safetensors refuses tensors that share memory, such as tied weights or views.
+    own = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
+    data = save(own, {key: json.dumps(value) for key, value in metadata.items()})
+    partial.write_bytes(_with_sorted_metadata(data))
+    os.replace(partial, path)
+
+
+def _with_sorted_metadata(data: bytes) -> bytes:
+    """Sort the metadata in a safetensors file's header, so that the same content gives the same bytes."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:start])
+    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[start:]
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read the tensors (on the CPU) and the metadata that `save_tensors` wrote.
+
+    Raises:
+        BadInputError: the file is missing, damaged, or not from `save_tensors`.
+    """
+    if not path.is_file():
+        raise BadInputError(f"{path} does not exist: expected a safetensors file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+    except SafetensorError as error:
+        raise BadInputError(f"{path} is not a whole safetensors file: {error}") from None
+    except json.JSONDecodeError:
+        raise BadInputError(f"{path} was not written by astra-data: its metadata is not JSON") from None
+    return tensors, metadata
+
+
+@contextmanager
+def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Yield the state in `checkpoint`, as `flatten` took it, and the metadata; the block goes on from them.
+
+    Raises:
+        BadInputError: it cannot be read, or the block does not find in it what it needs, as in one from an
+            older version.
+    """
+    try:
+        tensors, metadata = load_tensors(checkpoint)
+    except BadInputError as error:
+        raise BadInputError(f"{error}: remove {checkpoint.parent}") from None
+    try:
+        yield unflatten(tensors), metadata
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise BadInputError(
+            f"{checkpoint}: expected what this version began, found something else ({error}): "
+            f"remove {checkpoint.parent}"
+        ) from error
+
+
+@contextmanager
+def understood(
+    path: Path, what: str, kinds: Collection[str], device: str
+) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
+    """Yield the tensors (on `device`) and the metadata of `path`, from which the block builds `what`.
+
+    Args:
+        path: written by `save_tensors`.
+        what: for messages, such as "a policy".
+        kinds: what the metadata's "kind" may be.
+        device: torch device.
+
+    Raises:
+        BadInputError: the file cannot be read, is of another kind, or the block does not find in it what it
+            needs, as in one from an older version.
+    """
+    tensors, metadata = load_tensors(path)
+    kind = metadata.get("kind")
+    if kind not in kinds:
+        found = "a file without a kind" if kind is None else f"kind {kind}"
+        raise BadInputError(
+            f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again"
+        )
+    moved = {name: tensor.to(device) for name, tensor in tensors.items()}
+    try:
+        yield moved, metadata
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        found = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise BadInputError(
+            f"{path}: expected {what} as this version writes it, found {found}: run that stage again"
+        ) from error
+
+
+@contextmanager
+def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
+    """Yield a working folder that becomes `out` when the block succeeds.
+
+    After a failure the working folder, `.<name>.partial` beside `out`, stays: the next call yields it again
+    with all that it holds, so that a training can go on from its last checkpoint. What replaces an older
+    `out` begins empty instead; the older one waits as `.<name>.old` until the new one is in its place.
+
+    Args:
+        out: the finished folder.
+        replace: whether an `out` that is already there is replaced.
+        config: what it is made with, written to `config.json`; what was begun otherwise is refused.
+
+    Raises:
+        BadInputError: `out` is already there and is not to be replaced, or was begun otherwise.
+    """
+    partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
+    if old.exists() and not out.exists():  # a kill came between the two renames below
+        os.replace(old, out)
+    if out.exists() and not replace:
+        raise BadInputError(f"{out} is finished already: remove it to make it anew")
+    if replace:
+        _remove(partial, old)
+    partial.mkdir(parents=True, exist_ok=True)
+    if config is not None:
+        told = partial / "config.json"
+        is_begun = any(partial.iterdir())
+        if is_begun and not (told.exists() and told.read_text() == config):
+            raise BadInputError(
+                f"{partial} was begun with other settings, see its config.json if it has one: remove it"
+            )
+        told.write_text(config)
+    yield partial
+    if out.exists():
+        os.replace(out, old)
+    os.replace(partial, out)
+    _remove(old)
+
+
+def _remove(*folders: Path) -> None:
+    for folder in folders:
+        if folder.exists():
+            shutil.rmtree(folder)
+
+
+def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:
+    """Turn nested containers of tensors and numbers into flat, named tensors; `unflatten` is the inverse.
+
+    A path's parts say what held them, so that every type comes back: `key`, `#3` (an int key), `[0]` (in a
+    list), `(0)` (in a tuple). `=` ends the path of a number; `=none`, `={}`, `=[]` and `=()` those of what
+    is empty.
+
+    Raises:
+        BadInputError: a key has other characters than letters, digits, `_`, `.` and `-`, or a value is
+            of another type.
+    """
+    return dict(_leaves(nested, "")) if nested else {}
+
+
+def unflatten(flat: Mapping[str, Tensor]) -> dict[Any, Any]:
+    """Turn what `flatten` returned back into nested containers."""
+    tree: dict[str, Any] = {}
+    for path, tensor in flat.items():
+        *parents, last = path.split("/")
+        branch = tree
+        for part in parents:
+            branch = branch.setdefault(part, {})
+        name, number, kind = last.partition("=")
+        branch[name] = _EMPTY[kind]() if kind else tensor.item() if number else tensor
+    return {_key(part): _container(value) for part, value in tree.items()}
+
+
+_EMPTY: dict[str, Callable[[], Any]] = {"none": lambda: None, "{}": dict, "[]": list, "()": tuple}
+
+
+def _leaves(value: Nested, path: str) -> Iterator[tuple[str, Tensor]]:
+    prefix = f"{path}/" if path else ""
+    match value:
+        case Tensor():
+            yield path, value
+        case bool():
+            yield f"{path}=", torch.tensor(value)
+        case int():
+            yield f"{path}=", torch.tensor(value, dtype=torch.int64)
+        case float():
+            yield f"{path}=", torch.tensor(value, dtype=torch.float64)
+        case None:
+            yield f"{path}=none", torch.empty(0)
+        case Mapping() | list() | tuple() if not value:
+            brackets = "{}" if isinstance(value, Mapping) else "[]" if isinstance(value, list) else "()"
+            yield f"{path}={brackets}", torch.empty(0)
+        case Mapping():
+            for key, item in value.items():
+                yield from _leaves(item, prefix + _part(key, path))
+        case list() | tuple():
+            left, right = "[]" if isinstance(value, list) else "()"
+            for index, item in enumerate(value):
+                yield from _leaves(item, f"{prefix}{left}{index}{right}")
+        case _:
+            raise BadInputError(f"{path}: expected tensors and numbers, got {type(value).__name__}")
+
+
+def _part(key: object, path: str) -> str:
+    if type(key) is int:
+        return f"#{key}"
+    if isinstance(key, str) and re.fullmatch(r"[\w.-]+", key):
+        return key
+    raise BadInputError(f"{path or 'top'}: expected keys of letters, digits, '_', '.' and '-', got {key!r}")
+
+
+def _key(part: str) -> str | int:
+    return int(part[1:]) if part.startswith("#") else part
+
+
+def _container(value: Any) -> Any:  # noqa: ANN401 - any nested value
+    if not isinstance(value, dict) or not value:
+        return value
+    first = next(iter(value))
+    if first[0] not in "[(":
+        return {_key(part): _container(item) for part, item in value.items()}
+    items = [_container(value[part]) for part in sorted(value, key=lambda part: int(part[1:-1]))]
+    return items if first[0] == "[" else tuple(items)

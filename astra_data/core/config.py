@@ -1,0 +1,206 @@
+"""Recipes: TOML files read into strict, frozen models, with every fault of a file told at once."""
+
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, Tag, ValidationError
+from pydantic_core import ErrorDetails
+
+from astra_data.core.errors import RecipeError
+
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Number = Annotated[int, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+_UNNAMED = ""
+
+
+def choice(name: str) -> str:
+    """Return the tag of a model among those that a table may be; messages leave it out of a key's name."""
+    return f"<{name}>"
+
+
+def _is_choice(part: int | str) -> bool:
+    return str(part).startswith("<")
+
+
+class Config(BaseModel):
+    """Settings of one part: frozen, without unknown keys and without silent conversions.
+
+    An int is taken where a float is expected; nothing else is converted. Each field is described by the
+    string under it.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+def as_json(**told: Config | str | int | None) -> str:
+    """Return settings, and what else is told, by their names; of a part that has none, null."""
+    plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in told.items()}
+    return json.dumps(plain, indent=1)
+
+
+def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:
+    """Read the recipe at `path` into `model`; TOML arrays become tuples.
+
+    Raises:
+        RecipeError: the file is missing or not TOML, or `model` refuses it; one message holds every fault.
+    """
+    return validated(load_tables(path), model, str(path))
+
+
+def load_tables(path: Path) -> dict[str, Any]:
+    """Read the TOML file at `path` as it is.
+
+    Raises:
+        RecipeError: the file is missing or not TOML.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        nearby = [str(file) for file in sorted(path.parent.glob("*.toml"))]
+        raise RecipeError(f"{path} does not exist{did_you_mean(str(path), nearby)}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError(f"{path} cannot be read as a text file: {error}") from None
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RecipeError(_syntax_fault(path, text, str(error))) from None
+
+
+def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: str) -> M:
+    """Read `tables`, which come from `origin`, into `model`; lists become tuples.
+
+    Raises:
+        RecipeError: `model` refuses them; one message holds every fault.
+    """
+    try:
+        return model.model_validate(_with_tuples(dict(tables)))
+    except ValidationError as error:
+        faults = [_fault(details, model) for details in error.errors(include_url=False)]
+    if len(faults) == 1:
+        raise RecipeError(f"{origin}: {faults[0]}")
+    raise RecipeError("\n  ".join([f"{origin} has {len(faults)} faults:", *faults]))
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a clause that names the closest of `known`, or lists them all when none is close."""
+    known = list(known)
+    close = get_close_matches(name, known, n=1)
+    if close:
+        return f": did you mean '{close[0]}'?"
+    return f"; known: {', '.join(known)}" if known else ""
+
+
+_EXPECTED = {
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "model_type": "a table",
+    "string_type": "a string in quotes",
+    "tuple_type": "an array",
+}
+
+
+def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
+    location = error["loc"]
+    key = ".".join(str(part) for part in location if not _is_choice(part)) or "recipe"
+    kind, message = error["type"], error["msg"]
+    if kind == "extra_forbidden":
+        hint = _choice_hint(location, model) or _key_hint(
+            str(location[-1]), _section(model, location[:-1]), model
+        )
+        return f"{key}: unknown key{hint}"
+    if kind == "union_tag_invalid":
+        told = error["ctx"]
+        known, got = (told[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
+        choices = known.replace(", ", " or ")
+        return f"{key}.{told['discriminator'].strip('()_')}: expected {choices}, got '{got}'"
+    if kind == "missing":
+        return f"{key}: expected a value, but the key is missing"
+    if kind == "value_error":
+        return f"{key}: {message.removeprefix('Value error, ')}"
+    expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
+    if expected == message:
+        return f"{key}: {message[0].lower()}{message[1:]}"
+    return f"{key}: expected {expected}, got {_shortened(error['input'])}"
+
+
+def _choice_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    """Return a clause that names the other choice of a table that has the key at `location`, if one does."""
+    if len(location) < 2 or not _is_choice(location[-2]):
+        return ""
+    parent = _section(model, location[:-3])
+    field = parent.model_fields.get(str(location[-3])) if parent else None
+    for name, other in _nested_models(field.annotation if field else None).items():
+        if location[-1] in other.model_fields:
+            return f": '{name.strip('<>')}' has it, not '{str(location[-2]).strip('<>')}'"
+    return ""
+
+
+def _key_hint(key: str, section: type[BaseModel] | None, model: type[BaseModel]) -> str:
+    fields = list(section.model_fields) if section else []
+    if get_close_matches(key, fields):
+        return did_you_mean(key, fields)
+    elsewhere = {dotted.rpartition(".")[2]: dotted for dotted in _dotted_keys(model)}
+    close = get_close_matches(key, elsewhere, n=1, cutoff=0.8)
+    return f": did you mean '{elsewhere[close[0]]}'?" if close else did_you_mean(key, fields)
+
+
+def _section(model: type[BaseModel], location: Iterable[int | str]) -> type[BaseModel] | None:
+    """Follow `location` through the nested models; None where it leaves them."""
+    section: type[BaseModel] | None = model
+    choices: dict[str, type[BaseModel]] = {}
+    for part in location:
+        if part not in choices:
+            field = section.model_fields.get(str(part)) if section else None
+            choices = _nested_models(field.annotation) if field else {}
+            part = _UNNAMED
+        section = choices.get(str(part))
+    return section
+
+
+def _nested_models(annotation: Any) -> dict[str, type[BaseModel]]:  # noqa: ANN401 - an annotation is any object
+    """Return the models that `annotation` allows, by the names of the choices where there are several."""
+    found: dict[str, type[BaseModel]] = {}
+    for candidate in (annotation, *get_args(annotation)):
+        kind, *told = get_args(candidate) if get_origin(candidate) is Annotated else (candidate,)
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            found[next((mark.tag for mark in told if isinstance(mark, Tag)), _UNNAMED)] = kind
+    return found
+
+
+def _dotted_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        yield prefix + name
+        for nested in _nested_models(field.annotation).values():
+            yield from _dotted_keys(nested, f"{prefix}{name}.")
+
+
+def _syntax_fault(path: Path, text: str, message: str) -> str:
+    place = re.search(r" \(at line (\d+).*\)$| \(at end of document\)$", message)
+    line = place[1] if place and place[1] else text.count("\n") + 1
+    return f"{path}, line {line}: not valid TOML: {message[: place.start()] if place else message}"
+
+
+def _with_tuples(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _with_tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_with_tuples(item) for item in value)
+    return value
+
+
+def _shortened(value: object, limit: int = 60) -> str:
+    text = repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= limit else f"{text[:limit]}…"

@@ -1,0 +1,83 @@
+"""Where an artefact comes from: commit, package versions and machine."""
+
+import os
+import platform
+import subprocess
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.cores import cores
+
+ROOT = Path(__file__).parents[2]
+CODE = ("astra_data", "pyproject.toml", "uv.lock")
+"""What makes a checkout differ from its commit; notes and recipes do not."""
+
+PACKAGES = (
+    *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
+    *("numpy", "rliable", "scipy", "torch", "torchrl"),
+)
+"""Packages whose versions can move a result."""
+
+
+@cache
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of `PACKAGES`, where installed; asked once."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+@cache
+def git_commit() -> str | None:
+    """Return the commit of the checkout that this process runs from, with "-dirty" if its code was changed.
+
+    Asked once: what is committed later is not what this process loaded.
+    """
+    if not (ROOT / ".git").exists():
+        return None
+    try:
+        head = _git("rev-parse", "--verify", "HEAD")
+        return f"{head}-dirty" if _git("status", "--porcelain", "--", *CODE) else head
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(ROOT), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def origin(device: str = "cpu") -> dict[str, Any]:
+    """Return what every artefact says of its making; ask when a stage begins."""
+    return {"git_commit": git_commit(), "packages": package_versions(), "machine": machine(device)}
+
+
+def machine(device: str = "cpu") -> dict[str, Any]:
+    """Return the processor, its cores and the memory of this machine, and the GPU if `device` is one."""
+    return {
+        "cpu": _cpu_name(),
+        "cores": cores(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": _gpu_name(device) if device.startswith("cuda") else None,
+    }
+
+
+def _cpu_name() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _gpu_name(device: str) -> str:
+    import torch  # seconds, which reading a dataset can do without
+
+    return torch.cuda.get_device_name(device)

@@ -1,0 +1,70 @@
+"""Exact statistics in float64, with LeRobot's names and shapes."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.format import QUANTILES, STATISTICS, STORED_STATISTICS
+
+BLOCK_VALUES = 2**26
+"""Values that are held in memory at once: 256 MiB of float32."""
+
+
+def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return `STATISTICS` (9, size) of `rows` (size, T), which it sorts; quantiles are linear in between."""
+    # Each index has a row of its own: sums are then pairwise and sorting is fast.
+    mean = rows.mean(axis=1)
+    centred = rows - mean[:, None]
+    np.square(centred, out=centred)
+    std = np.sqrt(centred.mean(axis=1))
+    rows.sort(axis=1)
+    position = np.array(QUANTILES) * (rows.shape[1] - 1)
+    below = np.floor(position).astype(np.intp)
+    lower, upper = rows[:, below], rows[:, np.ceil(position).astype(np.intp)]
+    quantiles = lower + (upper - lower) * (position - below)
+    return np.vstack([rows[:, 0], rows[:, -1], mean, std, quantiles.T])
+
+
+def episode_statistics(columns: Iterable[Array]) -> NDArray[np.float64]:
+    """Return `STATISTICS` (9, sum of sizes) of `columns` (T,) or (T, size), side by side."""
+    values = [column if column.ndim > 1 else column[:, None] for column in columns]
+    rows = np.empty((sum(column.shape[1] for column in values), len(values[0])))
+    np.concatenate([column.T for column in values], out=rows)
+    return statistics(rows)
+
+
+def global_statistics(
+    columns: list[Column], frames: int, blocks: Callable[[list[str]], Iterator[dict[str, Array]]]
+) -> dict[str, dict[str, list[Any]]]:
+    """Return meta/stats.json over all `frames`.
+
+    Quantiles are exact, so at least one index is in memory as a whole. Above `BLOCK_VALUES` frames memory
+    grows with them: the index and two float64 copies of it are 20 bytes per frame of float32 (2 GB at 100
+    million frames), however many columns there are.
+
+    Args:
+        columns: all stored columns.
+        frames: number of rows.
+        blocks: yields the values (n,) or (n, size) of the named columns from the first row to the last.
+    """
+    indices = [(column, index) for column in columns for index in range(column.size)]
+    parts: dict[str, list[NDArray[np.float64]]] = {column.name: [] for column in columns}
+    at_once = max(1, BLOCK_VALUES // frames)
+    for first in range(0, len(indices), at_once):
+        chosen = indices[first : first + at_once]
+        rows = [np.empty(frames, column.dtype) for column, _ in chosen]
+        end = 0
+        for block in blocks(list(dict.fromkeys(column.name for column, _ in chosen))):
+            begin, end = end, end + len(next(iter(block.values())))
+            for row, (column, index) in zip(rows, chosen, strict=True):
+                row[begin:end] = block[column.name].reshape(end - begin, -1)[:, index]
+        for row, (column, _) in zip(rows, chosen, strict=True):
+            parts[column.name].append(statistics(row[None].astype(np.float64)))
+    stats: dict[str, dict[str, list[Any]]] = {}
+    for name, part in parts.items():
+        named = dict(zip(STATISTICS, np.concatenate(part, axis=1).tolist(), strict=True))
+        stats[name] = {key: named.get(key, [frames]) for key in STORED_STATISTICS}
+    return stats

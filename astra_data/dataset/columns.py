@@ -1,0 +1,283 @@
+"""Names, types and meaning of every dataset column, and the episode that carries them.
+
+Dimension letters, used in every docstring of the toolkit:
+
+    B batch   T steps   S target state   X abstract state   A action   Z latent
+
+A column with one value per step has shape (T,), all others (T, size): never (T, 1), never more dimensions.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import BadInputError
+
+STATE = "observation.state"
+"""(T, S) float32: the full target state s_t."""
+GOAL = "observation.environment_state"
+"""(T, G) float32: the goal, where a task has one; LeRobot's own policies need it to train."""
+ACTION = "action"
+"""(T, A) float32: a_t, as given to both worlds."""
+NEXT_STATE = "next.observation.state"
+"""(T, S) float32: s_{t+1}, explicit, so that nothing has to be shifted."""
+REWARD = "next.reward"
+"""(T,) float32: the target reward r_t."""
+TERMINATED = "next.terminated"
+"""(T,) bool: the task ended, no value beyond it; learners bootstrap unless this is set."""
+TRUNCATED = "next.truncated"
+"""(T,) bool: time ran out."""
+DONE = "next.done"
+"""(T,) bool: terminated or truncated."""
+SUCCESS = "next.success"
+"""(T,) bool: the goal is reached in s_{t+1}."""
+ABSTRACT_STATE = "abstract.state"
+"""(T, X) float32: the abstract state of s_t."""
+ABSTRACT_NEXT_STATE = "abstract.next_state"
+"""(T, X) float32: the abstract state of s_{t+1}."""
+ABSTRACT_SIMULATED_NEXT_STATE = "abstract.simulated_next_state"
+"""(T, X) float32: where the abstract simulator lands from the abstract state of s_t under a_t."""
+
+EPISODE_UID = "episode_uid"
+"""(T,) int64: names the episode for good, through every later edit; the writer fills it in."""
+TIMESTAMP = "timestamp"
+FRAME_INDEX = "frame_index"
+EPISODE_INDEX = "episode_index"
+INDEX = "index"
+TASK_INDEX = "task_index"
+RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)
+"""Columns that the writer fills in; all but the first are LeRobot's own."""
+
+DTYPES = ("float32", "int64", "bool")
+ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
+"""What a change of the planar frame does to an index, see `Column.astra`; and to how many at once."""
+
+Array = NDArray[Any]
+Scalar = float | int | bool | str
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a dataset.
+
+    Attributes:
+        name: on disk. LeRobot turns names that begin with "observation" or "action" into policy inputs.
+        dtype: one of `DTYPES`.
+        size: values per step.
+        names: a name for each of them.
+        meaning: one sentence.
+        astra: "unit", "frame", "role" and "mirror", each a list with one word per index. Roles are how a
+            rotation and shift of the planar frame act: "position" and "vector" come as consecutive (x, y)
+            pairs, "heading" is an angle in rad, "quaternion" four consecutive values (w, x, y, z) that turn
+            from the body's frame to the world's, "invariant" is left alone. What is seen from the body is
+            therefore invariant, also its angular rates. A mirror image of the robot follows from the roles
+            too, but for its invariant values: "mirror" names the value that each becomes, "-hip_2" with its
+            sign changed, and is "" elsewhere.
+    """
+
+    name: str
+    dtype: str = "float32"
+    size: int = 1
+    names: tuple[str, ...] | None = None
+    meaning: str = ""
+    astra: Mapping[str, list[str]] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a column that contradicts itself, listing every fault."""
+        faults = []
+        if not self.name or "/" in self.name:
+            faults.append("the name must not be empty or contain '/'")
+        if self.dtype not in DTYPES:
+            faults.append(f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}")
+        if self.size < 1:
+            faults.append(f"size {self.size} is less than 1")
+        if self.names is not None and len(self.names) != self.size:
+            faults.append(f"{len(self.names)} names for {self.size} values")
+        for key, words in (self.astra or {}).items():
+            if key not in ("unit", "frame", "role", "mirror"):
+                faults.append(f"astra has {key!r}, expected unit, frame, role, mirror")
+            elif len(words) != self.size:
+                faults.append(f"{len(words)} words in astra's {key} for {self.size} values")
+        unknown = sorted(set((self.astra or {}).get("role", [])) - set(ROLES))
+        if unknown:
+            faults.append(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
+        if not faults:
+            faults = [*self._role_faults(), *self._mirror_faults()]
+        if faults:
+            raise BadInputError(f"Column {self.name!r}: {'; '.join(faults)}.")
+
+    @property
+    def roles(self) -> list[tuple[str, slice]]:
+        """Each role with the indices that it acts on at once, in order; empty where roles are not told."""
+        groups, index, roles = [], 0, (self.astra or {}).get("role", [])
+        while index < len(roles):
+            width = ROLES[roles[index]]
+            groups.append((roles[index], slice(index, index + width)))
+            index += width
+        return groups
+
+    @property
+    def mirror(self) -> tuple[list[int], list[int]] | None:
+        """What a mirror image does to invariant values: the index that each becomes, and its sign, +1 or -1.
+
+        All other values stay where they are. None where it is not told though there are invariant values.
+        """
+        astra = self.astra or {}
+        words = astra.get("mirror")
+        if words is None:
+            return None if "invariant" in astra.get("role", []) else ([*range(self.size)], [1] * self.size)
+        names = list(self.names or ())
+        source = [names.index(word.lstrip("-")) if word else index for index, word in enumerate(words)]
+        return source, [-1 if word.startswith("-") else 1 for word in words]
+
+    def _role_faults(self) -> list[str]:
+        words = (self.astra or {}).get("role", [])
+        return [
+            f"role {role} at index {group.start}, expected {ROLES[role]} indices of it side by side"
+            for role, group in self.roles
+            if words[group] != [role] * ROLES[role]
+        ]
+
+    def _mirror_faults(self) -> list[str]:
+        words = (self.astra or {}).get("mirror")
+        if words is None:
+            return []
+        roles, names = (self.astra or {}).get("role", []), self.names or ()
+        of = {
+            name: word for name, word, role in zip(names, words, roles, strict=False) if role == "invariant"
+        }
+        faults = [
+            f"mirror {word!r} of a {role}, expected '': its role says it"
+            for word, role in zip(words, roles, strict=False)
+            if word and role != "invariant"
+        ]
+        for name, word in of.items():
+            other, sign = word.lstrip("-"), "-" if word.startswith("-") else ""
+            if of.get(other) != sign + name:
+                faults.append(f"mirror {word!r} of {name}, expected a value whose mirror is {sign}{name}")
+        return faults if of else [*faults, "a mirror without names and roles of invariant values"]
+
+    def feature(self) -> dict[str, Any]:
+        """Return the column's entry in LeRobot's `features`."""
+        names = None if self.names is None else list(self.names)
+        entry: dict[str, Any] = {"dtype": self.dtype, "shape": [self.size], "names": names}
+        astra = {key: list(words) for key, words in (self.astra or {}).items()}
+        if self.meaning or astra:
+            entry["astra"] = ({"meaning": self.meaning} if self.meaning else {}) | astra
+        return entry
+
+    @classmethod
+    def from_feature(cls, name: str, feature: Mapping[str, Any]) -> "Column":
+        """Rebuild a column from its entry in LeRobot's `features`.
+
+        Raises:
+            BadInputError: the entry is not what was expected.
+        """
+        try:
+            astra = dict(feature.get("astra") or {})
+            meaning = astra.pop("meaning", "")
+            names = feature.get("names")
+            return cls(
+                name=name,
+                dtype=feature["dtype"],
+                size=feature["shape"][0],
+                names=None if names is None else tuple(names),
+                meaning=meaning,
+                astra=astra or None,
+            )
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise BadInputError(f"Column {name!r}: {feature!r} is no entry of features ({error}).") from error
+
+    def faults(self, values: Array) -> list[str]:
+        """List how the dtype and shape of `values` differ from what the column expects; empty if they fit."""
+        faults = []
+        if values.dtype != self.dtype:
+            faults.append(f"{self.name}: dtype {values.dtype}, expected {self.dtype}")
+        if values.shape[1:] != (() if self.size == 1 else (self.size,)):
+            expected = "(T,)" if self.size == 1 else f"(T, {self.size})"
+            faults.append(f"{self.name}: shape {values.shape}, expected {expected}")
+        return faults
+
+
+OUTCOME_COLUMNS = (
+    Column(REWARD, meaning="target reward of the step"),
+    Column(TERMINATED, "bool", meaning="the task ended: no value beyond it"),
+    Column(TRUNCATED, "bool", meaning="time ran out"),
+    Column(DONE, "bool", meaning="terminated or truncated"),
+    Column(SUCCESS, "bool", meaning="the goal is reached after the step"),
+)
+"""What every collected dataset says about the outcome of a step."""
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Episode:
+    """One episode of T steps.
+
+    Attributes:
+        uid: names the episode for good, 0 <= uid < 2^63.
+        columns: name to (T,) or (T, size) contiguous array of one of `DTYPES`; `RESERVED` names excluded.
+        metadata: facts about the whole episode (success, return, seed, source_episode, ...).
+
+    Raises:
+        BadInputError: lists every fault, with column and first frame.
+    """
+
+    uid: int
+    columns: Mapping[str, Array]
+    metadata: Mapping[str, Scalar] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse an episode with faults, listing every one."""
+        metadata = {
+            key: value.item() if isinstance(value, np.generic) else value
+            for key, value in self.metadata.items()
+        }
+        columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
+        object.__setattr__(self, "metadata", metadata)
+        object.__setattr__(self, "columns", columns)
+        faults = []
+        if type(self.uid) is not int or not 0 <= self.uid < 2**63:
+            faults.append(f"uid {self.uid!r}, expected an int in [0, 2^63)")
+        faults += [fault for name, values in self.columns.items() for fault in _column_faults(name, values)]
+        lengths = {name: len(values) for name, values in columns.items() if values.ndim}
+        if not columns:
+            faults.append("there are no columns")
+        elif len(set(lengths.values())) > 1:
+            told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            faults.append(f"columns differ in their number of steps ({told})")
+        elif 0 in lengths.values():
+            faults.append("there are no steps")
+        for key, value in metadata.items():
+            if not isinstance(value, Scalar):
+                faults.append(f"metadata {key}: {type(value).__name__}, expected float, int, bool or str")
+            elif isinstance(value, float) and not np.isfinite(value):
+                faults.append(f"metadata {key}: {value}, expected a finite number")
+        if faults:
+            raise BadInputError(f"Episode {self.uid}: {'; '.join(faults)}.")
+
+    def __len__(self) -> int:
+        """Return T."""
+        return len(next(iter(self.columns.values())))
+
+    def __repr__(self) -> str:
+        """Show shapes and dtypes instead of values."""
+        shapes = ", ".join(f"{name} {values.shape} {values.dtype}" for name, values in self.columns.items())
+        return f"Episode(uid={self.uid}, {shapes}, metadata={dict(self.metadata)})"
+
+
+def _column_faults(name: str, values: Array) -> list[str]:
+    faults = []
+    if name in RESERVED:
+        faults.append(f"{name}: is filled in by the writer, leave it out")
+    if values.dtype not in DTYPES:
+        faults.append(f"{name}: dtype {values.dtype}, expected one of {', '.join(DTYPES)}")
+    if values.ndim not in (1, 2) or values.shape[1:] in ((0,), (1,)):
+        faults.append(f"{name}: shape {values.shape}, expected (T,) or (T, size) with size > 1")
+    elif values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
+        bad = np.argwhere(~finite)
+        where = f"frame {bad[0][0]}" + (f" index {bad[0][1]}" if values.ndim == 2 else "")
+        faults.append(f"{name}: {len(bad)} values are not finite, the first in {where}")
+    return faults

@@ -1,0 +1,99 @@
+"""Where a dataset comes from, what it holds, and which episodes its subsets take."""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.provenance import git_commit, package_versions
+from astra_data.dataset.columns import Array
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""What datasets may be called."""
+
+_DEFAULTS: dict[str, Any] = {
+    "name": None,
+    "version": "1.0.0",
+    "parents": [],
+    "stage": None,
+    "config": {},
+    "seeds": {},
+    "environment": {},
+    "simulator": {},
+}
+
+
+def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what goes to meta/astra/dataset.json, all but the content hash.
+
+    Args:
+        description: "name" and "stage", and where they apply "version" (by default 1.0.0), "parents" (see
+            `Dataset.identity`), "config", "seeds", "environment" and "simulator" (ids with parameters).
+
+    Raises:
+        BadInputError: lists every key that is missing, unknown or not plain JSON.
+    """
+    full = _DEFAULTS | dict(description)
+    faults = [f"unknown key {key!r}, expected {', '.join(_DEFAULTS)}" for key in full.keys() - _DEFAULTS]
+    if not isinstance(full["name"], str) or not NAME.fullmatch(full["name"]):
+        faults.append(f"name {full['name']!r}, expected letters, digits, '.', '_' and '-'")
+    if not isinstance(full["version"], str) or not re.fullmatch(r"\d+\.\d+\.\d+", full["version"]):
+        faults.append(f"version {full['version']!r}, expected three numbers such as 1.0.0")
+    if not isinstance(full["stage"], str) or not full["stage"]:
+        faults.append(f"stage {full['stage']!r}, expected the name of the stage that writes the dataset")
+    for parent in full["parents"]:
+        if sorted(parent) != ["hash", "name", "version"]:
+            faults.append(f"parent {dict(parent)}, expected name, version and hash")
+    try:
+        full = json.loads(json.dumps(full, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        faults.append(f"expected plain JSON ({error})")
+    if faults:
+        raise BadInputError(f"Dataset description: {'; '.join(faults)}.")
+    return full | {"packages": package_versions(), "git_commit": git_commit()}
+
+
+class ContentHash:
+    """A running sha256 over the values of all columns, whatever their order and the files' encoding."""
+
+    def __init__(self) -> None:
+        """Start with no columns."""
+        self._columns: dict[str, Any] = {}
+        self._kinds: dict[str, str] = {}
+
+    def update(self, name: str, values: Array) -> None:
+        """Append `values` (n,) or (n, size), contiguous, to column `name`."""
+        if name not in self._columns:
+            self._columns[name] = hashlib.sha256()
+            self._kinds[name] = f"{values.dtype.name}{values.shape[1:]}"
+        self._columns[name].update(values.data)
+
+    def hexdigest(self) -> str:
+        """Return the hash of everything so far."""
+        total = hashlib.sha256()
+        for name in sorted(self._columns):
+            total.update(f"{name}\0{self._kinds[name]}\0".encode() + self._columns[name].digest())
+        return total.hexdigest()
+
+
+def changed_values(
+    before: Mapping[str, Any], after: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the dotted key and both values, None for none, wherever two nested descriptions differ."""
+    for key in [*before, *(key for key in after if key not in before)]:
+        old, new = before.get(key), after.get(key)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from changed_values(old, new, f"{prefix}{key}.")
+        elif old != new:
+            yield f"{prefix}{key}", old, new
+
+
+def permutation(uids: Iterable[int], seed: int) -> list[int]:
+    """Return `uids` in a random order whose prefixes are the nested subsets.
+
+    Each uid's place follows from (seed, uid) alone, so it is the same in every dataset that derives from
+    the same episodes, whichever are added or removed.
+    """
+    return sorted(uids, key=lambda uid: hashlib.sha256(f"{seed} {uid}".encode()).digest())

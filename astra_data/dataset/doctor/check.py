@@ -1,0 +1,205 @@
+"""Everything that can be wrong with a LeRobot dataset, ours or another's, in one report."""
+
+from collections.abc import Iterator, Mapping
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
+from astra_data.dataset.column_statistics import global_statistics
+from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.description import permutation
+from astra_data.dataset.doctor.check_episodes import EXACT, EpisodeChecks, is_close
+from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.format import (
+    CODEBASE_VERSION,
+    DATA_PATH,
+    DATASET_PATH,
+    DEFAULT_COLUMNS,
+    INFO_PATH,
+    METADATA_PATH,
+    POLICY_PATH,
+    STATS_PATH,
+    SUBSETS_PATH,
+    TASKS_PATH,
+)
+from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
+from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
+from astra_data.dataset.plain import (
+    MOST_FPS,
+    PlainColumn,
+    data_files,
+    episodes_files,
+    plain_columns,
+    read_object,
+    read_small_table,
+    read_statistics,
+    schema_faults,
+)
+from astra_data.dataset.reader import Dataset
+
+_META_FILES = (INFO_PATH, STATS_PATH, TASKS_PATH, DATASET_PATH, METADATA_PATH, SUBSETS_PATH, POLICY_PATH)
+
+
+def check(root: Path) -> Report:
+    """Check the dataset in folder `root`: its files, every value and, where it is ours, its origin.
+
+    Raises:
+        BadInputError: there is no folder `root`, or it holds no dataset.
+    """
+    if not (root / "meta").is_dir() and not (root / "data").is_dir():
+        raise BadInputError(f"{root}: no dataset there; expected a folder with meta/ and data/")
+    report = Report()
+    info = read_object(root / INFO_PATH)
+    if isinstance(info, str):
+        report.fault(INFO_PATH, f"{INFO_PATH} {info}: nothing else was checked")
+        return report
+    is_ours = (root / DATASET_PATH).exists()
+    if not is_ours:
+        report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset, nothing is known of its origin")
+    columns = _info_faults(info, report)
+    if columns and _files_are_readable(root, info, columns, report):
+        checks = EpisodeChecks(root, info, columns, is_ours, report)
+        try:
+            checks.run()
+            checks.totals()
+            if is_ours:
+                _global_statistics(root, columns, report)
+                _astra_faults(root, checks, report)
+        except AstraDataError as error:
+            report.fault("values", str(error))
+    if is_ours and not report.faults:
+        try:
+            Dataset.open(root)
+        except AstraDataError as error:
+            report.fault("opening", str(error))
+    return report
+
+
+def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
+    """Check meta/info.json; return the columns whose values can be checked, none if they are too few."""
+    version, fps, features = info.get("codebase_version"), info.get("fps"), info.get("features")
+    if version != CODEBASE_VERSION:
+        report.fault(INFO_PATH, f"{INFO_PATH}: the format is {version}, expected {CODEBASE_VERSION}")
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < MOST_FPS:
+        report.fault(INFO_PATH, f"{INFO_PATH}: fps is {fps!r}, expected a positive number below 2^31")
+        return []
+    if not isinstance(features, dict):
+        report.fault(INFO_PATH, f"{INFO_PATH}: features is {features!r}, expected an object")
+        return []
+    if not is_data_path(data_path := info.get("data_path")):
+        told = f"data_path is {data_path!r}, expected a path inside the folder such as {DATA_PATH}"
+        report.fault(INFO_PATH, f"{INFO_PATH}: {told}")
+        return []
+    columns, others = plain_columns(features)
+    if others:
+        report.note("features", f"not checked, for they are not rows of numbers: {', '.join(others)}")
+    for column in columns:
+        labels = features[column.name].get("names")
+        if isinstance(labels, list) and len(labels) != column.size:
+            report.fault("names", f"{column.name}: {len(labels)} names for {column.size} values")
+        if "/" in column.name:
+            report.fault("names", f"{column.name}: a column's name must not contain '/'")
+    declared = {column.name: column for column in columns}
+    for default in DEFAULT_COLUMNS:
+        found = declared.get(default.name)
+        if found is None or (found.dtype, found.size) != (default.dtype, default.size):
+            report.fault("features", f"{default.name}: expected in features as one {default.dtype} per step")
+            columns = []
+    return columns
+
+
+def _files_are_readable(
+    root: Path, info: Mapping[str, Any], columns: list[PlainColumn], report: Report
+) -> bool:
+    """Check the footers of all parquet files and the schemas of the data files."""
+    _strangers(root, report)
+    before = report.fault_count
+    for kind, files in (("data", data_files(root)), ("meta/episodes", episodes_files(root))):
+        if not files:
+            report.fault("files", f"{kind} has no parquet file")
+        for path in files:
+            name = path.relative_to(root)
+            try:
+                with pq.ParquetFile(path) as file:
+                    schema = file.schema_arrow
+            except UNREADABLE as error:
+                report.fault("files", f"{name} is truncated or no parquet file ({first_line(error)})")
+                continue
+            if kind == "data":
+                unknown = sorted(set(schema.names) - info["features"].keys())
+                faults = schema_faults(schema, columns)
+                for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:
+                    report.fault("columns", f"{name} {fault}")
+    if report.fault_count > before:
+        report.note("values", "values were not checked, because not all files could be read as declared")
+        return False
+    return True
+
+
+def _strangers(root: Path, report: Report) -> None:
+    """Tell files that LeRobot does not know; in the metadata they may be another tool's."""
+    known = {root / path for path in _META_FILES} | {*data_files(root), *episodes_files(root)}
+    for path in sorted([*(root / "data").rglob("*"), *(root / "meta").rglob("*")]):
+        if path.is_file() and path not in known:
+            tell = report.fault if path.is_relative_to(root / "data") else report.note
+            tell("files", f"{path.relative_to(root)} does not belong to it")
+
+
+def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -> None:
+    stored = read_statistics(root)
+    if isinstance(stored, str):
+        report.fault(STATS_PATH, f"{STATS_PATH} {stored}")
+        return
+    ours = [Column(column.name, column.dtype, column.size) for column in columns]
+
+    def blocks(names: list[str]) -> Iterator[dict[str, Array]]:
+        chosen = [column for column in columns if column.name in names]
+        for table in read_blocks(data_files(root), names):
+            yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in chosen}
+
+    for name, expected in global_statistics(ours, report.frames, blocks).items():
+        for key, values in expected.items():
+            found = stored.get(name, {}).get(key)
+            if not is_close(found, values, EXACT):
+                report.fault(STATS_PATH, f"{STATS_PATH}: {key} of {name} is {found}, expected {values}")
+
+
+def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
+    try:
+        description = read_description(root)
+        if (found := checks.hash.hexdigest()) != (stored := description["content_hash"]):
+            report.fault("origin", f"the content hash is {found}, expected {stored}")
+        _policy_faults(root, description.get("behavior"), report)
+    except CorruptDatasetError as error:
+        report.fault("origin", str(error))
+    table = read_small_table(root / METADATA_PATH)
+    if isinstance(table, str):
+        report.fault(METADATA_PATH, f"{METADATA_PATH} {table}")
+    else:
+        told = [(row.get("episode_uid"), row.get("length")) for row in table.to_pylist()]
+        present = zip(checks.uids, checks.lengths, strict=True)
+        for episode, (said, is_) in enumerate(zip_longest(told, present)):
+            if said != is_:
+                fault = f"{said} as uid and length of episode {episode}, expected {is_}"
+                report.fault(METADATA_PATH, f"{METADATA_PATH} has {fault}")
+    try:
+        subsets = read_subsets(root)
+        if subsets["uids"] != permutation(checks.uids, subsets["seed"]):
+            report.fault(SUBSETS_PATH, f"{SUBSETS_PATH}: the uids are not in the order of their seed")
+    except CorruptDatasetError as error:
+        report.fault(SUBSETS_PATH, str(error))
+
+
+def _policy_faults(root: Path, behavior: object, report: Report) -> None:
+    """Compare the policy that acted with what is recorded of it, if it was trained while collecting."""
+    expected = behavior.get("policy_sha256") if isinstance(behavior, dict) else None
+    if expected is None:
+        return
+    policy = root / POLICY_PATH
+    found = file_digest(policy) if policy.is_file() else "not there"
+    if found != expected:
+        report.fault("origin", f"{POLICY_PATH} is {found}, expected the sha256 {expected}")

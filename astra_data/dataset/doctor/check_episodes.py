@@ -1,0 +1,190 @@
+"""The values of every episode, against the rules and against what meta/episodes says of them."""
+
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.dataset import columns as names
+from astra_data.dataset.column_statistics import episode_statistics
+from astra_data.dataset.description import ContentHash
+from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.format import STATISTICS, STATS_PATH, TASKS_PATH
+from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.plain import (
+    PlainColumn,
+    Run,
+    data_files,
+    episode_rows,
+    flag_faults,
+    read_statistics,
+    read_tasks,
+    run_faults,
+    runs,
+)
+
+EXACT = 1e-6
+"""Relative tolerance of our own statistics."""
+ESTIMATED = 1e-3
+"""Relative tolerance of LeRobot's, which adds up in float32 and estimates quantiles and spread."""
+
+
+class EpisodeChecks:
+    """Goes through all episodes once, one in memory at a time.
+
+    Attributes:
+        hash: of the content, once `run` has been called.
+        uids: of the episodes; their numbers, where there is no such column.
+        lengths: their numbers of steps.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        info: Mapping[str, Any],
+        columns: Sequence[PlainColumn],
+        is_ours: bool,
+        report: Report,
+    ) -> None:
+        """Prepare; statistics are exact where the dataset `is_ours`, and estimates elsewhere."""
+        self.hash = ContentHash()
+        self.uids: list[int] = []
+        self.lengths: list[int] = []
+        self._root = root
+        self._info = info
+        self._columns = columns
+        self._is_ours = is_ours
+        self._report = report
+        self._tasks = self._read_tasks()
+        self._lowest: NDArray[np.float64] | None = None
+        self._highest: NDArray[np.float64] | None = None
+
+    def run(self) -> None:
+        """Check every episode.
+
+        Raises:
+            CorruptDatasetError: a file cannot be read.
+        """
+        every = (
+            run
+            for path in data_files(self._root)
+            for run in runs(path, read_blocks([path], [c.name for c in self._columns]), self._columns)
+        )
+        for number, (run, row) in enumerate(zip_longest(every, episode_rows(self._root))):
+            if run is None:
+                self._report.fault("meta/episodes", f"meta/episodes has episode {number}, the data has not")
+                continue
+            for name, fault in run_faults(run, number=number, row=self._report.frames, fps=self._info["fps"]):
+                self._report.fault(name, fault)
+            for fault in flag_faults(run, number):
+                (self._report.fault if self._is_ours else self._report.note)("flags", fault)
+            tasks = np.unique(run.columns[names.TASK_INDEX])
+            unknown = [task for task in tasks.tolist() if task not in self._tasks]
+            if unknown:
+                self._report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
+            for name, values in run.columns.items():
+                self.hash.update(name, values)
+            if row is None:
+                self._report.fault("meta/episodes", f"meta/episodes lacks episode {number}")
+            else:
+                self._check_row(number, run, row)
+            self.uids.append(int(run.columns.get(names.EPISODE_UID, [number])[0]))
+            self.lengths.append(len(run))
+            self._report.episodes += 1
+            self._report.frames += len(run)
+
+    def totals(self) -> None:
+        """Check counts, uids and, where they are estimates, the extremes in stats.json."""
+        found = {"total_episodes": self._report.episodes, "total_frames": self._report.frames}
+        for key, count in (found | {"total_tasks": len(self._tasks)}).items():
+            if self._info.get(key) != count:
+                self._report.fault("counts", f"{key} is {self._info.get(key)}, expected {count}")
+        first: dict[int, int] = {}
+        for number, uid in enumerate(self.uids):
+            if first.setdefault(uid, number) != number:
+                self._report.fault("uids", f"episodes {first[uid]} and {number} have the same uid {uid}")
+        if not self._is_ours:
+            self._check_extremes()
+
+    def _read_tasks(self) -> dict[int, str]:
+        tasks = read_tasks(self._root)
+        if isinstance(tasks, str):
+            self._report.fault("tasks", f"{TASKS_PATH} {tasks}")
+            return {}
+        return tasks
+
+    def _check_row(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
+        start = self._report.frames
+        expected: dict[str, object] = {
+            "episode_index": number,
+            "length": len(run),
+            "dataset_from_index": start,
+            "dataset_to_index": start + len(run),
+        }
+        for key, value in expected.items():
+            if row.get(key) != value:
+                told = f"meta/episodes: {key} of episode {number} is {row.get(key)}, expected {value}"
+                self._report.fault("meta/episodes", told)
+        place = {"chunk_index": row.get("data/chunk_index"), "file_index": row.get("data/file_index")}
+        known = all(isinstance(index, int) for index in place.values())
+        said = self._info["data_path"].format(**place) if known else None
+        if said != str(run.path.relative_to(self._root)):
+            told = f"meta/episodes: episode {number} is said to be in {said}, it is in {run.path.name}"
+            self._report.fault("meta/episodes", told)
+        present = {self._tasks.get(int(task)) for task in np.unique(run.columns[names.TASK_INDEX])}
+        if set(row.get("tasks") or ()) != present:
+            told = f"meta/episodes: tasks of episode {number} are {row.get('tasks')}, expected {present}"
+            self._report.fault("meta/episodes", told)
+        self._check_statistics(number, run, row)
+
+    def _check_statistics(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
+        found = episode_statistics(run.columns.values())
+        lowest, highest = found[STATISTICS.index("min")], found[STATISTICS.index("max")]
+        self._lowest = lowest if self._lowest is None else np.minimum(self._lowest, lowest)
+        self._highest = highest if self._highest is None else np.maximum(self._highest, highest)
+        kinds = STATISTICS if self._is_ours else ("min", "max", "mean")
+        first = 0
+        for column in self._columns:
+            last = first + column.size
+            for kind in kinds:
+                told = row.get(f"stats/{column.name}/{kind}")
+                self._compare(
+                    f"{kind} of {column.name} in episode {number}",
+                    told,
+                    found[STATISTICS.index(kind), first:last],
+                )
+            first = last
+
+    def _check_extremes(self) -> None:
+        stored = read_statistics(self._root)
+        if isinstance(stored, str):
+            self._report.fault("statistics", f"{STATS_PATH} {stored}")
+            return
+        first = 0
+        for column in self._columns:
+            last = first + column.size
+            for kind, values in (("min", self._lowest), ("max", self._highest)):
+                if values is not None:
+                    told = stored.get(column.name, {}).get(kind)
+                    self._compare(f"{kind} of {column.name}", told, values[first:last])
+            first = last
+
+    def _compare(self, what: str, told: object, found: NDArray[np.float64]) -> None:
+        if is_close(told, found, EXACT if self._is_ours else ESTIMATED):
+            return
+        tell = self._report.fault if self._is_ours else self._report.note
+        tell("statistics", f"statistics: {what} is {told}, expected {found.tolist()}")
+
+
+def is_close(told: object, found: object, tolerance: float) -> bool:
+    """Tell whether stored statistics equal the values `found`, relative to the largest of them."""
+    try:
+        stored, values = np.asarray(told, dtype=np.float64), np.asarray(found, dtype=np.float64)
+    except (OverflowError, TypeError, ValueError):
+        return False
+    if stored.size != values.size:
+        return False
+    return bool(np.allclose(stored.ravel(), values.ravel(), tolerance, tolerance * np.abs(values).max()))

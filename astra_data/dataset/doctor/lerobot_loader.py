@@ -1,0 +1,71 @@
+"""Does lerobot's own loader see the same? Only here does the dataset layer import lerobot."""
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from astra_data.dataset.columns import ACTION, EPISODE_INDEX, Array
+from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.plain import PlainColumn, data_files, plain_columns, runs
+
+WINDOWS = 32
+"""Windows that are compared, spread evenly over the dataset."""
+OFFSETS = np.array([-2, -1, 0, 1])
+"""Their steps, relative to the row."""
+
+
+def compare_with_lerobot(root: Path, report: Report) -> None:
+    """Open the dataset with `LeRobotDataset` and compare windows of observations and actions with the files.
+
+    Nothing is fetched and no cache is left behind; importing lerobot takes seconds and 0.8 GB.
+    """
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    import datasets.config  # noqa: PLC0415 - slow, and only after the environment is set
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415
+
+    info = json.loads((root / INFO_PATH).read_text(encoding="utf-8"))
+    columns = [c for c in plain_columns(info["features"])[0] if c.name.startswith(("observation", ACTION))]
+    deltas = {column.name: (OFFSETS / info["fps"]).tolist() for column in columns}
+    cache, usual = tempfile.TemporaryDirectory(), datasets.config.HF_DATASETS_CACHE
+    datasets.config.HF_DATASETS_CACHE = Path(cache.name)
+    try:
+        loaded = LeRobotDataset("local/dataset", root=root, delta_timestamps=deltas, video_backend="pyav")
+        if (len(loaded), loaded.num_episodes) != (report.frames, report.episodes):
+            found = f"{loaded.num_episodes} episodes, {len(loaded)} frames"
+            report.fault("lerobot", f"lerobot sees {found}, not {report.episodes}, {report.frames}")
+        for row, expected, padded in _windows(root, columns, report.frames):
+            item = loaded[row]
+            for name, values in expected.items():
+                if not np.array_equal(item[name].numpy().reshape(values.shape), values.astype(np.float32)):
+                    report.fault("lerobot", f"lerobot's window of {name} around row {row} has other values")
+                if not np.array_equal(item[f"{name}_is_pad"].numpy(), padded):
+                    report.fault(
+                        "lerobot", f"lerobot's window of {name} around row {row} is padded otherwise"
+                    )
+    except Exception as error:  # noqa: BLE001 - whatever stops lerobot is what we are here to report
+        report.fault("lerobot", f"lerobot cannot open it: {type(error).__name__}: {error}".split("\n")[0])
+    finally:
+        datasets.config.HF_DATASETS_CACHE = usual
+        cache.cleanup()
+
+
+def _windows(
+    root: Path, columns: list[PlainColumn], frames: int
+) -> Iterator[tuple[int, dict[str, Array], Array]]:
+    """Yield rows with the windows around them, clipped to their episodes, and which steps were clipped."""
+    wanted = set(np.linspace(0, frames - 1, WINDOWS).astype(int).tolist())
+    read = [*columns, *(PlainColumn(name, "int64", 1) for name in (EPISODE_INDEX, "frame_index"))]
+    first = 0
+    for path in data_files(root):
+        for run in runs(path, read_blocks([path], [column.name for column in read]), read):
+            for row in sorted(wanted & set(range(first, first + len(run)))):
+                steps = row - first + OFFSETS
+                inside = np.clip(steps, 0, len(run) - 1)
+                yield row, {c.name: run.columns[c.name][inside] for c in columns}, steps != inside
+            first += len(run)

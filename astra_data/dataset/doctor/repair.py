@@ -1,0 +1,201 @@
+"""Save what is whole of a broken LeRobot dataset, ours or another's, into a new one."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Column, Episode, Scalar
+from astra_data.dataset.doctor.salvage import whole_runs
+from astra_data.dataset.format import (
+    DATASET_PATH,
+    DEFAULT_COLUMNS,
+    INFO_PATH,
+    METADATA_PATH,
+    POLICY_PATH,
+    SUBSETS_PATH,
+    TASKS_PATH,
+)
+from astra_data.dataset.meta_files import read_description
+from astra_data.dataset.plain import (
+    MOST_FPS,
+    PlainColumn,
+    plain_columns,
+    read_object,
+    read_small_table,
+    read_tasks,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import Version, successor
+from astra_data.dataset.writer import DatasetWriter
+
+_DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
+
+
+@dataclass
+class Repaired:
+    """What `repair` saved.
+
+    Attributes:
+        episodes: number of episodes saved. frames: number of steps.
+        notes: what was lost or changed, a sentence each.
+    """
+
+    episodes: int = 0
+    frames: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
+    """Write the whole, verified episodes in `folder` to a new dataset `out`.
+
+    An episode whose values are wrong is left out; so is all that follows once it is unclear where episodes
+    begin, or a file cannot be read. Data files are read by their footers, or where a killed writer left none,
+    by their pages. Statistics and meta/episodes are made anew.
+
+    Args:
+        folder: the broken dataset; it is not touched.
+        out: folder of the new one.
+        like: the dataset that `folder` was made from by LeRobot's tools, which drop our metadata: origin and
+            the episodes' metadata are taken from it, joined by episode_uid.
+
+    Raises:
+        CorruptDatasetError: meta/info.json is gone, or there is not one whole episode.
+        BadInputError: `out` exists, or episodes cannot be joined with `like`.
+    """
+    info = read_object(folder / INFO_PATH)
+    if isinstance(info, str):
+        raise CorruptDatasetError(f"{folder}: {INFO_PATH} {info}; without it columns and fps are unknown")
+    columns, specs, fps = _declared(folder, info)
+    if like is not None and names.EPISODE_UID not in info["features"]:
+        raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {like.reference}")
+    result = Repaired(notes=_conversions(info, columns))
+    tasks = read_tasks(folder)
+    if isinstance(tasks, str):
+        result.notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")
+        tasks = {}
+    metadata = _metadata(folder, result.notes) if like is None else _facts(like.uids.tolist(), like.metadata)
+    description = _description(folder, like, result.notes)
+    unknown = 0
+    task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
+    seed = _subset_seed(folder if like is None else like.root)
+    with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
+        for uid, run in whole_runs(folder, columns, fps, result.notes):
+            values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
+            unknown += uid not in metadata
+            facts = dict(metadata.get(uid, {}))
+            if len(tasks) > 1:
+                facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
+            writer.add(Episode(uid, values, facts))
+            result.episodes += 1
+            result.frames += len(run)
+        counted = info.get("total_episodes")
+        if isinstance(counted, int) and counted > result.episodes:
+            lost = counted - result.episodes
+            result.notes.append(f"{lost} of the {counted} episodes that {INFO_PATH} counts are lost")
+        written = read_object(folder / DATASET_PATH)
+        is_all = like is None and counted == result.episodes and len(columns) == len(info["features"])
+        if is_all and not isinstance(written, str) and written.get("content_hash") != writer.content_hash:
+            result.notes.append(
+                "a value was altered after it was written, for the content hash is another; which one "
+                "cannot be told"
+            )
+        writer.made = {"repaired": result.notes}
+        writer.policy = policy if (policy := folder / POLICY_PATH).is_file() else None
+        if not result.episodes:
+            raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
+    if metadata and unknown:
+        result.notes.append(f"{unknown} episodes have no metadata: their uids are not among the known ones")
+    if len(tasks) > 1:
+        result.notes.append(
+            f"the {len(tasks)} tasks became one, the episodes' own is in their metadata 'task'"
+        )
+    return result
+
+
+def _declared(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
+    """Return the readable columns, those of them that the writer takes, and the fps, from info.json."""
+    features, fps = info.get("features"), info.get("fps")
+    columns = plain_columns(features)[0] if isinstance(features, dict) else []
+    missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
+    if missing or not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
+        raise CorruptDatasetError(
+            f"{folder}: {INFO_PATH} has fps {fps!r} and lacks the columns {', '.join(missing) or 'none'}; "
+            "expected a whole number of frames per second and all of LeRobot's own columns"
+        )
+    assert isinstance(features, dict)
+    specs = []
+    for column in columns:
+        if column.name in names.RESERVED:
+            continue
+        feature = features[column.name]
+        labels = feature.get("names")
+        fits = isinstance(labels, list) and [type(label) for label in labels] == [str] * column.size
+        kind = _DTYPES[np.dtype(column.dtype).kind]
+        known = feature | {"dtype": kind, "names": labels if fits else None}
+        specs.append(Column.from_feature(column.name, known))
+    return columns, specs, int(fps)
+
+
+def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> list[str]:
+    notes = []
+    others = sorted(info["features"].keys() - {column.name for column in columns})
+    if others:
+        notes.append(f"left out, for they are not rows of numbers: {', '.join(others)}")
+    for column in columns:
+        kind = _DTYPES[np.dtype(column.dtype).kind]
+        if column.dtype != kind:
+            notes.append(f"{column.name} was {column.dtype} and is now {kind}")
+    return notes
+
+
+def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
+    """Return the episodes' metadata by uid, empty where there is none."""
+    if not (folder / "meta/astra").is_dir():
+        return {}
+    table = read_small_table(folder / METADATA_PATH)
+    if isinstance(table, str):
+        notes.append(f"{METADATA_PATH} {table}: success, return and the like of the episodes are lost")
+        return {}
+    columns = table.to_pydict()
+    uids = columns.pop(names.EPISODE_UID, [])
+    columns.pop("length", None)
+    return _facts(uids, columns)
+
+
+def _facts(
+    uids: Sequence[int], metadata: Mapping[str, Sequence[Scalar | None]]
+) -> dict[int, dict[str, Scalar]]:
+    return {
+        uid: {key: value for key, values in metadata.items() if (value := values[row]) is not None}
+        for row, uid in enumerate(uids)
+    }
+
+
+def _description(folder: Path, like: Dataset | None, notes: list[str]) -> dict[str, Any]:
+    config = {"folder": folder.name}
+    if like is not None:
+        return successor(like, "episodes", stage="repair", config=config, out=folder)[0]
+    try:
+        old = read_description(folder)
+    except CorruptDatasetError as error:
+        if (folder / DATASET_PATH).exists():
+            notes.append(f"{error}: the origin is unknown")
+        name = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name).lstrip("-._")
+        return {"name": name or "repaired", "stage": "repair", "config": config}
+    kept = {key: old[key] for key in ("name", "seeds", "environment", "simulator")}
+    version = Version.parse(old["version"])
+    parent = {"name": old["name"], "version": old["version"], "hash": old["content_hash"]}
+    changed = {"version": str(version.next("episodes")), "parents": [parent]}
+    return {**kept, **changed, "stage": "repair", "config": config}
+
+
+def _subset_seed(folder: Path) -> int:
+    subsets = read_object(folder / SUBSETS_PATH)
+    seed = 0 if isinstance(subsets, str) else subsets.get("seed")
+    return seed if isinstance(seed, int) else 0

@@ -1,0 +1,163 @@
+"""Fields of a recording into columns."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Column
+from astra_data.exchange.mapping import FLAGS, ColumnMapping, ImportMapping
+from astra_data.exchange.recording import Block
+
+Mask = NDArray[np.bool_]
+EXACT = 2**53
+"""Below it, floats hold whole numbers exactly."""
+
+
+class Converter:
+    """Converts the blocks of one recording.
+
+    Attributes:
+        columns: what the dataset holds, with the columns that are derived; known from the first block on.
+    """
+
+    def __init__(self, mapping: ImportMapping) -> None:
+        """Convert by `mapping`."""
+        self.columns: tuple[Column, ...] = ()
+        self._mapping = mapping
+        self._converted: dict[str, Column] = {}
+
+    def convert(self, block: Block) -> tuple[dict[str, Array], Mask]:
+        """Return the columns of `block` with n rows, (n,) or (n, size), and which rows are finite, (n,).
+
+        Raises:
+            BadInputError: values are not what their columns hold, or change in size; lists every fault.
+        """
+        faults: list[str] = []
+        fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
+        if faults:
+            raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
+        finite = np.ones(len(block), bool)
+        for name in (*self._mapping.split.ends, *([self._mapping.time] if self._mapping.time else [])):
+            finite &= np.isfinite(fields[name]).all(axis=1)
+        columns = {}
+        for name, spec in self._mapping.columns.items():
+            try:
+                values = _transformed(np.concatenate([fields[f] for f in spec.fields], axis=1), spec)
+                column = self._converted.get(name) or column_of(name, spec, values.shape[1])
+                if values.shape[1] != column.size:
+                    raise BadInputError(f"{name}: {values.shape[1]} values, before there were {column.size}")
+                cast, ok = _cast(values, column)
+            except BadInputError as error:
+                faults.append(str(error))
+                continue
+            self._converted[name] = column
+            columns[name] = cast[:, 0] if column.size == 1 else cast
+            finite &= ok
+        if not faults:
+            faults += self._size_faults()
+        if faults:
+            raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
+        self.columns = self.columns or _complete(self._converted)
+        return columns, finite
+
+    def _size_faults(self) -> list[str]:
+        sizes = {name: column.size for name, column in self._converted.items()}
+        faults = []
+        if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
+            faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
+        for name in (REWARD, *FLAGS):
+            if sizes.get(name, 1) > 1:
+                faults.append(f"{name}: {sizes[name]} values, expected 1")
+        jump = self._mapping.split.jump
+        if jump and max(jump.values) >= sizes[jump.column]:
+            told = f"{jump.column} has {sizes[jump.column]} values, counted from 0"
+            faults.append(f"split.jump.values {list(jump.values)}: {told}")
+        return faults
+
+
+def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
+    """Return the column `name` with `size` values.
+
+    Raises:
+        BadInputError: lists do not have that many entries.
+    """
+    lists: dict[str, Sequence[str]] = {"unit": spec.unit, "frame": spec.frame, "role": spec.role}
+    astra = {key: list(words) * (size if len(words) == 1 else 1) for key, words in lists.items() if words}
+    dtype = spec.dtype or ("bool" if name in FLAGS else "float32")
+    return Column(name, dtype, size, spec.names or None, spec.meaning, astra or None)
+
+
+def _complete(converted: dict[str, Column]) -> tuple[Column, ...]:
+    columns = dict(converted)
+    if STATE in columns and NEXT_STATE not in columns:
+        state = columns[STATE]
+        meaning = f"{state.meaning or 'the state'}, one step later"
+        if TERMINATED in columns:
+            meaning += "; where an episode terminates, not recorded: the state itself"
+        columns[NEXT_STATE] = Column(NEXT_STATE, state.dtype, state.size, state.names, meaning, state.astra)
+    derived = (
+        Column(TERMINATED, "bool", meaning="the recording does not tell: never set"),
+        Column(TRUNCATED, "bool", meaning="the recording of the episode ends"),
+        Column(DONE, "bool", meaning="terminated or truncated"),
+    )
+    return (*columns.values(), *(column for column in derived if column.name not in columns))
+
+
+def _as_rows(name: str, values: Array, faults: list[str]) -> Array:
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        faults.append(f"field '{name}': expected numbers, got {array.dtype}")
+    elif 0 in array.shape:
+        faults.append(f"field '{name}' has no values, its shape is {array.shape}")
+    return array.reshape(len(array), -1)
+
+
+def _transformed(values: Array, spec: ColumnMapping) -> Array:
+    """Apply `take`, `scale`, `offset` and `clip` to `values` (n, width)."""
+    if spec.take:
+        if max(spec.take) >= values.shape[1]:
+            told = f"{', '.join(spec.fields)} hold {values.shape[1]} values, counted from 0"
+            raise BadInputError(f"take {list(spec.take)}: {told}")
+        values = values[:, list(spec.take)]
+    for key, numbers in (("scale", spec.scale), ("offset", spec.offset)):
+        if len(numbers) not in (0, 1, values.shape[1]):
+            raise BadInputError(f"{key} has {len(numbers)} numbers for {values.shape[1]} values")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if spec.scale:
+            values = values * np.array(spec.scale)
+        if spec.offset:
+            values = values + np.array(spec.offset)
+    if spec.clip is not None:
+        values = np.where(np.isfinite(values), np.clip(values, *spec.clip), values)
+    return values
+
+
+def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
+    """Return `values` (n, size) in the column's dtype, and which rows are finite."""
+    finite: Mask = np.asarray(np.isfinite(values).all(axis=1))
+    sound = values[finite]
+    if column.dtype == "float32":
+        if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
+            raise BadInputError(
+                f'{column.name}: integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or '
+                "an offset that makes them small"
+            )
+        with np.errstate(over="ignore"):
+            cast = np.ascontiguousarray(values, np.float32)
+        return cast, finite & np.isfinite(cast).all(axis=1)
+    if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
+        raise BadInputError(f"{column.name}: expected true and false, or 1 and 0")
+    if column.dtype == "int64" and sound.dtype.kind == "f":
+        if not (sound == np.floor(sound)).all():
+            raise BadInputError(f"{column.name}: expected whole numbers")
+        if (abs(sound.astype(float)) >= EXACT).any():
+            raise BadInputError(
+                f"{column.name}: numbers of 2^53 or more came as floats, which do not hold them exactly; "
+                "expected integers: no fractions or empty cells among them, no field of floats beside them, "
+                "no scale, offset or clip"
+            )
+    elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
+        raise BadInputError(f"{column.name}: expected whole numbers below 2^63")
+    return np.where(finite[:, None], values, 0).astype(column.dtype), finite

@@ -1,0 +1,223 @@
+"""Rows of a recording into columns, and columns into episodes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import (
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Column,
+    Scalar,
+)
+from astra_data.exchange.conversion import Converter, Mask
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Block
+
+REASONS = ("file", "source", "field", "end", "gap", "jump", "rejected")
+"""What begins an episode, the first that applies: a new file, the format's own episodes, a field that
+changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, a jump, rows that
+were rejected."""
+
+RATE_TOLERANCE = 0.1
+"""By which share the rate that the times tell may differ from fps."""
+
+Cut = tuple[dict[str, Array], dict[str, Scalar]]
+
+
+@dataclass
+class Tally:
+    """What became of the rows.
+
+    Attributes:
+        rows: how many were read.
+        rejected_rows: those with a value that is not finite.
+        rejected_first: where the first of them is.
+        split_points: where an episode ends and the next begins, by reason.
+        last_rows: last rows of episodes, dropped because nobody recorded their next state.
+        last_reward: the sum of their rewards.
+        short_rows: rows of episodes that were too short.
+    """
+
+    rows: int = 0
+    rejected_rows: int = 0
+    rejected_first: str = ""
+    split_points: dict[str, int] = field(default_factory=dict)
+    last_rows: int = 0
+    last_reward: float = 0.0
+    short_rows: int = 0
+
+
+class Cutter:
+    """Cuts the blocks that it is fed, in order, into episodes; holds one episode at a time.
+
+    Attributes:
+        tally: what became of the rows so far.
+    """
+
+    def __init__(self, mapping: ImportMapping) -> None:
+        """Cut by `mapping`."""
+        self.tally = Tally()
+        self._mapping = mapping
+        self._converter = Converter(mapping)
+        self._before: dict[str, Array] = {}
+        self._kept_before: tuple[Array, Array | None] | None = None
+        self._counters: NDArray[np.int64] = np.zeros(len(REASONS) - 1, np.int64)
+        self._pieces: list[dict[str, Array]] = []
+        self._metadata: dict[str, Scalar] = {}
+        self._seconds, self._steps = 0.0, 0
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """What the episodes hold; known from the first block on."""
+        return self._converter.columns
+
+    def feed(self, block: Block, row: int, *, is_apart: bool) -> Iterator[Cut]:
+        """Take in `block`; yield the columns and the metadata of the episodes that ended.
+
+        Args:
+            block: at least one row.
+            row: number of its first row in its file.
+            is_apart: whether it does not continue the block before.
+
+        Raises:
+            BadInputError: values are not what their columns hold, or change in size; lists every fault.
+        """
+        columns, finite = self._converter.convert(block)
+        self.tally.rows += len(block)
+        rejected = ~finite
+        if rejected.any():
+            first = row + int(np.argmax(rejected))
+            self.tally.rejected_first = self.tally.rejected_first or f"{block.origin} row {first}"
+            self.tally.rejected_rows += int(rejected.sum())
+        counters = self._count(block, columns, rejected, is_apart=is_apart)
+        if not finite.any():
+            return
+        kept = {name: values[finite] for name, values in columns.items()}
+        begins = self._begins(counters[:, finite], kept)
+        rows = row + np.flatnonzero(finite)
+        edges = [0, *np.flatnonzero(begins).tolist(), len(begins)]
+        for first, last in pairwise(edges):
+            if begins[first] and first < last:
+                yield from self.finish()
+                self._metadata = {"source": block.origin, "source_row": int(rows[first])}
+            if first < last:
+                self._pieces.append({name: values[first:last] for name, values in kept.items()})
+
+    def finish(self) -> Iterator[Cut]:
+        """Yield the episode at hand, if there is one, and begin the next."""
+        if not self._pieces:
+            return
+        episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
+        self._pieces = []
+        length = len(next(iter(episode.values())))
+        if STATE in episode and NEXT_STATE not in episode:
+            state = episode[STATE]
+            if TERMINATED in episode and episode[TERMINATED][-1]:
+                # Nobody bootstraps on what follows a terminal step, but its reward counts.
+                episode[NEXT_STATE] = np.concatenate([state[1:], state[-1:]])
+            else:
+                self.tally.last_rows += 1
+                self.tally.last_reward += float(episode[REWARD][-1]) if REWARD in episode else 0.0
+                episode = {name: values[:-1] for name, values in episode.items()} | {NEXT_STATE: state[1:]}
+                length -= 1
+        if length < self._mapping.min_steps:
+            self.tally.short_rows += length
+            return
+        terminated = episode.setdefault(TERMINATED, np.zeros(length, bool))
+        truncated = episode.get(TRUNCATED, np.zeros(length, bool)).copy()
+        truncated[-1] |= not terminated[-1]
+        yield episode | {TRUNCATED: truncated, DONE: terminated | truncated}, self._metadata
+
+    def check_rate(self) -> None:
+        """Compare fps to the rate that the times tell.
+
+        Raises:
+            BadInputError: they differ by more than `RATE_TOLERANCE`.
+        """
+        if self._steps and self._seconds > 0:
+            rate, fps = self._steps / self._seconds, self._mapping.fps
+            if abs(rate / fps - 1) > RATE_TOLERANCE:
+                raise BadInputError(
+                    f"'{self._mapping.time}' tells {rate:.4g} rows per second, fps says {fps}: "
+                    "correct fps or time_scale, or resample the recording"
+                )
+
+    def _count(
+        self, block: Block, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
+    ) -> NDArray[np.int64]:
+        """Return how often each reason but jumps has applied up to each row, (reasons, n)."""
+        split, n = self._mapping.split, len(block)
+        masks: dict[str, Mask] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
+        fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
+        now: dict[str, Array] = {f"end {name}": fields[name] for name in split.ends}
+        now |= {name: columns[name][:, None] for name in (TERMINATED, TRUNCATED) if name in columns}
+        if split.field:
+            now["field"] = fields[split.field]
+        if self._mapping.time:
+            now["gap"] = fields[self._mapping.time][:, :1].astype(np.float64) * self._mapping.time_scale
+        continues = not (is_apart or block.starts)
+        for key, values in now.items():
+            series = np.concatenate([self._before[key] if continues else values[:1], values])
+            if key == "field":
+                masks[key] = (series[:-1] != values).any(axis=1)
+            elif key == "gap":
+                times = _held(series)
+                masks[key] = self._gaps(np.diff(times[:, 0]))
+                now[key] = times[1:]
+            else:
+                masks["end"] |= (series[:-1] != 0).any(axis=1)
+        masks["file"][0], masks["source"][0] = is_apart, block.starts
+        self._before = {key: values[-1:] for key, values in now.items()}
+        if self._mapping.not_finite == "split":
+            masks["rejected"] = rejected
+        counters: NDArray[np.int64] = self._counters[:, None] + np.cumsum(list(masks.values()), axis=1)
+        self._counters = counters[:, -1]
+        return counters
+
+    def _gaps(self, steps_s: Array) -> Mask:
+        gaps: Mask = steps_s < 0
+        if self._mapping.split.gap_s is not None:
+            gaps |= steps_s > self._mapping.split.gap_s
+        regular = steps_s[~gaps & (steps_s > 0)]
+        self._seconds += float(regular.sum())
+        self._steps += len(regular)
+        return gaps
+
+    def _begins(self, counters: NDArray[np.int64], kept: dict[str, Array]) -> Mask:
+        """Return which of the kept rows begin an episode, and count the reasons."""
+        jump = self._mapping.split.jump
+        where = kept[jump.column].reshape(counters.shape[1], -1)[:, list(jump.values)] if jump else None
+        if self._kept_before is None:
+            old_counters, old_where = counters[:, :1], None if where is None else where[:1]
+        else:
+            old_counters, old_where = self._kept_before
+        changed = np.diff(np.concatenate([old_counters, counters], axis=1), axis=1) > 0
+        jumped = np.zeros(counters.shape[1], bool)
+        if jump and where is not None and old_where is not None:
+            steps = np.diff(np.concatenate([old_where, where]).astype(np.float64), axis=0)
+            jumped = np.linalg.norm(steps, axis=1) > jump.above
+        reasons = np.insert(changed, REASONS.index("jump"), jumped, axis=0)
+        begins: Mask = np.asarray(reasons.any(axis=0))
+        for reason in np.argmax(reasons[:, begins], axis=0):
+            name = REASONS[reason]
+            self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
+        begins[0] |= self._kept_before is None
+        self._kept_before = counters[:, -1:], None if where is None else where[-1:]
+        return begins
+
+
+def _held(times: Array) -> Array:
+    """Replace what is not finite in `times` (n, 1) by what was before, so that no gap hides behind it."""
+    rows = np.where(np.isfinite(times[:, 0]), np.arange(len(times)), 0)
+    held: Array = times[np.maximum.accumulate(rows)]
+    return held

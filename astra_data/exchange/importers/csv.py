@@ -1,0 +1,71 @@
+"""CSV: one row per step, a header with the fields' names; read block by block."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from pyarrow import csv
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Array
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Block, Source, row_count
+
+SUFFIXES = (".csv", ".tsv")
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows; fields are whole numbers, numbers, or true and false, and an empty cell is NaN.
+
+    Raises:
+        BadInputError: fields are missing, doubled or no numbers.
+    """
+    with source.open() as stream:
+        # As text first: what a column holds in its first block says nothing about its last.
+        reader = csv.open_csv(
+            stream,
+            parse_options=csv.ParseOptions(delimiter="\t" if str(source).endswith(".tsv") else ","),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(mapping.all_fields, pa.string()),
+                strings_can_be_null=True,
+                include_columns=_checked(source, mapping),
+            ),
+        )
+        row = 0
+        for batch in reader:
+            values: dict[str, Array] = {}
+            for field in mapping.all_fields:
+                if field in mapping.fields:
+                    values[field] = _numbers(batch.column(field), f"{source} row {row}: field '{field}'")
+                else:
+                    values[field] = np.array(batch.column(field).to_pylist(), dtype=str)
+            row += len(batch)
+            if len(batch):
+                yield Block(values, str(source))
+
+
+def _checked(source: Source, mapping: ImportMapping) -> list[str]:
+    with source.open() as stream:
+        delimiter = "\t" if str(source).endswith(".tsv") else ","
+        options = csv.ParseOptions(delimiter=delimiter)
+        header = csv.open_csv(stream, parse_options=options).schema.names
+    row_count(str(source), mapping.all_fields, dict.fromkeys(header, (0,)))
+    doubled = sorted({name for name in mapping.all_fields if header.count(name) > 1})
+    if doubled:
+        raise BadInputError(f"{source}: the header has {', '.join(doubled)} more than once")
+    return mapping.all_fields
+
+
+def _numbers(texts: pa.StringArray, where: str) -> Array:
+    whole = [] if texts.null_count else [pa.int64()]  # No integer stands for an empty cell.
+    for kind in (*whole, pa.float64(), pa.bool_()):
+        try:
+            numbers = pc.cast(texts, kind)
+        except pa.ArrowInvalid as error:
+            fault = str(error)
+            continue
+        if kind == pa.int64():
+            return np.from_dlpack(numbers)
+        return np.from_dlpack(numbers.cast(pa.float64()).fill_null(np.nan))
+    raise BadInputError(f"{where} and below: expected numbers, or true and false ({fault})")

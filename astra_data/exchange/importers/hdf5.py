@@ -1,0 +1,127 @@
+"""HDF5: one dataset per field; the layouts of D4RL and robomimic are known. Read block by block."""
+
+import json
+from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
+from typing import Any
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import NEXT_STATE, STATE, TRUNCATED
+from astra_data.exchange.layouts import D4RL, ROBOMIMIC
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, natural, row_count
+
+SUFFIXES = (".h5", ".hdf5", ".mat")
+
+MOST_COMPRESSED = 10_000
+"""No filter makes this many bytes of one; beyond, values were never written."""
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows of each episode's group, or of the file where `mapping.episodes` is left out.
+
+    Raises:
+        BadInputError: groups or fields are missing, or lie in another file.
+    """
+    h5py = optional("h5py", "hdf5")
+    with h5py.File(source.path, "r") as file:
+        for group in _groups(h5py, file, mapping.episodes, str(source)):
+            origin = f"{source}{group.name}".rstrip("/")
+            datasets = _datasets(h5py, group)
+            order = slice(None, None, -1 if mapping.transposed else 1)
+            shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
+            n = row_count(origin, mapping.all_fields, shapes)
+            used = {field: datasets[field] for field in mapping.all_fields}
+            _check_storage(used, origin)
+            for first in range(0, n, BLOCK_ROWS):
+                rows = slice(first, min(first + BLOCK_ROWS, n))
+                values = {
+                    field: dataset[..., rows].T if mapping.transposed else dataset[rows]
+                    for field, dataset in used.items()
+                }
+                yield Block(values, origin, starts=mapping.episodes is not None and first == 0)
+
+
+def layout(source: Source) -> dict[str, Any]:
+    """Return the keys of a mapping for a file in the layout of D4RL or of robomimic.
+
+    Of robomimic, the state is all of `obs` with one or two dimensions (images are left out), in the order of
+    their names; `dones` is taken for terminated, as robomimic's own learners do. It may stay set while
+    success lasts: rows after its first are episodes of one step, left out unless truncation is told too.
+
+    Raises:
+        BadInputError: it is neither.
+    """
+    h5py = optional("h5py", "hdf5")
+    with h5py.File(source.path, "r") as file:
+        fields = _datasets(h5py, file)
+        if {"observations", "actions"} <= fields.keys():
+            columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
+            return {"columns": columns}
+        demos = sorted({name.split("/")[1] for name in fields if name.startswith("data/demo_")}, key=natural)
+        if not demos:
+            raise BadInputError(
+                f"{source}: neither D4RL's layout (observations, actions) nor robomimic's (data/demo_0); "
+                "pass --mapping"
+            )
+        demo = _datasets(h5py, file[f"data/{demos[0]}"])
+        columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
+        for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
+            found = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
+            if found:
+                columns[name] = {"fields": sorted(found)}
+        keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
+        if TRUNCATED not in columns:
+            keys["min_steps"] = 2
+        env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
+        fps = env_args.get("env_kwargs", {}).get("control_freq")
+        return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
+
+
+def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
+    groups = [file]
+    if pattern is None:
+        return groups
+    for part in pattern.strip("/").split("/"):
+        groups = [
+            _linked(h5py, group, name, origin)
+            for group in groups
+            for name in sorted(group, key=natural)
+            if fnmatchcase(name, part)
+        ]
+    if not groups:
+        raise BadInputError(f"{origin}: no groups '{pattern}'; it has {', '.join(list(file)[:10])}")
+    return groups
+
+
+def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN401 - of h5py
+    """Return the group `name` of `group`, unless the name stands for what may lie in another file."""
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise BadInputError(
+            f"{origin}{group.name.rstrip('/')}/{name} is a link; copy what it names into its place"
+        )
+    return group[name]
+
+
+def _check_storage(datasets: Mapping[str, Any], origin: str) -> None:
+    faults = []
+    for field, dataset in datasets.items():
+        if dataset.external or dataset.is_virtual:
+            faults.append(f"field '{field}' lies in another file; copy it into this one")
+        elif dataset.nbytes > MOST_COMPRESSED * (dataset.id.get_storage_size() + 2**10):
+            faults.append(f"field '{field}' claims the shape {dataset.shape}, but the file does not hold it")
+    if faults:
+        raise BadInputError(f"{origin}: {'; '.join(faults)}")
+
+
+def _datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py
+    """Map the path of each dataset below `group` to it; links into other files are not followed."""
+    found: dict[str, Any] = {}
+
+    def visit(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = item
+
+    group.visititems(visit)
+    return found

@@ -1,0 +1,34 @@
+"""JSON: one object that maps each field to its rows, as the NAO's logs are.
+
+A file is read whole, since a JSON value ends where its file ends; larger ones than `LIMIT_BYTES` are refused.
+"""
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Block, Source, row_count
+
+SUFFIXES = (".json", ".log")
+LIMIT_BYTES = 2**28
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield all rows as one block.
+
+    Raises:
+        BadInputError: the file is too large or no object; fields are missing or differ in length.
+    """
+    with source.open() as stream:
+        text = stream.read(LIMIT_BYTES + 1)
+    if len(text) > LIMIT_BYTES:
+        raise BadInputError(f"{source}: expected at most {LIMIT_BYTES // 2**20} MB of JSON, split the file")
+    fields = json.loads(text)
+    if not isinstance(fields, dict):
+        raise BadInputError(f"{source}: expected an object of fields, got {type(fields).__name__}")
+    shapes = {name: (len(rows),) if isinstance(rows, list) else () for name, rows in fields.items()}
+    if row_count(str(source), mapping.all_fields, shapes):
+        yield Block({field: np.array(fields[field]) for field in mapping.all_fields}, str(source))

@@ -1,0 +1,78 @@
+"""Minari: a dataset's folder, read by Minari itself, one episode at a time.
+
+Fields are `observations`, `next_observations`, `actions`, `rewards`, `terminations`, `truncations` and
+`infos`; where a space is a dictionary or a tuple, its parts: `observations/desired_goal`, `actions/0`.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Block, Source, row_count
+
+GOAL_FIELD = "observations/desired_goal"
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield each episode as one block.
+
+    Raises:
+        BadInputError: fields are missing or differ in length.
+    """
+    for episode in _open(source.path).iterate_episodes():
+        fields = _fields(episode)
+        origin = f"{source}/episode_{episode.id}"
+        shapes = {name: values.shape for name, values in fields.items()}
+        if row_count(origin, mapping.all_fields, shapes):
+            yield Block({field: fields[field] for field in mapping.all_fields}, origin, starts=True)
+
+
+def layout(source: Source) -> dict[str, Any]:
+    """Return the keys of a mapping: the state is every part of the observation but the desired goal."""
+    fields = _fields(next(iter(_open(source.path).iterate_episodes([0]))))
+    state = [f for f in fields if f.split("/")[0] == "observations" and f != GOAL_FIELD]
+    columns = {
+        STATE: {"fields": state},
+        NEXT_STATE: {"fields": [f"next_{field}" for field in state]},
+        ACTION: {"fields": [field for field in fields if field.split("/")[0] == "actions"]},
+        REWARD: {"fields": ["rewards"]},
+        TERMINATED: {"fields": ["terminations"]},
+        TRUNCATED: {"fields": ["truncations"]},
+    }
+    return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
+
+
+def is_dataset(path: Path) -> bool:
+    """Tell whether `path` is a folder as Minari writes them."""
+    return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
+
+
+def _open(path: Path) -> Any:  # noqa: ANN401 - of minari
+    return optional("minari", "minari").MinariDataset(path / "data")
+
+
+def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
+    observations = dict(_parts("observations", episode.observations))
+    steps = {
+        **{name: values[:-1] for name, values in observations.items()},
+        **{f"next_{name}": values[1:] for name, values in observations.items()},
+        **dict(_parts("actions", episode.actions)),
+        **dict(_parts("infos", episode.infos)),
+    }
+    for name in ("rewards", "terminations", "truncations"):
+        steps[name] = np.asarray(getattr(episode, name))
+    return steps
+
+
+def _parts(name: str, value: Any) -> Iterator[tuple[str, Array]]:  # noqa: ANN401 - nested dicts and tuples
+    if isinstance(value, dict | tuple):
+        pairs = sorted(value.items()) if isinstance(value, dict) else enumerate(value)
+        for key, part in pairs:
+            yield from _parts(f"{name}/{key}", part)
+    else:
+        yield name, np.asarray(value)

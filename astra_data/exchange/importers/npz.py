@@ -1,0 +1,60 @@
+"""NPZ: one array per field, rows along the first dimension; read block by block, without pickle."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import IO, Any
+from zipfile import ZipFile
+
+import numpy as np
+from numpy.lib import format as npy
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Array
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, row_count
+
+SUFFIXES = (".npz",)
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows, read from all arrays side by side.
+
+    Raises:
+        BadInputError: fields are missing, differ in length, or hold Python objects.
+    """
+    with source.open() as stream, ZipFile(stream) as archive, ExitStack() as exits:
+        known = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        files = {
+            field: exits.enter_context(archive.open(known[field]))
+            for field in mapping.all_fields
+            if field in known
+        }
+        headers = {field: _header(file) for field, file in files.items()}
+        shapes = {field: (0,) for field in known} | {field: shape for field, (shape, _) in headers.items()}
+        n = row_count(str(source), mapping.all_fields, shapes)
+        for first in range(0, n, BLOCK_ROWS):
+            rows = min(BLOCK_ROWS, n - first)
+            values = {
+                field: _rows(files[field], (rows, *shape[1:]), dtype)
+                for field, (shape, dtype) in headers.items()
+            }
+            yield Block(values, str(source))
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    version = npy.read_magic(file)  # type: ignore[no-untyped-call]
+    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(file)  # type: ignore[no-untyped-call]
+    if dtype.hasobject:
+        raise BadInputError(f"{file.name}: holds Python objects, which are never unpickled")
+    if is_fortran and len(shape) > 1:
+        raise BadInputError(f"{file.name}: rows are not consecutive; save np.ascontiguousarray of it")
+    return shape, dtype
+
+
+def _rows(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    content = file.read(size)
+    if len(content) < size:
+        raise BadInputError(f"{file.name}: ends early, {size - len(content)} bytes are missing")
+    return np.frombuffer(content, dtype).reshape(shape)

@@ -1,0 +1,241 @@
+"""Other people's recordings into datasets."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from itertools import chain
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from astra_data.core.config import did_you_mean, load_recipe, validated
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.dataset.columns import TRUNCATED, Episode
+from astra_data.dataset.parquet import first_line
+from astra_data.dataset.versions import place
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.exchange.cutting import Cut, Cutter, Tally
+from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Block, Source, find_sources, is_archive
+
+FORMATS: Mapping[str, ModuleType] = {
+    "csv": csv,
+    "hdf5": hdf5,
+    "json": json,
+    "mcap": mcap,
+    "minari": minari,
+    "npz": npz,
+}
+IN_ARCHIVES = ("csv", "json")
+"""Formats that are read from front to back, and so from archives."""
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What an import gave.
+
+    Attributes:
+        root: the dataset's folder.
+        episodes: how many it has.
+        frames: how many steps.
+        tally: what became of the rows.
+        wall_seconds: how long it took.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    tally: Tally
+    wall_seconds: float
+
+    def __str__(self) -> str:
+        """Tell it in a few lines."""
+        tally = self.tally
+        points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
+        first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
+        return (
+            f"{self.root}: {self.episodes} episodes, {self.frames} frames "
+            f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
+            f"split points: {points}\n"
+            f"rejected rows: {tally.rejected_rows}{first}\n"
+            f"last rows without a next state: {_last_rows(tally)}; "
+            f"rows of episodes that were too short: {tally.short_rows}"
+        )
+
+
+def import_dataset(
+    recordings: Sequence[Path],
+    mapping: Path | None = None,
+    *,
+    out: Path | None = None,
+    file_format: str | None = None,
+    name: str | None = None,
+    fps: int | None = None,
+    task: str | None = None,
+) -> ImportReport:
+    """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
+
+    Args:
+        recordings: files, folders or archives of one format.
+        mapping: the file that says which fields become which columns; D4RL, robomimic and Minari need none.
+        out: the dataset's folder, by default its place at home.
+        file_format: one of `FORMATS`, by default told from the recordings' names.
+        name: of the dataset; like `fps` and `task`, it overrides the mapping.
+        fps: steps per second.
+        task: what the episodes do.
+
+    Raises:
+        BadInputError: a recording is not what was expected; nothing is written.
+        RecipeError: the mapping is not what was expected.
+    """
+    began = time.perf_counter()
+    given = {"name": name, "fps": fps, "task": task, "format": file_format}
+    options = {key: value for key, value in given.items() if value is not None}
+    settings = None
+    if mapping is not None:
+        read = load_recipe(mapping, ImportMapping)
+        settings = validated(read.model_dump() | options, ImportMapping, str(mapping))
+    chosen = (settings.format if settings else file_format) or _told_format(recordings)
+    if chosen not in FORMATS:
+        raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
+    sources = [source for recording in recordings for source in _sources(recording, chosen)]
+    settings = settings or _standard(sources[0], chosen, options)
+    cutter = Cutter(settings)
+    episodes = _episodes(sources, chosen, settings, cutter)
+    first = next(episodes, None)
+    if first is None:
+        _refuse_rejected(cutter.tally, settings)
+        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes ({_losses(cutter.tally)})")
+    description = {
+        "name": settings.name,
+        "version": settings.version,
+        "stage": "import",
+        "config": settings.model_dump(exclude_defaults=True) | {"recordings": _identities(sources)},
+    }
+    root = place(description) if out is None else out
+    frames = count = 0
+    with DatasetWriter(
+        root, cutter.columns, fps=settings.fps, task=settings.task, description=description
+    ) as writer:
+        for count, (columns, metadata) in enumerate(chain([first], episodes), start=1):
+            writer.add(Episode(count - 1, columns, metadata))
+            frames += len(columns[TRUNCATED])
+        _refuse_rejected(cutter.tally, settings)
+        cutter.check_rate()
+        seconds = time.perf_counter() - began
+        writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
+    return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began)
+
+
+def _told_format(recordings: Sequence[Path]) -> str:
+    faults, told = [], {}
+    for recording in recordings:
+        try:
+            told[recording] = _format_of(recording)
+        except BadInputError as error:
+            faults.append(str(error))
+    if len(set(told.values())) > 1:
+        formats = ", ".join(f"{path} {name}" for path, name in told.items())
+        faults.append(f"expected recordings of one format, got {formats}")
+    if faults:
+        raise BadInputError("\n".join(faults))
+    return next(iter(told.values()))
+
+
+def _format_of(recording: Path) -> str:
+    if minari.is_dataset(recording):
+        return "minari"
+    names = [str(source) for source in find_sources(recording, [""])]
+    for name, module in FORMATS.items():
+        if any(file.endswith(_suffixes(module)) for file in names):
+            return name
+    raise BadInputError(f"{recording}: its name does not tell its format; pass --format {'|'.join(FORMATS)}")
+
+
+def _suffixes(module: ModuleType) -> tuple[str, ...]:
+    return tuple(getattr(module, "SUFFIXES", ()))
+
+
+def _sources(recording: Path, file_format: str) -> list[Source]:
+    if file_format == "minari":
+        if not minari.is_dataset(recording):
+            raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
+        return [Source(recording, None, recording)]
+    if is_archive(recording) and file_format not in IN_ARCHIVES:
+        raise BadInputError(f"{recording}: {file_format} cannot be read from an archive, unpack it")
+    return find_sources(recording, _suffixes(FORMATS[file_format]))
+
+
+def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> ImportMapping:
+    module = FORMATS[file_format]
+    if not hasattr(module, "layout"):
+        raise BadInputError(f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml")
+    with _explained(source, file_format):
+        keys = module.layout(source) | options
+    missing = [f"--{key}" for key in ("name", "fps") if key not in keys]
+    if missing:
+        raise BadInputError(f"{source}: pass {' and '.join(missing)}, or --mapping FILE.toml")
+    return validated({"task": keys["name"]} | keys, ImportMapping, str(source))
+
+
+def _episodes(
+    sources: Sequence[Source], file_format: str, mapping: ImportMapping, cutter: Cutter
+) -> Iterator[Cut]:
+    recording = None
+    for source in sources:
+        is_apart = mapping.split.files or source.recording != recording
+        origin, row = "", 0
+        for block in _blocks(source, file_format, mapping):
+            recording = source.recording
+            row = row if block.origin == origin else 0
+            yield from cutter.feed(block, row, is_apart=is_apart)
+            is_apart, origin, row = False, block.origin, row + len(block)
+    yield from cutter.finish()
+
+
+def _blocks(source: Source, file_format: str, mapping: ImportMapping) -> Iterator[Block]:
+    with _explained(source, file_format):
+        yield from FORMATS[file_format].read(source, mapping)
+
+
+@contextmanager
+def _explained(source: Source, file_format: str) -> Iterator[None]:
+    """Turn what a broken file makes a library raise, which may be anything, into one clear message."""
+    try:
+        yield
+    except AstraDataError:
+        raise
+    except Exception as error:
+        message = first_line(error) or type(error).__name__
+        raise BadInputError(f"{source} cannot be read as {file_format}: {message}") from error
+
+
+def _refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
+    if tally.rejected_rows and mapping.not_finite == "refuse":
+        raise BadInputError(
+            f"{tally.rejected_rows} of {tally.rows} rows have values that are not finite, the first is "
+            f'{tally.rejected_first}; set not_finite = "drop" or "split" in the mapping to leave them out'
+        )
+
+
+def _losses(tally: Tally) -> str:
+    return (
+        f"rows {tally.rows}, rejected {tally.rejected_rows}, last ones without a next state "
+        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}"
+    )
+
+
+def _last_rows(tally: Tally) -> str:
+    lost = f" (with them a reward of {tally.last_reward:g} in sum)" if tally.last_reward else ""
+    return f"{tally.last_rows}{lost}"
+
+
+def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:
+    """Return name and sha256 of every file that is read."""
+    files = []
+    for path in dict.fromkeys(source.path for source in sources):
+        files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    return [{"name": file.name, "sha256": file_digest(file)} for file in files]

@@ -1,0 +1,163 @@
+"""Which fields of a recording become which columns, in one TOML file."""
+
+from difflib import get_close_matches
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from astra_data.core.config import Config, Count, Positive
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    RESERVED,
+    REWARD,
+    ROLES,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+)
+
+Index = Annotated[int, Field(ge=0)]
+FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
+FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
+
+
+class ColumnMapping(Config):
+    """Where one column comes from.
+
+    The fields stand side by side; of a field with more than two dimensions, each row is flattened. Then come
+    `take`, `scale`, `offset` and `clip`, in this order. Lists with one entry hold for every value.
+    """
+
+    fields: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Fields of the source; of MCAP, "/topic:path.in.message"."""
+    take: tuple[Index, ...] = ()
+    """Which of their values, from 0; by default all."""
+    scale: tuple[float, ...] = ()
+    """Factors, such as 0.001 for mm."""
+    offset: tuple[float, ...] = ()
+    """What is added after scaling."""
+    clip: tuple[float, float] | None = None
+    """The range into which values are clipped; what is not finite is not clipped but rejected."""
+    names: tuple[str, ...] = ()
+    """A name for each value."""
+    unit: tuple[str, ...] = ()
+    """Units after scaling."""
+    frame: tuple[str, ...] = ()
+    """Frames of reference."""
+    role: tuple[str, ...] = ()
+    """What a planar rotation does to each value: see `columns.ROLES`."""
+    meaning: str = ""
+    """One sentence."""
+    dtype: Literal["float32", "int64", "bool"] | None = None
+    """By default bool for flags and float32 for all else."""
+    latched: bool = False
+    """MCAP: sent once or on change, so that the last value holds without limit."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unknown = sorted(set(self.role) - set(ROLES))
+        if unknown:
+            raise ValueError(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
+        if self.clip is not None and self.clip[0] >= self.clip[1]:
+            raise ValueError(f"clip {list(self.clip)}, expected the lower bound first")
+        return self
+
+
+class Jump(Config):
+    """Where a jump begins a new episode."""
+
+    column: str
+    """Which column jumps."""
+    values: Annotated[tuple[Index, ...], Field(min_length=1)]
+    """Which of its values, such as x and y."""
+    above: Positive
+    """The Euclidean distance between rows, in the column's unit, above which it is a jump."""
+
+
+class Split(Config):
+    """What begins a new episode, besides the episodes that a format knows itself."""
+
+    files: bool = True
+    """Each file; if false, the files of a folder or archive continue one another."""
+    field: str | None = None
+    """A field of the source whose value changes."""
+    ends: tuple[str, ...] = ()
+    """Fields of the source that are true in the last row of an episode, besides those of next.terminated and
+    next.truncated."""
+    gap_s: Positive | None = None
+    """A step in `time` that is longer, or backwards; of MCAP, how long a topic's last value may be held."""
+    jump: Jump | None = None
+    """A jump between rows."""
+
+
+class ImportMapping(Config):
+    """How a recording becomes a dataset."""
+
+    name: str
+    """The dataset's name."""
+    task: str
+    """What the episodes do, a sentence or a name."""
+    fps: Count
+    """Steps per second. MCAP is resampled to it, by holding each value until the next; of other formats, each
+    row is a step."""
+    columns: Annotated[dict[str, ColumnMapping], Field(min_length=1)]
+    """By name. next.observation.state is derived where it is left out: an episode then loses its last row,
+    whose next state nobody recorded, unless it is terminated: then the state stands for the next state, on
+    which nobody bootstraps. A row with next.terminated or next.truncated ends its episode, also where such a
+    flag stays set row by row: `min_steps` = 2 leaves out what follows the first. next.done is always
+    derived."""
+    version: str = "1.0.0"
+    """The dataset's version."""
+    format: str | None = None
+    """One of `imports.FORMATS`, by default told from the file's name."""
+    split: Split = Split()
+    """What begins a new episode."""
+    time: str | None = None
+    """A field with the time of each row; the rate that it tells must be `fps`."""
+    time_scale: Positive = 1.0
+    """Seconds per unit of `time`."""
+    not_finite: Literal["refuse", "drop", "split"] = "refuse"
+    """What becomes of rows with values that are not finite: nothing is imported; the rows are left out and
+    their neighbours become consecutive; or the rows are left out and begin new episodes."""
+    min_steps: Count = 1
+    """Episodes with fewer steps are left out."""
+    episodes: str | None = None
+    """HDF5: groups that are episodes, such as "data/demo_*"; fields are then relative to the group."""
+    transposed: bool = False
+    """HDF5: rows lie along the last dimension, as in MATLAB's files."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        faults = []
+        for name, column in self.columns.items():
+            expected = "bool" if name in FLAGS else "float32" if name in FLOATS else column.dtype
+            if column.dtype not in (None, expected):
+                faults.append(f"column {name} has dtype {column.dtype}, expected {expected}")
+            if name in (*RESERVED, DONE):
+                faults.append(f"column {name} is filled in, leave it out")
+            slip = get_close_matches(name, {*FLAGS, *FLOATS} - self.columns.keys(), n=1, cutoff=0.9)
+            if slip and name not in (*FLAGS, *FLOATS):
+                faults.append(f"column {name}: did you mean '{slip[0]}'?")
+            if not name or "/" in name:
+                faults.append(f"column '{name}': expected a name without '/'")
+        jump = self.split.jump
+        if jump is not None and jump.column not in self.columns:
+            faults.append(f"split.jump.column '{jump.column}', expected one of {', '.join(self.columns)}")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    @property
+    def fields(self) -> list[str]:
+        """The fields with numbers that the mapping needs, each once."""
+        more = [*self.split.ends, *([self.time] if self.time else [])]
+        return list(dict.fromkeys([field for c in self.columns.values() for field in c.fields] + more))
+
+    @property
+    def all_fields(self) -> list[str]:
+        """The fields that the mapping needs, with the one that tells episodes apart."""
+        return list(dict.fromkeys([*self.fields, *([self.split.field] if self.split.field else [])]))

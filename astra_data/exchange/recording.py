@@ -1,0 +1,151 @@
+"""Other people's recordings: where they lie, and the blocks of rows that importers read from them."""
+
+import re
+import tarfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePath, PurePosixPath
+from typing import IO
+
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Array
+
+BLOCK_ROWS = 2**13
+"""Rows that an importer reads at once, where the format allows it."""
+
+ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One file of a recording.
+
+    Attributes:
+        path: the file, or the archive that holds it.
+        member: its entry in the archive, None for a file of its own.
+        recording: the file, folder or archive that was asked for; its files come one after the other.
+    """
+
+    path: Path
+    member: tarfile.TarInfo | None
+    recording: Path
+
+    def __str__(self) -> str:
+        """Name the file for messages and for the episodes' metadata."""
+        return self.path.name if self.member is None else f"{self.path.name}/{self.member.name}"
+
+    @contextmanager
+    def open(self) -> Iterator[IO[bytes]]:
+        """Open the file for reading bytes, in an archive without unpacking it."""
+        if self.member is None:
+            with self.path.open("rb") as stream:
+                yield stream
+            return
+        with tarfile.open(self.path) as archive:
+            content = archive.extractfile(self.member)
+            assert content is not None, "find_sources returns plain files"
+            with content:
+                yield content
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Consecutive rows.
+
+    Attributes:
+        values: field to n rows, (n,) or (n, ...).
+        origin: the file, and the part of it, that they come from.
+        starts: whether the format itself begins an episode with the first row.
+    """
+
+    values: Mapping[str, Array]
+    origin: str
+    starts: bool = False
+
+    def __len__(self) -> int:
+        """Return n."""
+        return len(next(iter(self.values.values())))
+
+
+def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
+    """List the files of a recording in their natural order: 2 before 10; what is hidden is left out.
+
+    Args:
+        recording: a file, a folder, or an archive, whose members must be plain files inside of it.
+        suffixes: what the names of a folder's or archive's files end with; others are left out.
+
+    Raises:
+        BadInputError: it does not exist, cannot be read, is unsafe or holds no such file.
+    """
+    if not recording.exists():
+        raise BadInputError(f"{recording} does not exist")
+    if recording.is_dir():
+        files = [path for path in recording.rglob("*") if path.is_file()]
+        sources = [Source(path, None, recording) for path in files if _is_seen(path.relative_to(recording))]
+    elif is_archive(recording):
+        members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]
+        sources = [Source(recording, member, recording) for member in members]
+    else:
+        return [Source(recording, None, recording)]
+    sources = [source for source in sources if str(source).endswith(tuple(suffixes))]
+    if not sources:
+        raise BadInputError(f"{recording}: expected files that end with {' or '.join(suffixes)}, found none")
+    return sorted(sources, key=lambda source: natural(f"{source.path}/{source}"))
+
+
+def is_archive(path: Path) -> bool:
+    """Tell by its name whether `path` is an archive."""
+    return path.name.endswith(ARCHIVES)
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Return what sorts names with numbers in them as people do."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+
+
+def _is_seen(path: PurePath) -> bool:
+    """Tell whether no part of `path` is hidden; archives made on a Mac hide a file beside each."""
+    return not any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
+
+
+def _members(archive: Path) -> list[tarfile.TarInfo]:
+    try:
+        with tarfile.open(archive) as opened:
+            members = [member for member in opened if not member.isdir()]
+    except (tarfile.TarError, OSError, EOFError, ValueError, ArithmeticError) as error:
+        raise BadInputError(f"{archive} cannot be read as an archive: {error}") from error
+    faults = []
+    for member in members:
+        path = PurePosixPath(member.name)
+        if not member.isfile() or member.issparse():
+            faults.append(f"{member.name} is a link, a device or sparse")
+        elif path.is_absolute() or ".." in path.parts:
+            faults.append(f"{member.name} lies outside of the archive")
+    if faults:
+        raise BadInputError(f"{archive}: expected plain files; {'; '.join(faults)}")
+    return members
+
+
+def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:
+    """Return how many rows `fields` have.
+
+    Args:
+        origin: the file, for the message.
+        fields: what is wanted.
+        shapes: the shape of every field that there is.
+
+    Raises:
+        BadInputError: lists the fields that are missing or have no rows, and differing numbers of rows.
+    """
+    faults = [f"no field '{field}'{did_you_mean(field, shapes)}" for field in fields if field not in shapes]
+    found = {field: shapes[field] for field in fields if field in shapes}
+    faults += [f"field '{field}' is a single value, expected rows" for field in found if not found[field]]
+    lengths = {field: shape[0] for field, shape in found.items() if shape}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{field} {length}" for field, length in lengths.items())
+        faults.append(f"fields differ in their number of rows ({told})")
+    if faults:
+        raise BadInputError(f"{origin}: {'; '.join(faults)}")
+    return next(iter(lengths.values()))

@@ -1,0 +1,209 @@
+"""A dataset's card: what it is and where it comes from, in the form that the Hugging Face Hub shows."""
+
+import json
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
+from astra_data.dataset.columns import RESERVED, Column
+from astra_data.dataset.inspection import visited
+from astra_data.exchange.sharing.loading import loading
+from astra_data.exchange.sharing.notes import Notes
+from astra_data.reports.figures.coverage import coverage
+from astra_data.reports.figures.style import png
+
+TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
+
+SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B")
+"""Upper ends of the Hub's size categories, in steps, from a thousand by factors of ten."""
+
+WIDE = 4
+"""Columns with more values than this have their names listed below the table."""
+
+CITATION = """\
+```bibtex
+@article{deng2026abstract,
+  title   = {Abstract Sim2Real through Approximate Information States},
+  author  = {Deng and Li and Hanna},
+  journal = {IEEE Robotics and Automation Letters},
+  year    = {2026},
+  doi     = {10.1109/LRA.2026.3688068}
+}
+```"""
+
+
+def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None) -> list[Path]:
+    """Write the card of `dataset` to `out` and, if the dataset has planar positions, their figure beside it.
+
+    Args:
+        dataset: any.
+        out: the Markdown file; it is replaced, and so is the figure, `<stem>-coverage.png`.
+        notes: what only a person can say.
+        source: where it is shared, as `pull` takes it; None tells how to open a folder.
+
+    Returns:
+        the files written.
+
+    Raises:
+        BadInputError: `out` cannot be written.
+    """
+    positions = visited(dataset)
+    figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
+    text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)
+    try:
+        out.write_text(text, encoding="utf-8")
+        if positions is None or figure is None:
+            return [out]
+        figure.write_bytes(png(coverage(positions.counts, positions.extent, "position", "m")))
+    except OSError as error:
+        raise BadInputError(f"{out} cannot be written: {error.strerror}; choose another file.") from error
+    return [out, figure]
+
+
+def render_card(
+    dataset: Dataset, notes: Notes, *, source: str | None = None, figure: str | None = None
+) -> str:
+    """Return the card of `dataset` as Markdown with the Hub's front matter; `figure` is a path beside it."""
+    from huggingface_hub import DatasetCardData  # noqa: PLC0415 - slow to import
+
+    description = dataset.description
+    data = DatasetCardData(
+        license=notes.license,
+        pretty_name=description["name"],
+        task_categories=["robotics"],
+        tags=list(TAGS),
+        size_categories=[_size_category(int(dataset.lengths.sum()))],
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    sections = {
+        "Behavior": notes.behavior,
+        "Intended use": notes.intended_use,
+        "Limits": notes.limits,
+        "Contents": _counts(dataset) + (f"\n\n![Steps per cell of the plane]({figure})" if figure else ""),
+        "Columns": _columns(dataset),
+        "Provenance": _provenance(description),
+        "Loading": loading(dataset, source),
+        "Citation": f"The method that these datasets are made for:\n\n{CITATION}",
+    }
+    parts = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
+    parts += [f"## {title}\n\n{text.strip()}" for title, text in sections.items() if text]
+    return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def _opening(dataset: Dataset) -> str:
+    stand_in = dataset.description["environment"].get("stand_in")
+    told = f" The robot is a simulated stand-in (`{stand_in}`) for a physical one." if stand_in else ""
+    return (
+        f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
+        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. Task: “{dataset.task}”. "
+        f"The format is LeRobot {layout.CODEBASE_VERSION}.{told}"
+    )
+
+
+def _counts(dataset: Dataset) -> str:
+    lengths = dataset.lengths
+    quartiles = np.percentile(lengths, [25, 50, 75])
+    rows = [
+        ("episodes", f"{len(dataset):,}"),
+        ("steps", f"{int(lengths.sum()):,}"),
+        ("duration", f"{lengths.sum() / dataset.info['fps'] / 60:,.1f} min"),
+        ("episode length", f"{lengths.min()} to {lengths.max()} steps; quartiles {_listed(quartiles)}"),
+    ]
+    told = dataset.metadata | {"success": dataset.successes() or []}
+    facts = {key: [value for value in values if value is not None] for key, values in told.items()}
+    for key, values in sorted(facts.items()):
+        if values and all(isinstance(value, bool) for value in values):
+            share = sum(map(bool, values)) / len(values)
+            rows.append((key, f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})"))
+        elif key == "return" and values:
+            returns = np.array(values, dtype=np.float64)
+            rows.append((key, f"mean {returns.mean():.2f}; {returns.min():.2f} to {returns.max():.2f}"))
+    return _table(("what", "value"), rows)
+
+
+def _columns(dataset: Dataset) -> str:
+    columns = [Column.from_feature(name, feature) for name, feature in dataset.features.items()]
+    rows = []
+    wide: dict[tuple[str, ...], list[str]] = {}
+    for column in columns:
+        if column.name not in RESERVED or column.meaning:
+            meaning = column.meaning
+            if column.names and column.size > WIDE:
+                wide.setdefault(column.names, []).append(column.name)
+            elif column.names:
+                meaning = f"{meaning}: {', '.join(column.names)}".removeprefix(": ")
+            shape = f"({column.size},)"
+            rows.append((f"`{column.name}`", column.dtype, shape, _units(column), meaning))
+    plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
+    table = _table(("column", "type", "shape", "units", "meaning"), rows)
+    order = [f"In {_joined(same)}, in order: {', '.join(names)}." for names, same in wide.items()]
+    return "\n\n".join(
+        [
+            table,
+            *order,
+            f"LeRobot's own columns are {', '.join(plain)}. Frames, and what turns or shifts with the world, "
+            f"stand in `{layout.INFO_PATH}` under `astra`.",
+        ]
+    )
+
+
+def _joined(names: list[str]) -> str:
+    return " and ".join(f"`{name}`" for name in names)
+
+
+def _units(column: Column) -> str:
+    units = (column.astra or {}).get("unit", [])
+    runs = [(unit, len(list(run))) for unit, run in groupby(units)]
+    return ", ".join(unit if count == 1 else f"{unit} ({count})" for unit, count in runs)
+
+
+def _provenance(description: dict[str, Any]) -> str:
+    parents = [
+        f"{parent['name']}@data-{parent['version']} (`{parent['hash']}`)" for parent in description["parents"]
+    ]
+    packages = [f"{name} {version}" for name, version in description["packages"].items()]
+    rows = [
+        ("version", description["version"]),
+        ("made by stage", description["stage"]),
+        ("from", "; ".join(parents) or "nothing earlier"),
+        ("config", _json(description["config"])),
+        ("seeds", _json(description["seeds"])),
+        ("environment", _json(description["environment"])),
+        ("simulator", _json(description["simulator"])),
+        ("packages", ", ".join(packages)),
+        ("commit", f"`{description['git_commit']}`" if description["git_commit"] else "not recorded"),
+        ("content hash (sha256)", f"`{description['content_hash']}`"),
+    ]
+    return _table(("what", "value"), rows)
+
+
+def _json(content: dict[str, Any]) -> str:
+    return f"`{json.dumps(content, ensure_ascii=False)}`" if content else "none"
+
+
+def _listed(values: np.ndarray[Any, Any]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    return "\n".join(_lines(head, rows))
+
+
+def _lines(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+    for row in (head, ("---",) * len(head), *rows):
+        cells = (" ".join(cell.split()).replace("|", "\\|") for cell in row)
+        yield f"| {' | '.join(cells)} |"
+
+
+def _size_category(steps: int) -> str:
+    powers = [(1000 * 10**power, name) for power, name in enumerate(SIZES)]
+    above = next((number for number, (limit, _) in enumerate(powers) if steps < limit), len(powers))
+    if above == 0:
+        return f"n<{SIZES[0]}"
+    return f"n>{SIZES[-1]}" if above == len(SIZES) else f"{SIZES[above - 1]}<n<{SIZES[above]}"

@@ -1,0 +1,197 @@
+"""Datasets on the Hugging Face Hub: one repository each, whose tags data-<version> never move."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from astra_data.core.errors import AstraDataError, BadInputError, SharingError
+from astra_data.core.progress import Progress
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
+from astra_data.dataset.versions import Version
+from astra_data.exchange.sharing.store import RemoteFolder
+from astra_data.exchange.sharing.sums import SUMS_PATH, dataset_files
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError
+
+KIND = "dataset"
+
+
+class HubStore:
+    """The versions of one dataset in the Hub's repository `repo`, "user/name"."""
+
+    def __init__(self, repo: str) -> None:
+        """Take the repository; nothing is asked yet."""
+        self._repo = repo
+
+    def create(self, card: Path, *, private: bool) -> None:
+        """Make the repository unless it exists.
+
+        Args:
+            card: a folder with the README.md that it is to get, which the Hub checks first.
+            private: whether nobody else may see it.
+
+        Raises:
+            BadInputError: the Hub does not take the card, or the repository is public and not to be.
+            SharingError: the Hub refuses or cannot be reached.
+        """
+        with _told(self._repo) as api:
+            _validate(api, (card / "README.md").read_text(encoding="utf-8"))
+            # None leaves it to what the user or the organisation prefers.
+            api.create_repo(self._repo, repo_type=KIND, private=private or None, exist_ok=True)
+            if private and not api.repo_info(self._repo, repo_type=KIND).private:
+                raise BadInputError(
+                    f"{self._repo} exists already and is public, expected a private repository. Nothing was "
+                    "uploaded: make it private in its settings on the Hub, choose another, or leave out "
+                    "--private."
+                )
+
+    def versions(self) -> list[Version]:
+        """Return the tagged versions, the oldest first."""
+        return sorted(self._commits())
+
+    def folder(self, version: Version) -> RemoteFolder:
+        """Return where the files of `version` are read: the commit that its tag names right now."""
+        from huggingface_hub import HfFileSystem  # noqa: PLC0415 - slow to import
+
+        filesystem = HfFileSystem(skip_instance_cache=True)
+        commit = self._commits()[version]
+        return RemoteFolder(filesystem, f"datasets/{self._repo}@{commit}", f"{self._repo}@{version.tag}")
+
+    def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
+        """Add `dataset`: its files, then the card, then the tag "v3.0", then the tag that marks it as there.
+
+        Raises:
+            BadInputError: the repository holds another dataset or a newer version.
+            SharingError: the Hub refuses or cannot be reached.
+        """
+        version = Version.parse(dataset.description["version"])
+        self._refuse_mixing(dataset, version)
+        with _told(self._repo) as api:
+            progress(0.0, "files")
+            commit = self._commit_files(api, dataset, card)
+            progress(0.9, "card")
+            commit = self._commit_card(api, dataset, card, commit)
+            tags = api.list_repo_refs(self._repo, repo_type=KIND).tags
+            if layout.CODEBASE_VERSION in [tag.name for tag in tags]:
+                api.delete_tag(self._repo, tag=layout.CODEBASE_VERSION, repo_type=KIND)
+            for tag in (layout.CODEBASE_VERSION, version.tag):
+                api.create_tag(self._repo, tag=tag, revision=commit, repo_type=KIND)
+        progress(1.0, "tags")
+
+    def _refuse_mixing(self, dataset: Dataset, version: Version) -> None:
+        known = self.versions()
+        if not known:
+            return
+        name = self.folder(known[-1]).description().get("name")
+        if name != dataset.description["name"]:
+            raise BadInputError(f"{self._repo} holds the dataset {name!r}; choose another repository.")
+        if known[-1] > version:
+            raise BadInputError(
+                f"{self._repo} has {known[-1].tag} already, and main shows the newest version: "
+                f"{version.tag} can no longer be added. Push it to another place."
+            )
+
+    def _commit_files(self, api: "HfApi", dataset: Dataset, card: Path) -> str:
+        """Make data/ and meta/ those of `dataset`."""
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
+
+        # A commit that somebody else adds from here on makes this one fail.
+        head = api.repo_info(self._repo, repo_type=KIND).sha
+        there = api.list_repo_files(self._repo, revision=head, repo_type=KIND)
+        if layout.INFO_PATH in there and SUMS_PATH not in there:
+            raise BadInputError(
+                f"{self._repo} holds a dataset that astra-data did not push; choose another repository."
+            )
+        files = dataset_files(dataset.root)
+        old = [path for path in there if path.startswith(("data/", "meta/")) and path not in files]
+        commit = api.create_commit(
+            self._repo,
+            [
+                *(CommitOperationAdd(path, dataset.root / path) for path in files),
+                *(CommitOperationDelete(path, is_folder=False) for path in old),
+                CommitOperationAdd(SUMS_PATH, card / SUMS_PATH),
+            ],
+            repo_type=KIND,
+            parent_commit=head,
+            commit_message=f"Add {dataset.reference}",
+        )
+        return str(commit.oid)
+
+    def _commit_card(self, api: "HfApi", dataset: Dataset, card: Path, parent: str) -> str:
+        from huggingface_hub import CommitOperationAdd  # noqa: PLC0415 - slow to import
+
+        pages = [path for path in sorted(card.iterdir()) if path.name != SUMS_PATH]
+        commit = api.create_commit(
+            self._repo,
+            [CommitOperationAdd(path.name, path) for path in pages],
+            repo_type=KIND,
+            parent_commit=parent,
+            commit_message=f"Describe {dataset.reference}",
+        )
+        return str(commit.oid)
+
+    def _commits(self) -> dict[Version, str]:
+        with _told(self._repo) as api:
+            tags = api.list_repo_refs(self._repo, repo_type=KIND).tags
+        versions = ((Version.from_tag(tag.name), tag.target_commit) for tag in tags)
+        return {version: commit for version, commit in versions if version}
+
+
+def _validate(api: "HfApi", card: str) -> None:
+    """Ask the Hub whether it takes `card`; a commit asks only once there is a repository to commit to."""
+    from huggingface_hub import get_session, get_token, hf_raise_for_status  # noqa: PLC0415 - slow to import
+
+    token = get_token()
+    answer = get_session().post(
+        f"{api.endpoint}/api/validate-yaml",
+        json={"content": card, "repoType": KIND},
+        headers={"Authorization": f"Bearer {token}"} if token else {},
+    )
+    if answer.status_code == 400:
+        faults = "; ".join(str(fault.get("message")) for fault in answer.json().get("errors", []))
+        raise ValueError(f"faults in the card: {faults}")
+    hf_raise_for_status(answer)
+
+
+@contextmanager
+def _told(repo: str) -> Iterator["HfApi"]:
+    """Yield the Hub's interface, and turn what it raises into one line."""
+    from huggingface_hub import HfApi  # noqa: PLC0415 - slow to import
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError  # noqa: PLC0415 - slow to import
+
+    try:
+        yield HfApi()
+    except AstraDataError:
+        raise
+    except HfHubHTTPError as error:
+        raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(error)}") from error
+    except HFValidationError as error:
+        raise BadInputError(f"{repo} is no name of a repository on the Hub: {error}") from error
+    except ValueError as error:
+        raise BadInputError(f"{repo}: the Hugging Face Hub does not take this: {error}") from error
+    except Exception as error:
+        # Uploads fail with whatever their transfer raises, wrapped or not.
+        cause = error.__cause__ or error
+        if isinstance(cause, HfHubHTTPError):
+            raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(cause)}") from error
+        raise SharingError(
+            f"{repo} on the Hugging Face Hub cannot be reached ({type(cause).__name__}: {cause}); "
+            "check the network, then run the same command again."
+        ) from error
+
+
+def _refusal(error: "HfHubHTTPError") -> str:
+    from huggingface_hub.errors import RepositoryNotFoundError  # noqa: PLC0415 - slow to import
+
+    status = error.response.status_code
+    if isinstance(error, RepositoryNotFoundError):
+        return "no such dataset, or no rights to see it; check the name and log in with `hf auth login`."
+    if status in (401, 403):
+        return "no rights to do this; log in with `hf auth login` and a token that may write."
+    if status in (409, 412):
+        return "it was changed by somebody else at the same time; run the same command again."
+    return f"it answered {status}: {error.server_message or error}"

@@ -1,0 +1,82 @@
+"""Share a version of a dataset."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.progress import Progress, silent
+from astra_data.dataset import Dataset
+from astra_data.dataset.versions import Version, open_dataset
+from astra_data.exchange.sharing.address import Hub, Url, parse_place
+from astra_data.exchange.sharing.card import write_card
+from astra_data.exchange.sharing.hub import HubStore
+from astra_data.exchange.sharing.notes import Notes
+from astra_data.exchange.sharing.store import RemoteFolder, Store
+from astra_data.exchange.sharing.sums import SUMS_PATH, make_sums
+from astra_data.exchange.sharing.urls import UrlStore
+
+
+def push(
+    dataset: str | Path,
+    destination: str,
+    *,
+    notes: Path | None = None,
+    private: bool = False,
+    progress: Progress = silent,
+) -> str:
+    """Send `dataset` to `destination`, with its card; do nothing if it is there already.
+
+    Args:
+        dataset: a folder, name@data-1.2.0, or name for the newest at home.
+        destination: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or any URL that fsspec
+            knows, below which <name>/data-<version>/ is made.
+        notes: TOML file with the human part of the card, see `Notes`.
+        private: whether the repository on the Hub is private: one that is made is, a public one is refused.
+        progress: is told how far it is.
+
+    Returns:
+        where `pull` finds it, with its version.
+
+    Raises:
+        BadInputError: there is no such dataset, the place holds something else under this version, the
+            Hub does not take the card, or a repository that is to be private is public.
+        CorruptDatasetError: the dataset is incomplete or was altered.
+        RecipeError: the notes are not what they should be.
+        SharingError: the place refuses or cannot be reached.
+    """
+    local = open_dataset(dataset)
+    place = parse_place(destination)
+    written = load_recipe(notes, Notes) if notes else Notes()
+    if private and isinstance(place, Url):
+        raise BadInputError(f"{place}: private is for the Hugging Face Hub; elsewhere the storage decides.")
+    faults = local.verify()
+    if faults:
+        raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
+    version = Version.parse(local.description["version"])
+    if isinstance(place, Url):
+        place = Url(f"{place}/{local.description['name']}")
+    with TemporaryDirectory() as folder:
+        card = Path(folder)
+        write_card(local, card / "README.md", written, source=str(place))
+        store: Store
+        if isinstance(place, Hub):
+            store = hub = HubStore(place.repo)
+            hub.create(card, private=private)
+        else:
+            store = UrlStore(place.url)
+        if version in store.versions():
+            _refuse_change(store.folder(version), local)
+        else:
+            (card / SUMS_PATH).write_text(make_sums(local.root), encoding="utf-8")
+            store.upload(local, card, progress)
+    return f"{place}@{version.tag}"
+
+
+def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
+    found = there.description().get("content_hash")
+    if found != local.content_hash:
+        raise BadInputError(
+            f"{there.name} holds other values: its content hash is {found}, not {local.content_hash}. "
+            "Versions never change: give the dataset a new one, or push elsewhere."
+        )

@@ -1,0 +1,117 @@
+"""Datasets at any URL that fsspec knows: <url>/<name>/data-<version>/."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from astra_data.core.errors import AstraDataError, BadInputError, SharingError
+from astra_data.core.optional import cure
+from astra_data.core.progress import Progress
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
+from astra_data.dataset.versions import Version
+from astra_data.exchange.sharing.store import RemoteFolder
+from astra_data.exchange.sharing.sums import SUMS_PATH, dataset_files
+
+EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+"""Which extra of this package reads which URLs."""
+
+
+class UrlStore:
+    """The versions of one dataset below a URL; a version is there once its `layout.DATASET_PATH` is."""
+
+    def __init__(self, url: str) -> None:
+        """Take the folder `url`, whose last part is the dataset's name.
+
+        Raises:
+            BadInputError: nothing installed reads such a URL.
+        """
+        import fsspec  # noqa: PLC0415 - slow to import
+
+        self._url = url
+        protocol = url.partition("://")[0].lower()
+        options = {"auto_mkdir": True} if protocol in ("file", "local") else {}
+        with _told(url):
+            try:
+                self._filesystem, self._path = fsspec.core.url_to_fs(url, **options)
+            except ImportError as error:
+                extra = EXTRAS.get(protocol)
+                how = cure(extra) if extra else error
+                raise BadInputError(f"{url}: what reads {protocol}:// is not installed: {how}") from error
+            except ValueError as error:
+                raise BadInputError(f"{url}: {error}; expected a URL such as s3://bucket/folder") from error
+
+    def versions(self) -> list[Version]:
+        """Return the versions that are there whole, the oldest first."""
+        with _told(self._url):
+            self._filesystem.invalidate_cache()
+            try:
+                found = self._filesystem.ls(self._path, detail=False)
+            except FileNotFoundError:
+                return []
+            tags = (str(path).rstrip("/").rpartition("/")[2] for path in found)
+            versions = (version for tag in tags if (version := Version.from_tag(tag)))
+            return sorted(version for version in versions if self._filesystem.exists(self._mark(version)))
+
+    def folder(self, version: Version) -> RemoteFolder:
+        """Return where the files of `version` are read."""
+        return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self._url}/{version.tag}")
+
+    def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
+        """Add `dataset`: `layout.DATASET_PATH` is written last and marks it as whole.
+
+        SHA256SUMS is written first and says whose folder it is: an upload that was stopped is gone over
+        again by the next one of the same files, and nothing that is there is ever deleted.
+
+        Raises:
+            BadInputError: the folder holds other files.
+            SharingError: the place refuses or cannot be reached.
+        """
+        version = Version.parse(dataset.description["version"])
+        remote = self.folder(version)
+        sums = card / SUMS_PATH
+        files = {path: dataset.root / path for path in dataset_files(dataset.root)}
+        files |= {path.name: path for path in sorted(card.iterdir()) if path != sums}
+        files[layout.DATASET_PATH] = files.pop(layout.DATASET_PATH)
+        with _told(self._url):
+            self._filesystem.invalidate_cache()
+            if not self._filesystem.find(remote.path):
+                self._filesystem.put_file(str(sums), f"{remote.path}/{SUMS_PATH}")
+            for number, (path, file) in enumerate(files.items()):
+                # Each time anew: a push of other values may have begun at the same moment.
+                self._refuse_others(remote, sums.read_bytes())
+                progress(number / len(files), path)
+                self._filesystem.put_file(str(file), f"{remote.path}/{path}")
+        progress(1.0, f"{len(files)} files")
+
+    def _refuse_others(self, remote: RemoteFolder, sums: bytes) -> None:
+        try:
+            there = self._filesystem.cat_file(f"{remote.path}/{SUMS_PATH}")
+        except FileNotFoundError:
+            there = None
+        if there != sums:
+            raise BadInputError(
+                f"{remote.name} exists already and holds something else: other files, or a part of another "
+                f"push of this version, stopped or going on right now. Nothing in it is replaced: look at it "
+                "and delete it, give the dataset a new version, or push elsewhere."
+            )
+
+    def _mark(self, version: Version) -> str:
+        return f"{self.folder(version).path}/{layout.DATASET_PATH}"
+
+
+@contextmanager
+def _told(url: str) -> Iterator[None]:
+    """Turn what a back end raises into one line; each of them has its own kinds of errors."""
+    try:
+        yield
+    except AstraDataError:
+        raise
+    except PermissionError as error:
+        raise SharingError(f"{url}: no rights to do this ({error}); check the credentials.") from error
+    except FileNotFoundError as error:
+        raise SharingError(f"{url}: does not exist ({error}); check the spelling.") from error
+    except Exception as error:
+        raise SharingError(
+            f"{url}: {type(error).__name__}: {error}; check the address, the credentials and the network."
+        ) from error

@@ -1,0 +1,1 @@
+"""Recipes, the plan of their artefacts, and how these are made: one machine or many."""

@@ -1,0 +1,257 @@
+"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if it is on any.
+
+    based_on = "antmaze_umaze"
+
+A recipe with this line says only what differs from the recipe of that name beside it. Stages that nothing
+differs for are not run again: links in its folder lead to the other recipe's artefacts. It may have another
+task if that has the same target; then it shares the collected episodes.
+"""
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.config import did_you_mean, load_tables, validated
+from astra_data.core.errors import RecipeError
+from astra_data.core.naming import base_method, is_plus
+from astra_data.experiments.points import Point
+from astra_data.experiments.recipe import DERIVED, METHOD_TABLES, STAGES, WHOLE, Recipe
+from astra_data.methods import METHODS
+from astra_data.reports.files import read_published
+from astra_data.reports.sizes import by_size
+from astra_data.worlds.registry import TASKS
+
+ALWAYS_NEW = {"report"}
+"""Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+
+
+_SIMULATOR = "simulator"
+"""What differs between two tasks that have the same target."""
+_ROWS_TABLES = METHOD_TABLES.keys() | {"plus"}
+"""Tables of a recipe that only some rows read."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A recipe and where its artefacts are.
+
+    Attributes:
+        recipe: with everything that it takes from the one that it is based on.
+        path: the recipe's file. folder: of its artefacts.
+        base: the experiment that it is based on, if any.
+    """
+
+    recipe: Recipe
+    path: Path
+    folder: Path
+    base: "Experiment | None" = None
+
+    @cached_property
+    def borrowed(self) -> set[str]:
+        """The stages whose artefacts are the base's."""
+        if self.base is None:
+            return set()
+        changed = _differences(self.base.recipe.settings, self.recipe)
+        absent = set() if self.recipe.sweep.percent else {"subset"}
+        absent |= set() if self.recipe.augment else {"augment"}
+        return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed)
+
+    def maker(self, stage: str) -> "Experiment":
+        """Return the experiment that makes the artefacts of `stage`."""
+        return self.base if self.base and stage in self.borrowed else self
+
+    def place(self, key: str) -> Path:
+        """Return where the artefact `key` is made."""
+        return self.maker(key.partition("/")[0]).folder / key
+
+    def has(self, key: str) -> bool:
+        """Tell whether the artefact `key` is finished."""
+        stage = key.partition("/")[0]
+        return self.place(key).is_dir() and not self.maker(stage)._is_link(stage)
+
+    def _is_link(self, stage: str) -> bool:
+        """Tell whether a stage's folder is a link to another recipe's, from this run or an earlier one."""
+        link = self.folder / stage
+        return link.is_symlink() and link.readlink().parent.parent == Path("..")
+
+    def link_borrowed(self) -> None:
+        """Let links in the folder lead to what is borrowed.
+
+        Raises:
+            RecipeError: there are artefacts where a link belongs.
+        """
+        for stage in STAGES:
+            link = self.folder / stage
+            if self._is_link(stage):
+                link.unlink()
+            if stage not in self.borrowed:
+                continue
+            source = self.maker(stage).folder
+            if link.exists():
+                raise RecipeError(
+                    f"{link} is in the way: {self.path} is based on {source.name}, whose {stage} it uses; "
+                    f"give the recipe another name, or remove {link}"
+                )
+            link.symlink_to(Path("..") / source.name / stage)
+
+    def check_unchanged(self) -> None:
+        """Refuse settings that differ from those that made what is already there, finished or begun.
+
+        Raises:
+            RecipeError: they do, here or in the base.
+        """
+        if self.base:
+            self.base.check_unchanged()
+        record = self.folder / "recipe.json"
+        if not record.is_file():
+            return
+        changed = _differences(json.loads(record.read_text()), self.recipe)
+        whole = _stale_stages(changed - _ROWS_TABLES)
+        own = STAGES.keys() - self.borrowed - ALWAYS_NEW
+        own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
+        present = [str(self.folder / stage) for stage in STAGES if stage in whole & own]
+        for table in sorted(changed & _ROWS_TABLES):
+            for stage in sorted((_stale_stages({table}) - whole) & own):
+                present += map(str, self._rows_of(table, stage))
+        if present:
+            raise RecipeError(
+                f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
+                f"give the recipe another name, or remove {' '.join(dict.fromkeys(present))}"
+            )
+
+    @property
+    def results(self) -> Path:
+        """The folder that its results are published in."""
+        return self.path.parent / "results"
+
+    @property
+    def published_in(self) -> Path:
+        """The file of published results that hold its points: the base's, where its evaluations are those."""
+        return self.results / f"{self.maker('evaluate').path.stem}.json"
+
+    def published(self) -> set[Point]:
+        """Return the points that its published results have.
+
+        Raises:
+            BadInputError: there are no such results.
+            RecipeError: they were made with other settings.
+        """
+        points = set()
+        for percent, found in by_size(read_published(self.published_in)).items():
+            changed = _differences(found.settings, self.recipe) - ALWAYS_NEW
+            changed -= {
+                table for table in _ROWS_TABLES if not any(_reads(row, table) for row in found.methods)
+            }
+            if changed:
+                raise RecipeError(
+                    f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
+                    f"{self.results} were made: make all rows again and publish them in their place"
+                )
+            rows = found.methods.items()
+            points |= {Point(method, seed, percent) for method, row in rows for seed in row.seeds}
+        return points
+
+    def _rows_of(self, table: str, stage: str) -> list[Path]:
+        """Return the folders in `stage` of the rows that read `table`."""
+        return [row for row in sorted((self.folder / stage).iterdir()) if _reads(row.name, table)]
+
+
+def load_experiment(path: Path, root: Path) -> Experiment:
+    """Read the recipe at `path`, whose artefacts are in a folder of its name in `root`.
+
+    Raises:
+        RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
+    """
+    tables = load_tables(path)
+    folder = root / path.stem
+    if "based_on" not in tables:
+        return Experiment(validated(tables, Recipe, str(path)), path, folder)
+    name = tables["based_on"]
+    known = sorted({file.stem for file in path.parent.glob("*.toml")} - {path.stem})
+    if name not in known:
+        raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
+    base_path = path.with_name(f"{name}.toml")
+    base_tables = load_tables(base_path)
+    if "based_on" in base_tables:
+        raise RecipeError(f"{path}: based_on: expected a recipe that is based on none itself, got '{name}'")
+    base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)
+    recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
+    _check_fit(recipe, base, path)
+    return Experiment(recipe, path, folder, base)
+
+
+def _reads(row: str, table: str) -> bool:
+    """Tell whether a row, or the one whose policy it goes on from, has its settings from `table`."""
+    if table == "plus":
+        return is_plus(row)
+    base = base_method(row)
+    method = METHODS.get(base)
+    if method is None:
+        return False
+    ours = method.table or base
+    return table in (ours, DERIVED.get(ours)) or (
+        method.initial is not None and _reads(method.initial, table)
+    )
+
+
+def _stale_stages(changed: set[str]) -> set[str]:
+    """Return the stages that a change of the keys `changed` of a recipe reaches."""
+    stale: set[str] = set()
+    for stage, reads in STAGES.items():
+        sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
+        sections |= set() if stage == "collect" else {_SIMULATOR}
+        sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
+        if changed & sections or stale.intersection(reads):
+            stale.add(stage)
+    return stale
+
+
+def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
+    """Return the settings of `recipe` that differ from those recorded `before`.
+
+    What was not known then has its default, which is what was done.
+    """
+    with suppress(RecipeError):
+        before = validated(before, type(recipe), "recipe.json").settings
+    before, now = _told(dict(before)), _told(recipe.settings)
+    changed = {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
+    if "task" in changed and _share_target(str(before.get("task")), recipe.task):
+        return changed - {"task"} | {_SIMULATOR}
+    return changed
+
+
+def _share_target(task: str, other: str) -> bool:
+    return task in TASKS and TASKS[task].shares_target(TASKS[other])
+
+
+def _told(settings: dict[str, Any]) -> dict[str, Any]:
+    """Say of the sizes only what the artefacts of the others depend on: the largest."""
+    percents = settings.get("sweep", {}).get("percent", ())
+    return settings | {"sweep": max(percents, default=WHOLE)}
+
+
+def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    def both(key: str) -> Any:  # noqa: ANN401 - any value of a recipe
+        old, new = below[key], above[key]
+        return old | new if isinstance(old, dict) and isinstance(new, dict) else new
+
+    return dict(below) | {key: both(key) if key in below else value for key, value in above.items()}
+
+
+def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
+    name, faults = base.path.stem, []
+    if recipe.task != base.recipe.task and not _share_target(base.recipe.task, recipe.task):
+        faults.append(
+            f"task: expected that of {name}, '{base.recipe.task}', or one with the same target, "
+            f"got '{recipe.task}'"
+        )
+    for key in ("methods", "seeds"):
+        theirs, ours = getattr(base.recipe, key), getattr(recipe, key)
+        unknown = [value for value in ours if value not in theirs]
+        faults += [f"{key}: {name} has no '{value}', it has {list(theirs)}" for value in unknown]
+    if faults:
+        raise RecipeError(f"{path} does not fit what it is based on: {'; '.join(faults)}")

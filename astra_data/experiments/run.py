@@ -1,0 +1,247 @@
+"""Run recipes: every stage for every row and seed, each artefact once, from where the last run stopped."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from astra_data.core.config import did_you_mean
+from astra_data.core.cores import cores
+from astra_data.core.errors import BadInputError, MissingStageError
+from astra_data.core.lock import held
+from astra_data.core.naming import base_method
+from astra_data.experiments.display import display
+from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
+from astra_data.experiments.local_executor import Item, Watcher, execute
+from astra_data.experiments.plan import grounded_as, plan, stage_of
+from astra_data.experiments.points import Part
+from astra_data.experiments.ray_executor import execute_on_cluster
+from astra_data.experiments.recipe import STAGES, Recipe
+
+RUNS = Path("runs")
+CUDA_JOBS = 2
+"""Items at a time on a CUDA device: each process holds a context of its own there."""
+
+
+def run(
+    recipe_path: Path,
+    *,
+    seeds: Sequence[int] = (),
+    root: Path = RUNS,
+    jobs: int | None = None,
+    device: str = "cpu",
+    until: str | None = None,
+) -> Path:
+    """Make every artefact of a recipe that is not finished yet; return the recipe's folder.
+
+    Args:
+        recipe_path: the recipe.
+        seeds: those of the recipe's seeds to make and to report; by default all.
+        root: where the recipe's folder is.
+        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
+        device: torch device of the networks.
+        until: the last stage to run; by default all.
+
+    Raises:
+        RecipeError: the recipe has faults, or differs from the one that made what is there.
+        MissingStageError: an artefact of the recipe that it is based on is not finished.
+        BadInputError: another process runs in the recipe's folder.
+        AstraDataError: an item failed.
+    """
+    _check_stage(until or "report")
+    experiment = load_experiment(recipe_path, root)
+    wanted = set(list(STAGES)[: list(STAGES).index(until or "report") + 1]) - experiment.borrowed
+    part = Part.of(experiment.recipe, seeds=seeds)
+    planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
+    items = [item for item in planned if stage_of(item) in wanted]
+    make(experiment, items, jobs=jobs, device=device)
+    return experiment.folder
+
+
+def run_stage(
+    recipe_path: Path,
+    stage: str,
+    *,
+    method: str | None = None,
+    seeds: Sequence[int] = (),
+    root: Path = RUNS,
+    jobs: int | None = None,
+    device: str = "cpu",
+    publish: bool = False,
+    add: bool = False,
+) -> Path:
+    """Make the artefacts of one stage of a recipe, of one `method` and of some `seeds` only where given.
+
+    The report is also published where asked to `publish`, and has what is published already where asked to
+    `add`.
+
+    Raises:
+        MissingStageError: an artefact that the stage reads is not finished.
+        RecipeError: the recipe has faults, or differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder.
+        AstraDataError: an item failed.
+    """
+    _check_stage(stage)
+    experiment = load_experiment(recipe_path, root)
+    maker = experiment.maker(stage)
+    if maker is not experiment:
+        raise BadInputError(
+            f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` for that"
+        )
+    recipe, folder = experiment.recipe, experiment.folder
+    part = Part.of(recipe, seeds=seeds)
+    if add:
+        experiment.published()
+    planned = plan(
+        recipe,
+        recipe_path,
+        folder,
+        part,
+        device=device,
+        publish=experiment.results if publish else None,
+        add_to=experiment.published_in if add else None,
+    )
+    make(experiment, _selected(recipe, planned, stage, method), jobs=jobs, device=device)
+    return folder / stage
+
+
+def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
+    """Validate a recipe without running it; return each planned artefact and whether it is finished."""
+    experiment = load_experiment(recipe_path, root)
+    experiment.check_unchanged()
+    planned = plan(experiment.recipe, recipe_path, experiment.folder)
+    return {item.key: finished(item, experiment) for item in planned}
+
+
+Show = Callable[[int, Console], AbstractContextManager[Watcher]]
+"""Begins to show so many items, as `display.display` does."""
+
+
+def make(
+    experiment: Experiment,
+    items: Collection[Item],
+    *,
+    jobs: int | None,
+    device: str,
+    cluster: str | None = None,
+    show: Show = display,
+) -> None:
+    """Make those of an experiment's `items` that are not finished yet.
+
+    Args:
+        experiment: whose artefacts they are.
+        items: each after those it reads.
+        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
+        device: torch device of the networks.
+        cluster: address of the Ray cluster that works, or "local" for one that is started; by default
+            processes of this machine do.
+        show: shows how the items get on.
+
+    Raises:
+        MissingStageError: an artefact that an item reads is neither finished nor among them.
+        RecipeError: the recipe differs from the one that made what is there.
+        BadInputError: another process runs in the recipe's folder, or device or cluster are not there.
+        AstraDataError: an item failed.
+    """
+    _check_device(device, cluster)
+    recipe, folder = experiment.recipe, experiment.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        experiment.check_unchanged()
+        items = [item for item in items if not finished(item, experiment)]
+        _check_inputs(experiment, items)
+        experiment.link_borrowed()
+        partial_file = folder / ".recipe.json.partial"
+        partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
+        os.replace(partial_file, folder / "recipe.json")
+        # The networks get one thread: faster as small as they are, and idle threads slow down other items.
+        prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
+        with show(len(items), Console()) as watch:
+            if cluster is None:
+                jobs = jobs or _default_jobs(device)
+                execute(_share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+            else:
+                items = [_with_threads(item, 1) for item in items]
+                execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+
+
+def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
+    """Check that what `items` read and none of them makes is finished."""
+    made = {item.key for item in items}
+    # The report takes the seeds that are there, and says itself which rows have none.
+    readers = [item for item in items if stage_of(item) not in ALWAYS_NEW]
+    reads = [key for item in readers for key in item.inputs if key not in made]
+    missing = next((key for key in reads if not experiment.has(key)), None)
+    if missing:
+        stage, root = missing.partition("/")[0], experiment.folder.parent
+        maker = experiment.maker(stage)
+        # Of the base, `run` makes what comes before the stage as well; the command `augment` takes no recipe.
+        alone = stage != "augment" and (maker is experiment or not STAGES[stage])
+        command = f"astra-data {stage if alone else 'run'} {maker.path}"
+        option = "" if root == RUNS else f" --root {root}"
+        raise MissingStageError(f"{experiment.place(missing)} is missing: run `{command}{option}` first")
+
+
+def _default_jobs(device: str) -> int:
+    return CUDA_JOBS if torch.device(device).type == "cuda" else cores()
+
+
+def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
+    """Tell the items that step the target's physics their share of the cores."""
+    counts = Counter(map(stage_of, items))
+    return [_with_threads(item, max(1, cores() // min(jobs, counts[stage_of(item)]))) for item in items]
+
+
+def _with_threads(item: Item, num_threads: int) -> Item:
+    if not item.is_threaded:
+        return item
+    return replace(item, call=partial(item.call, num_threads=num_threads))
+
+
+def finished(item: Item, experiment: Experiment) -> bool:
+    """Tell whether the artefact of `item` is there, and is not to be made anew."""
+    return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
+
+
+def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str | None) -> list[Item]:
+    if method is not None and method not in recipe.methods:
+        raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
+    if method is not None and stage in ("ground", "align"):
+        method = grounded_as(base_method(method))
+
+    def is_asked_for(key: str) -> bool:
+        made_by, *row_and_seed = key.split("/")
+        return made_by == stage and method in (None, *row_and_seed[:-1])
+
+    selected = [item for item in items if is_asked_for(item.key)]
+    if not selected:
+        raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
+    return selected
+
+
+def _check_stage(stage: str) -> None:
+    if stage not in STAGES:
+        raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
+
+
+def _check_device(device: str, cluster: str | None) -> None:
+    try:
+        wanted = torch.device(device)
+    except RuntimeError:
+        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'") from None
+    if cluster is not None:
+        # Ray gives each task its own GPU, which is the only one that it sees.
+        if wanted.index:
+            raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
+        return
+    count = torch.cuda.device_count()
+    if wanted.type == "cuda" and (wanted.index or 0) >= count:
+        raise BadInputError(f"device '{device}' is not here: torch sees {count} CUDA devices")

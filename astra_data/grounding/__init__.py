@@ -1,0 +1,1 @@
+"""From pairs to a corrected simulator: fit, simulate, measure."""

@@ -1,0 +1,63 @@
+"""How well a grounding does on episodes that it was not fitted to."""
+
+import torch
+from torch import Tensor
+
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.grounding import GroundingModel, LossWeights
+from astra_data.learning.networks.paired_windows import Windows
+
+
+@torch.no_grad()
+def telemetry(
+    model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights
+) -> dict[str, float | None]:
+    """Return what falling losses do not show, on `episodes`.
+
+    R² of each head that is trained (of the correction: of the simulator's error that it removes), None where
+    there is nothing to explain, as in a perfect simulator; the mean standard deviation of the latent's
+    entries, and the latent's effective rank (exponential of the entropy of the covariance's normalised
+    eigenvalues).
+    """
+    windows = episodes.windows
+    latent, _ = model.encode(windows)
+    mask = windows.mask.bool()
+    corrected = model.correct(latent, windows.action, windows.simulated_next)
+    figures = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
+    if weights.reward > 0:
+        going_on, failing = model.predict_reward_parts(latent, windows.action)[mask].unbind(-1)
+        reward, failed = windows.reward[mask][:, 0], windows.reward[mask][:, 1] != 0
+        figures["r2_reward"] = _r2(going_on[~failed], reward[~failed])
+        figures["r2_final_reward"] = _r2(failing, failed * model.failure_cost)
+    if weights.latent > 0:
+        mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
+        both = mask[:, :-1] & mask[:, 1:]
+        figures["r2_latent"] = _r2(mean[both], latent[:, 1:][both])
+    samples = latent[mask]
+    eigenvalues = torch.linalg.eigvalsh(torch.cov(samples.T)).clamp_min(1e-12)
+    shares = eigenvalues / eigenvalues.sum()
+    figures["latent_std"] = float(samples.std(0).mean())
+    figures["latent_rank"] = float(torch.exp(-(shares * shares.log()).sum()))
+    return figures
+
+
+def correction_r2(corrected: Tensor, windows: Windows, std: Tensor) -> float | None:
+    """Return the share of the simulator's squared error, in units of `std` (X,), that a correction removes.
+
+    `corrected` (B, T, X) is what the correction makes of the simulated next states of `windows`. None where
+    there is nothing to explain.
+    """
+    mask = windows.mask.bool()
+    wrong, raw = (
+        ((landed - windows.next_state) / std)[mask].square().sum()
+        for landed in (corrected, windows.simulated_next)
+    )
+    return _explained(wrong, raw)
+
+
+def _r2(predicted: Tensor, true: Tensor) -> float | None:
+    return _explained((predicted - true).square().sum(), (true - true.mean(0)).square().sum())
+
+
+def _explained(residual: Tensor, total: Tensor) -> float | None:
+    return float(1.0 - residual / total) if total > 0 else None

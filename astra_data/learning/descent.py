@@ -1,0 +1,96 @@
+"""Descent: fit a model by gradients, at a rate that falls to nothing; go on after an interruption."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.config import Config, Count, Positive
+from astra_data.core.logbook import Logbook
+
+
+class DescentConfig(Config):
+    """How a model is fitted by gradients. The paper prints none of it, nor of what stages add."""
+
+    updates: Count = 1500
+    """Gradient updates in all."""
+    learning_rate: Positive = 1e-3
+    """At the start; falls to zero along a half cosine."""
+    gradient_norm: Positive = 1.0
+    """Gradients are clipped to this norm."""
+
+
+class Descent:
+    """A fit in progress, by AdamW.
+
+    Attributes:
+        parameters: those that are fitted.
+        done: updates so far.
+        points: what was measured on the way.
+        stopwatch: runs from the beginning, on top of what was spent before an interruption.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        config: DescentConfig,
+        *,
+        checkpoint: Path | None = None,
+        weight_decay: float = 0.0,
+    ) -> None:
+        """Begin, or go on from the `checkpoint` if it is there.
+
+        Args:
+            model: what is fitted: its parameters that require gradients.
+            config: settings.
+            checkpoint: the file that `keep` writes; None to write none.
+            weight_decay: of AdamW.
+
+        Raises:
+            BadInputError: the checkpoint is of another model, or from an older version.
+        """
+        self.done = 0
+        self._model, self._config = model, config
+        self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        self._optimizer = torch.optim.AdamW(self.parameters, config.learning_rate, weight_decay=weight_decay)
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimizer, config.updates)
+        self._logbook = Logbook(checkpoint, self._go_on)
+        self.points, self.stopwatch = self._logbook.points, self._logbook.stopwatch
+
+    def _go_on(self, state: dict[str, Any]) -> None:
+        self._model.load_state_dict(state["model"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._schedule.load_state_dict(state["schedule"])
+        self.done = state["done"]
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all updates are done."""
+        return self.done >= self._config.updates
+
+    @property
+    def share(self) -> float:
+        """The share of the updates that is done."""
+        return self.done / self._config.updates
+
+    def update(self, loss: Tensor) -> None:
+        """Take one step down the gradient of `loss`."""
+        self._optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, self._config.gradient_norm)
+        self._optimizer.step()
+        self._schedule.step()
+        self.done += 1
+
+    def keep(self, **measured: float | None) -> None:
+        """Add what was `measured` after this many updates to the points, and write the checkpoint."""
+        self.points.append({"step": self.done, **measured})
+        self._logbook.keep(
+            {
+                "model": self._model.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+                "schedule": self._schedule.state_dict(),
+                "done": self.done,
+            }
+        )

@@ -1,0 +1,90 @@
+"""What every learner that acts in an environment does: stretches of steps, seeded each, and resumable."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from astra_data.core.seeding import derive
+from astra_data.learning.acting import Acting
+
+
+class Part(Protocol):
+    """A part of a training that is kept in checkpoints, such as a network or an optimiser."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that `load_state_dict` needs."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any], /) -> object:
+        """Go on from `state`."""
+        ...
+
+
+class Learner(ABC):
+    """A training in progress.
+
+    Every iteration seeds torch from (seed, iteration): a training that resumes from a checkpoint repeats what
+    an uninterrupted one would have done.
+
+    Attributes:
+        env: the world. acting: how a policy acts in it.
+        total_steps: environment steps in all. steps: those done.
+        rollout_steps: batched steps per iteration.
+    """
+
+    def __init__(
+        self, acting: Acting, parts: Mapping[str, Part], *, total_steps: int, rollout_steps: int, seed: int
+    ) -> None:
+        """Prepare to learn.
+
+        Args:
+            acting: the world, in which a policy is about to act.
+            parts: what changes while learning, beside it.
+            total_steps: environment steps in all.
+            rollout_steps: batched steps per iteration.
+            seed: of all randomness.
+        """
+        self.env, self.acting = acting.env, acting
+        self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
+        self._parts, self._seed, self._iteration = parts, seed, 0
+
+    @property
+    def done(self) -> bool:
+        """Whether all steps are done."""
+        return self.steps >= self.total_steps
+
+    @property
+    def share_left(self) -> float:
+        """Share of the steps that are not done yet."""
+        return 1.0 - self.steps / self.total_steps
+
+    def iterate(self) -> dict[str, float]:
+        """Take a stretch of steps and learn.
+
+        Returns:
+            the figures of `Acting`, and the learner's own.
+        """
+        torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
+        told = self._iterate()
+        self.steps += self.env.num_envs * self.rollout_steps
+        self._iteration += 1
+        return self.acting.figures() | told
+
+    @abstractmethod
+    def _iterate(self) -> dict[str, float]:
+        """Take `rollout_steps` batched steps and learn; return figures."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything but the environment's own state; see `load_state_dict`."""
+        told = {"steps": self.steps, "iteration": self._iteration, "acting": self.acting.state_dict()}
+        return {name: part.state_dict() for name, part in self._parts.items()} | told
+
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
+        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+        self.steps, self._iteration = state["steps"], state["iteration"]
+        self.acting.load_state_dict(state["acting"], observation)

@@ -1,0 +1,46 @@
+"""The policy and its value: Gaussian actor and critic, with or without a recurrent memory of their own."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.learning.networks.history import mlp
+from astra_data.learning.networks.policy import Policy, PolicyShape
+
+
+@dataclass(frozen=True)
+class ActorCriticShape(PolicyShape):
+    """Sizes of actor and critic, and the logarithm of the deviation that actions begin with."""
+
+    initial_log_std: float = -0.5
+
+
+class ActorCritic(Policy):
+    """Tanh-bounded Gaussian mean with a state-independent deviation, and a value."""
+
+    def __init__(self, shape: ActorCriticShape) -> None:
+        super().__init__(shape)
+        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, shape.action_size))
+        self.critic = mlp((shape.feature_size, *shape.hidden_sizes, 1))
+        self.log_std = nn.Parameter(torch.full((shape.action_size,), shape.initial_log_std))
+        for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
+            layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+            for layer in layers:
+                nn.init.orthogonal_(layer.weight, 2**0.5)
+                nn.init.zeros_(layer.bias)
+            nn.init.orthogonal_(layers[-1].weight, gain)
+
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation (..., A) of the action for `features` (..., F)."""
+        mean = torch.tanh(self.actor(features))
+        return mean, self.log_std.exp().expand_as(mean)
+
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the mean action (..., A), or with `generator` one that is drawn and cut off at ±1."""
+        mean, std = self.policy(features)
+        return mean if generator is None else torch.normal(mean, std, generator=generator).clamp(-1.0, 1.0)
+
+    def value(self, features: Tensor) -> Tensor:
+        """Return the value (...) of `features` (..., F)."""
+        return torch.as_tensor(self.critic(features).squeeze(-1))

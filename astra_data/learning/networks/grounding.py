@@ -1,0 +1,280 @@
+"""ASTRA's grounding model: history encoder, latent dynamics, reward, correction; and their joint loss.
+
+Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: the correction alone.
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from astra_data.core.numbers import normalised
+from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures, mlp
+from astra_data.learning.networks.paired_windows import RISK_STEPS, Windows
+
+TargetKind = Literal["ema", "detach", "online"]
+
+_BALL_M = 0.1
+"""Unit of where the ball lies from the robot: whether it is touched is decided by less than that."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """λ1, λ2, λ3 of the paper's total loss."""
+
+    latent: float = 1.0
+    reward: float = 1.0
+    state: float = 1.0
+
+
+@dataclass(frozen=True)
+class GroundingShape:
+    """Sizes of the networks; the paper prints none.
+
+    Attributes:
+        state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
+        position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
+        ball_index: where in the state the position of a ball begins; None where there is none.
+        correction_heads: of f_abs, whose mean corrects.
+        corrects_reward: R_pred is what the task's own reward lacks, not the whole.
+        reward_dropout: share of the latent that R_pred does not see while it learns.
+    """
+
+    state_size: int
+    action_size: int
+    goal_size: int
+    latent_size: int = 64
+    embedding_size: int = 64
+    head_sizes: tuple[int, ...] = (128, 128)
+    position_octaves: int = 4
+    ball_index: int | None = None
+    correction_heads: int = 1
+    corrects_reward: bool = False
+    reward_dropout: float = 0.0
+    log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
+
+
+class GroundingModel(nn.Module):
+    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone, plus a topple head that does not shape the latent.
+
+    Scales are buffers, so a checkpoint carries them; `set_scales` and `set_reward_scales` take them from the
+    training episodes.
+    """
+
+    def __init__(self, shape: GroundingShape, target: TargetKind = "ema") -> None:
+        super().__init__()
+        self.shape = shape
+        self.target = target
+        states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
+        self.position_features = PositionFeatures(shape.position_octaves)
+        features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
+        self.encoder = HistoryEncoder(
+            features + shape.goal_size + actions,
+            embedding_size=shape.embedding_size,
+            latent_size=latent,
+        )
+        heads = shape.head_sizes
+        self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
+        self.reward_head = mlp((latent + actions, *heads, 2))
+        sizes = (latent + actions + features, *heads, states)
+        self.corrections = nn.ModuleList(mlp(sizes) for _ in range(shape.correction_heads))
+        self.topple_head = mlp((latent + actions + features, *heads, 1))
+        # An untrained correction is the identity: the raw simulator.
+        for head in self.corrections:
+            for parameter in list(head.parameters())[-2:]:
+                nn.init.zeros_(parameter)
+        self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
+        for name, size in {
+            "state": states,
+            "goal": shape.goal_size,
+            "correction": states,
+        }.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.register_buffer("reward_mean", torch.zeros(()))
+        self.register_buffer("reward_std", torch.ones(()))
+        self.register_buffer("failure_cost", torch.zeros(()))
+        self.register_buffer("failure_weight", torch.zeros(()))
+        self.register_buffer("residual_factor", torch.zeros(states, states))
+        self.register_buffer("usual_disagreement", torch.ones(()))
+        self.state_mean: Tensor
+        self.state_std: Tensor
+        self.goal_mean: Tensor
+        self.goal_std: Tensor
+        self.correction_std: Tensor
+        self.reward_mean: Tensor
+        self.reward_std: Tensor
+        self.failure_cost: Tensor
+        self.failure_weight: Tensor
+        self.residual_factor: Tensor
+        self.usual_disagreement: Tensor
+
+    def set_scales(self, columns: Mapping[str, Tensor]) -> None:
+        """Take means and deviations from training steps: state, goal, correction (N, ...)."""
+        for name, values in columns.items():
+            if not values.numel():
+                continue  # no goals
+            getattr(self, f"{name}_mean").copy_(values.mean(0))
+            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+
+    @torch.no_grad()
+    def set_reward_scales(self, reward: Tensor, failure_weight: float = 1.0) -> None:
+        """Take the scales of `reward` (N, 2) from training steps, in its two parts: see `Windows`.
+
+        The reward head begins where it predicts as many failures as there are, and their loss is weighed by
+        how rare they are, times `failure_weight`.
+        """
+        going_on, failing = reward.unbind(-1)
+        failed = failing != 0
+        if not failed.all():
+            self.reward_mean.copy_(going_on[~failed].mean())
+            self.reward_std.copy_(going_on[~failed].std(correction=0).clamp_min(1e-3))
+        if failed.any():
+            rate = failed.float().mean().clamp(max=0.5)
+            self.failure_cost.copy_((failing[failed].mean() - self.reward_mean).clamp_max(0.0))
+            self.failure_weight.copy_(failure_weight / functional.binary_cross_entropy(rate, rate))
+            list(self.reward_head.parameters())[-1][1] = rate.logit()
+
+    def state_features(self, state: Tensor) -> Tensor:
+        """Normalise abstract states (..., X) and append the features of their position, and of the ball's."""
+        position, index = state[..., :2], self.shape.ball_index
+        features = [normalised(state, self.state_mean, self.state_std), self.position_features(position)]
+        if index is not None:
+            apart = state[..., index : index + 2] - position
+            near = torch.cat([apart, apart.norm(dim=-1, keepdim=True)], dim=-1)
+            features.append(normalised(near, 0.0, _BALL_M))
+        return torch.cat(features, dim=-1)
+
+    def normal_goal(self, goal: Tensor) -> Tensor:
+        """Normalise goals (..., G)."""
+        return (goal - self.goal_mean) / self.goal_std
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
+        return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
+
+    def encode(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Return the latents (B, T, Z) and hidden states (B, T, H) of histories that begin with `windows`."""
+        latent, hidden = self.encoder(
+            self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        )
+        return latent, hidden
+
+    def predict_latent(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """P_lat: return mean and log-variance (..., Z) of the next latent."""
+        mean, raw = self.latent_dynamics(torch.cat([latent, action], dim=-1)).chunk(2, dim=-1)
+        low, high = self.shape.log_variance_bounds
+        return mean, low + (high - low) * torch.sigmoid(raw)
+
+    def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        """R_pred: return the target's reward (...), or what the task's own on abstract states lacks of it."""
+        return self.predict_reward_parts(latent, action).sum(-1)
+
+    def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Return both parts of the target's reward (..., 2): of going on, and what failing takes from it.
+
+        The second is how probably the step fails, times what failing costs: it is rare and large, and as a
+        number of its own it pays as easily as it costs where there is no data, which policies find.
+        """
+        going_on, log_odds = self._reward_outputs(latent, action)
+        parts = [going_on * self.reward_std + self.reward_mean, log_odds.sigmoid() * self.failure_cost]
+        return torch.stack(parts, dim=-1)
+
+    def _reward_outputs(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the normalised reward of a step that goes on, and the log-odds that it fails, (...) each."""
+        going_on, log_odds = self.reward_head(torch.cat([latent, action], dim=-1)).unbind(-1)
+        return going_on, log_odds
+
+    def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """f_abs: return the corrected next abstract state (..., X)."""
+        return self.opinions(latent, action, simulated_next).mean(0)
+
+    def opinions(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return the next abstract state as each head corrects it, (K, ..., X)."""
+        inputs = torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
+        return torch.stack([simulated_next + head(inputs) * self.correction_std for head in self.corrections])
+
+    def doubt(self, opinions: Tensor) -> Tensor:
+        """Return how many times as much as on the data `opinions` (K, ..., X) differ, (...)."""
+        spread = (opinions / self.correction_std).std(0).square().mean(-1).sqrt()
+        return spread / self.usual_disagreement
+
+    def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """Return the log-odds (...) of a topple within `RISK_STEPS`, on the way to `next_state`."""
+        inputs = torch.cat([latent, action, self.state_features(next_state)], dim=-1)
+        logit: Tensor = self.topple_head(inputs)
+        return logit.squeeze(-1)
+
+    def topple_risk(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """Return the probability (...) that the target topples in this step."""
+        return self.topple_logit(latent, action, next_state).sigmoid() / RISK_STEPS
+
+    def update_target(self, rate: float) -> None:
+        """Move the EMA target encoder by `rate` toward the encoder."""
+        with torch.no_grad():
+            for slow, fast in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
+                slow.lerp_(fast, rate)
+
+    def losses(self, windows: Windows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the joint loss (paper, Section IV-A) and its parts, each a mean over real steps and dims."""
+        inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        latent, _ = self.encoder(inputs)
+        action, mask = windows.action, windows.mask
+        parts: dict[str, Tensor] = {}
+        total = torch.zeros((), device=mask.device)
+        if weights.latent > 0:
+            following = self._following_latent(inputs, latent)
+            mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
+            nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
+            both = mask[:, :-1] * mask[:, 1:]
+            parts["latent"] = (nll * both).sum() / both.sum()
+            total = total + weights.latent * parts["latent"]
+        if weights.reward > 0:
+            parts["reward"] = self._reward_loss(latent, windows)
+            total = total + weights.reward * parts["reward"]
+        parts["state"] = self._correction_loss(latent, windows)
+        total = total + weights.state * parts["state"]
+        logit = self.topple_logit(latent.detach(), action, windows.next_state)
+        entropy = functional.binary_cross_entropy_with_logits(logit, windows.topples_soon, reduction="none")
+        parts["topple"] = _masked_mean(entropy, mask)
+        return total + parts["topple"], parts
+
+    def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
+        """Return the mean of both parts' losses: about one, and its weight, where averages are predicted.
+
+        Without any failures in the data the second is zero.
+        """
+        if self.shape.reward_dropout:
+            latent = functional.dropout(latent, self.shape.reward_dropout, self.training)
+        going_on, log_odds = self._reward_outputs(latent, windows.action)
+        reward, failing = windows.reward.unbind(-1)
+        failed = (failing != 0).float()
+        error = (1.0 - failed) * (going_on - (reward - self.reward_mean) / self.reward_std)
+        surprise = functional.binary_cross_entropy_with_logits(log_odds, failed, reduction="none")
+        return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
+
+    def _correction_loss(self, latent: Tensor, windows: Windows) -> Tensor:
+        opinions = self.opinions(latent, windows.action, windows.simulated_next)
+        error = ((opinions - windows.next_state) / self.correction_std).square().mean(-1)
+        mask = windows.mask.expand_as(error)
+        if len(opinions) > 1:
+            # Heads that are fitted to other halves of every batch differ in what the data leaves open.
+            mask = mask * (torch.rand(*error.shape[:2], 1, device=error.device) < 0.5)
+        return _masked_mean(error, mask)
+
+    def _following_latent(self, inputs: Tensor, latent: Tensor) -> Tensor:
+        if self.target == "online":
+            return latent[:, 1:]
+        if self.target == "detach":
+            return latent[:, 1:].detach()
+        with torch.no_grad():
+            slow, _ = self.target_encoder(inputs)
+        return torch.as_tensor(slow[:, 1:])
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    return (values * mask).sum() / mask.sum()

@@ -1,0 +1,88 @@
+"""The history encoder: a GRU over states and actions whose layer-normalised hidden state is the latent."""
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def mlp(sizes: tuple[int, ...], activation: type[nn.Module] = nn.ELU) -> nn.Sequential:
+    """Build linear layers of `sizes` with `activation` between them."""
+    layers: list[nn.Module] = []
+    for size_in, size_out in pairwise(sizes):
+        layers += [nn.Linear(size_in, size_out), activation()]
+    return nn.Sequential(*layers[:-1])
+
+
+class PositionFeatures(nn.Module):
+    """Sines and cosines of planar positions, so that a smooth network can place sharp walls.
+
+    Maps (..., 2) in m to (..., 4 * octaves): wavelengths from `longest_m` down by halves.
+    """
+
+    def __init__(self, octaves: int, longest_m: float = 16.0) -> None:
+        super().__init__()
+        wavelengths = longest_m * 0.5 ** torch.arange(octaves)
+        self.register_buffer("frequencies", 2 * torch.pi / wavelengths)
+        self.frequencies: Tensor
+        self.size = 4 * octaves
+
+    def forward(self, position: Tensor) -> Tensor:
+        """Return the features of `position` (..., 2)."""
+        phases = (position.unsqueeze(-1) * self.frequencies).flatten(-2)
+        return torch.cat([phases.sin(), phases.cos()], dim=-1)
+
+
+class HistoryEncoder(nn.Module):
+    """Encode a history (x_1, x_2, ...) into latents (z_1, z_2, ...), one for each step.
+
+    x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). The hidden state is
+    handed in and out, never kept; the latent is the hidden state after a LayerNorm without gain, which
+    fixes each latent's length (the printed latent loss would otherwise shrink it without limit). That
+    different histories keep different latents is up to the target of that loss.
+    """
+
+    def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
+        super().__init__()
+        self.latent_size = latent_size
+        self.embedding = nn.Linear(input_size, embedding_size)
+        self.recurrence = nn.GRU(embedding_size, latent_size, batch_first=True)
+
+    def forward(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Encode `inputs` (B, T, I) from `hidden` (B, Z), by default zero.
+
+        Returns:
+            latents (B, T, Z) and hidden states (B, T, Z) after each step.
+        """
+        start = None if hidden is None else hidden.unsqueeze(0)
+        states, _ = self.recurrence(functional.elu(self.embedding(inputs)), start)
+        return self.latent(states), states
+
+    def step(self, inputs: Tensor, hidden: Tensor) -> Tensor:
+        """Take in one step `inputs` (B, I); return the next hidden state (B, Z)."""
+        return self._next(functional.elu(self.embedding(inputs)), hidden)
+
+    def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
+        """Encode `inputs` (B, T, I), in which episodes begin, from `hidden` (B, Z).
+
+        `start` (B, T) is 1 where a new episode begins: there the hidden state is emptied.
+
+        Returns:
+            hidden states (B, T, Z) after each step.
+        """
+        embedded = functional.elu(self.embedding(inputs)).unbind(1)
+        keep = (1.0 - start).unsqueeze(-1).unbind(1)
+        states = []
+        for step, kept in zip(embedded, keep, strict=True):
+            hidden = self._next(step, hidden * kept)
+            states.append(hidden)
+        return torch.stack(states, dim=1)
+
+    def latent(self, hidden: Tensor) -> Tensor:
+        """Return the latent of a hidden state (..., Z)."""
+        return functional.layer_norm(hidden, (self.latent_size,))
+
+    def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:
+        (weights,) = self.recurrence.all_weights
+        return torch.gru_cell(embedded, hidden, *weights)

@@ -1,0 +1,39 @@
+"""The policy of soft actor-critic: a Gaussian whose draws are squashed by tanh."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from astra_data.learning.networks.history import mlp
+from astra_data.learning.networks.policy import Policy, PolicyShape
+
+_SMALLEST_SCALE = 1e-3
+_UNIT_SCALE = math.log(math.e - 1.0)
+"""Its softplus is 1."""
+
+
+def gaussian(output: Tensor) -> tuple[Tensor, Tensor]:
+    """Return location and scale (..., A) that an actor's `output` (..., 2 A) stands for."""
+    loc, width = output.chunk(2, dim=-1)
+    return loc, functional.softplus(width + _UNIT_SCALE) + _SMALLEST_SCALE
+
+
+class SoftActor(Policy):
+    """Location and scale of a Gaussian, both of the features; actions are the tanh of its draws."""
+
+    squashes = True
+
+    def __init__(self, shape: PolicyShape) -> None:
+        super().__init__(shape)
+        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, 2 * shape.action_size), nn.ReLU)
+
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return location and scale (..., A) of the Gaussian, before the tanh, for `features` (..., F)."""
+        return gaussian(self.actor(features))
+
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the tanh of the location, (..., A), or with `generator` that of a draw."""
+        loc, scale = self.policy(features)
+        return torch.tanh(loc if generator is None else torch.normal(loc, scale, generator=generator))

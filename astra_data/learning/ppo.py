@@ -1,0 +1,192 @@
+"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
+
+One iteration collects a stretch of steps from every environment and makes a few passes over it. Whole
+stretches are kept together, so the same code trains policies with and without memory.
+"""
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.config import Config, Count, NotNegative, Positive, Share
+from astra_data.core.seeding import derive
+from astra_data.learning.acting import Acting
+from astra_data.learning.learner import Learner
+from astra_data.learning.networks.actor_critic import ActorCritic
+from astra_data.worlds.batched import BatchedEnv
+
+if TYPE_CHECKING:
+    from torchrl.objectives import ClipPPOLoss
+
+
+class PpoConfig(Config):
+    """Settings of proximal policy optimisation."""
+
+    total_steps: Count = 4_000_000
+    """Environment steps in all."""
+    rollout_steps: Count = 64
+    """Steps of every environment per iteration."""
+    epochs: Count = 5
+    """Passes over the collected steps per iteration."""
+    minibatches: Count = 4
+    """Updates per pass; each takes whole stretches of a share of the environments."""
+    learning_rate: Positive = 5e-4
+    """At the start; falls linearly to zero."""
+    discount: Share = 0.99
+    """Of the reward, per step."""
+    gae_lambda: Share = 0.95
+    """Decay of the advantage's n-step mixture, per step."""
+    clip: Positive = 0.2
+    """Largest change of an action's probability ratio that still earns."""
+    entropy_weight: NotNegative = 0.003
+    """Of the policy's entropy in the loss."""
+    value_weight: NotNegative = 0.5
+    """Of the critic's squared error in the loss."""
+    gradient_norm: Positive = 0.5
+    """Gradients are clipped to this norm."""
+    reward_scale: Positive = 0.1
+    """Factor on the reward that the critic learns from."""
+
+
+class Ppo(Learner):
+    """A training in progress.
+
+    Attributes:
+        policy: the networks being trained.
+    """
+
+    def __init__(
+        self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
+    ) -> None:
+        """Prepare to train `policy` in `env`.
+
+        Args:
+            env: the world.
+            policy: the networks.
+            config: settings.
+            horizon: rows are restarted after so many steps, without ending the task.
+            seed: of all randomness.
+        """
+        self.policy, self.config = policy, config
+        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
+        self._loss = _ppo_loss(policy, config)
+        torch.manual_seed(derive(seed, "first reset"))
+        super().__init__(
+            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=True),
+            {"policy": policy, "optimizer": self._optimizer},
+            total_steps=config.total_steps,
+            rollout_steps=config.rollout_steps,
+            seed=seed,
+        )
+
+    def _iterate(self) -> dict[str, float]:
+        """Collect one stretch and learn from it; return the mean "std" of the actions."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * self.share_left
+        self._learn(self._collect())
+        return {"std": float(self.policy.log_std.detach().exp().mean())}
+
+    @torch.no_grad()
+    def _collect(self) -> dict[str, Tensor]:
+        from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
+        acting, policy = self.acting, self.policy
+        columns: dict[str, list[Tensor]] = {}
+        first_hidden = acting.hidden
+        for _ in range(self.rollout_steps):
+            row = {
+                "observation": acting.observation,
+                "previous_action": acting.previous_action,
+                "start": acting.first.float(),
+            }
+            features, hidden = policy.remember(acting.observation, acting.previous_action, acting.hidden)
+            mean, std = policy.policy(features)
+            action = torch.normal(mean, std)
+            value = policy.value(features)
+            taken = acting.take(action, hidden)
+            step, expired = taken.step, taken.expired
+            row |= {
+                "action": action,
+                "action_log_prob": torch.distributions.Normal(mean, std).log_prob(action).sum(-1),
+                "value": value,
+                "reward": step.reward * self.config.reward_scale,
+                "terminated": step.terminated,
+                "done": taken.done,
+                "beyond": torch.zeros_like(value),
+            }
+            if bool(expired.any()):
+                beyond, _ = policy.remember(step.observation[expired], taken.action[expired], hidden[expired])
+                row["beyond"][expired] = policy.value(beyond)
+            for name, values in row.items():
+                columns.setdefault(name, []).append(values)
+        rollout = {name: torch.stack(values, dim=1) for name, values in columns.items()}
+        last, _ = policy.remember(acting.observation, acting.previous_action, acting.hidden)
+        following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
+        following = torch.where(rollout["done"], rollout["beyond"], following)
+        advantage, target = vec_generalized_advantage_estimate(
+            self.config.discount,
+            self.config.gae_lambda,
+            *(
+                rollout[name].unsqueeze(-1) if isinstance(name, str) else name.unsqueeze(-1)
+                for name in ("value", following, "reward", "done", "terminated")
+            ),
+        )
+        return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
+
+    def _learn(self, rollout: dict[str, Tensor]) -> None:
+        from tensordict import TensorDict
+
+        config, policy = self.config, self.policy
+        advantage = rollout["advantage"]
+        rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        count = len(advantage)
+        for _ in range(config.epochs):
+            order = torch.randperm(count, device=advantage.device)
+            for rows in order.chunk(config.minibatches):
+                batch = {name: values[rows] for name, values in rollout.items()}
+                features = policy.remember_sequence(
+                    batch["observation"], batch["previous_action"], batch["hidden"], batch["start"]
+                )
+                learned = ("action", "action_log_prob", "advantage", "value_target")
+                columns = {"features": features} | {name: batch[name] for name in learned}
+                losses = self._loss(TensorDict(columns, batch_size=features.shape[:2]))
+                total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+                self._optimizer.zero_grad()
+                total.backward()
+                nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
+                self._optimizer.step()
+
+
+def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> "ClipPPOLoss":
+    from tensordict.nn import TensorDictModule
+    from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+    from torchrl.objectives import ClipPPOLoss
+
+    actor = ProbabilisticActor(
+        TensorDictModule(_Policy(policy), in_keys=["features"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"tanh_loc": False},
+    )
+    critic = ValueOperator(policy.critic, in_keys=["features"])
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=config.clip,
+        entropy_coeff=config.entropy_weight,
+        critic_coeff=config.value_weight,
+        loss_critic_type="l2",
+    )
+    loss.set_keys(value_target="value_target", advantage="advantage", sample_log_prob="action_log_prob")
+    return loss
+
+
+class _Policy(nn.Module):
+    def __init__(self, policy: ActorCritic) -> None:
+        super().__init__()
+        self.actor, self.log_std = policy.actor, policy.log_std
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        mean = torch.tanh(self.actor(features))
+        return mean, self.log_std.exp().expand_as(mean)

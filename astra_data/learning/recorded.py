@@ -1,0 +1,58 @@
+"""Recorded episodes as a policy would have seen them, to learn from in windows."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """E recorded episodes of up to T steps, padded at the end.
+
+    Attributes:
+        observation: (E, T, O). previous_action: (E, T, A), zero at the start. action: (E, T, A).
+        lengths: the number of real steps of each episode, (E,).
+    """
+
+    observation: Tensor
+    previous_action: Tensor
+    action: Tensor
+    lengths: Tensor
+
+    def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Draw windows of `length` steps by torch's global generator.
+
+        Returns:
+            the columns by name, (count, length, ...), and which steps to learn from, (count, length) bool:
+            all but the first `burn_in` of a window that begins in the midst of its episode.
+        """
+        episodes, steps, learned = draw_steps(self.lengths, count, length)
+        learned &= steps < self.lengths[episodes]
+        learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
+        names = ("observation", "previous_action", "action")
+        return {name: getattr(self, name)[episodes, steps] for name in names}, learned
+
+
+def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw windows of `length` steps, each step equally likely; from torch's global generator.
+
+    A window that is drawn across an end of its episode is moved inside. Without those, the last steps, where
+    episodes topple, would hardly be seen.
+
+    Args:
+        lengths: of the episodes, (E,).
+        count: of windows.
+        length: of each window; at most the longest episode's.
+
+    Returns:
+        episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn, (count,
+        length) bool. In an episode shorter than `length`, steps beyond its end are among them.
+    """
+    length = min(length, int(lengths.max()))
+    beginnings = lengths + length - 1
+    episodes = torch.multinomial(beginnings.float(), count, replacement=True)
+    drawn = (torch.rand(count, device=episodes.device) * beginnings[episodes]).long() - (length - 1)
+    first = drawn.clamp_min(0).minimum((lengths[episodes] - length).clamp_min(0))
+    steps = first[:, None] + torch.arange(length, device=first.device)
+    return episodes[:, None], steps, (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)

@@ -1,0 +1,68 @@
+"""The most recent steps of a batched environment, from which windows of steps in a row are drawn."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from astra_data.worlds.batched import BatchedEnv
+
+
+class Replay:
+    """The last steps of B environments, row after row, in contiguous tensors."""
+
+    def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: torch.device) -> None:
+        """Keep the last `size` steps of `env`, as many of each row, and memories of `memory_size` numbers."""
+        self._rows = size // env.num_envs
+        self._added = 0
+        place = self._rows, env.num_envs
+        numbers = {"observation": (env.observation_size,), "action": (env.action_size,), "reward": ()}
+        numbers |= {"previous_action": numbers["action"], "hidden": (memory_size,)}
+        self._columns = {name: torch.empty(*place, *size, device=device) for name, size in numbers.items()}
+        for name in ("terminated", "expired", "first"):
+            self._columns[name] = torch.empty(place, dtype=torch.bool, device=device)
+
+    def __len__(self) -> int:
+        """Steps of each row that are kept."""
+        return min(self._added, self._rows)
+
+    def add(self, **step: Tensor) -> None:
+        """Add a step of every environment.
+
+        Args:
+            step: observation (B, O); previous_action (B, A) and the policy's memory before the step, hidden
+                (B, M), both zero at the start; action (B, A); reward (B,); bool (B,): terminated, expired,
+                where time ran out, and first, where an episode begins.
+        """
+        row = self._added % self._rows
+        for name, column in self._columns.items():
+            column[row] = step[name]
+        self._added += 1
+
+    def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Draw windows of `length` steps in a row, and one step more, from torch's global generator.
+
+        Returns:
+            the columns (count, length + 1, ...), and what can be learned from, (count, length) bool: steps of
+            a known outcome, but for the first `burn_in` of a window, which only fill the memory, as long as
+            no episode has begun in it.
+        """
+        device = self._columns["reward"].device
+        oldest = self._added - len(self)
+        begin = oldest + torch.randint(len(self) - length, (count, 1), device=device)
+        steps = (begin + torch.arange(length + 1, device=device)) % self._rows
+        env = torch.randint(self._columns["reward"].shape[1], (count, 1), device=device)
+        drawn = {name: column[steps, env] for name, column in self._columns.items()}
+        filled = torch.arange(length, device=device) >= burn_in
+        has_begun = drawn["first"][:, :-1].cumsum(1) > 0
+        return drawn, ~drawn["expired"][:, :-1] & (filled | has_begun)
+
+    def state_dict(self) -> dict[str, Tensor | int]:
+        """Return what is kept."""
+        return {"added": self._added} | {name: column[: len(self)] for name, column in self._columns.items()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor | int]) -> None:
+        """Go on with what `state_dict` returned."""
+        self._added = int(state["added"])
+        for name, column in self._columns.items():
+            column[: len(self)] = torch.as_tensor(state[name], device=column.device)

@@ -1,0 +1,224 @@
+"""Read what the other stages left behind: a missing key is an error, an extra one is not."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from astra_data.core.errors import BadInputError
+from astra_data.reports.schema import Machine
+
+EVALUATION = "evaluation.json"
+TRAJECTORIES = "trajectories.safetensors"
+
+
+class Artefact(BaseModel):
+    """A file that a stage wrote, with how it was made where it says so."""
+
+    model_config = ConfigDict(frozen=True)
+
+    wall_seconds: float | None = None
+    """How long the stage ran, in s."""
+    cpu_seconds: float | None = None
+    """Of all its threads, in s."""
+    git_commit: str | None = None
+    """Of the code, ending in "-dirty" where it was changed since."""
+    packages: dict[str, str | None] = Field(default_factory=dict)
+    machine: Machine | None = None
+
+
+class Outcomes(BaseModel):
+    """How a policy's episodes went, one number per episode."""
+
+    model_config = ConfigDict(frozen=True)
+
+    success: list[float]
+    """1 where the goal was reached, else 0."""
+    failed: list[float]
+    """1 where it ended badly, else 0."""
+    wall_contact: list[float]
+    """Share of the episode's steps in contact with a wall."""
+    steps: list[float]
+    """Length of the episode in control steps."""
+    returns: list[float] = Field(alias="return")
+    """Undiscounted sum of rewards."""
+
+    def means(self) -> dict[str, float]:
+        """Return the mean of each measure over the episodes, by its name in the file."""
+        measures = self.model_dump(by_alias=True)
+        return {name: float(np.mean(values)) for name, values in measures.items()}
+
+
+class Evaluation(Artefact):
+    """evaluation.json of one row and seed."""
+
+    task: str
+    method: str
+    seed: int
+    episodes: int = Field(ge=1)
+    leg_scale: float = 1.0
+    dataset_version: str | None = None
+    dataset_hash: str | None = None
+    target_steps_per_second: float | None = None
+    target: Outcomes
+    simulated: Outcomes | None = None
+    """In the simulator that the policy was trained in; None for a row that was in none."""
+    raw: Outcomes | None = None
+    """In the raw simulator; None for a policy that cannot act on abstract states."""
+    grounded: Outcomes | None = None
+    """In the grounded simulator for reference, where there is one; None likewise."""
+    encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """Mean of each measure by encoder, where there is more than one."""
+
+    @model_validator(mode="after")
+    def _one_number_per_episode(self) -> Self:
+        wrong = [
+            f"{world}.{name} has {len(values)}"
+            for world in ("target", "simulated", "raw", "grounded")
+            if (outcomes := getattr(self, world)) is not None
+            for name, values in outcomes.model_dump(by_alias=True).items()
+            if len(values) != self.episodes
+        ]
+        if wrong:
+            raise ValueError(f"expected {self.episodes} episodes, but {', '.join(wrong)}")
+        return self
+
+
+class Point(BaseModel):
+    """One moment of a training."""
+
+    model_config = ConfigDict(frozen=True)
+
+    steps: float
+    success: float | None
+    """Of the training episodes that ended; None where none had."""
+    episode_steps: float | None = None
+    """Their mean length; None where none had, or where it was not recorded."""
+
+
+class CurveFile(Artefact):
+    """curve.json of one row and seed."""
+
+    steps_per_second: float | None = None
+    simulator_steps_per_second: float | None = None
+    updates_per_second: float | None = None
+    points: list[Point] = Field(min_length=1)
+
+
+class Metrics(Artefact):
+    """metrics.json of one row and seed's grounding or alignment."""
+
+    windows_per_second: float | None = None
+    episodes_per_second: float | None = None
+    replays_per_second: float | None = None
+
+
+class Band(BaseModel):
+    """An error at each horizon."""
+
+    model_config = ConfigDict(frozen=True)
+
+    mean: list[float]
+    low: list[float]
+    high: list[float]
+
+
+class Gap(Artefact):
+    """gap.json: open-loop error by horizon, for each quantity."""
+
+    horizons: list[int]
+    """Steps ahead."""
+    grounded: dict[str, Band]
+    raw: dict[str, Band]
+
+    @model_validator(mode="after")
+    def _one_number_per_horizon(self) -> Self:
+        if set(self.grounded) != set(self.raw):
+            raise ValueError(f"grounded has {sorted(self.grounded)}, but raw has {sorted(self.raw)}")
+        for name, band in [*self.grounded.items(), *self.raw.items()]:
+            lengths = {len(band.mean), len(band.low), len(band.high)}
+            if lengths != {len(self.horizons)}:
+                raise ValueError(f"expected {len(self.horizons)} numbers for {name}, got {sorted(lengths)}")
+        return self
+
+
+class DatasetFile(Artefact):
+    """meta/astra/dataset.json of a dataset."""
+
+    name: str
+    version: str
+    content_hash: str
+    target_steps_per_second: float | None = None
+    pairs_per_second: float | None = None
+
+
+def read_json[T: Artefact](model: type[T], path: Path) -> T:
+    """Read one of the files above.
+
+    Raises:
+        BadInputError: the file does not hold what its stage writes; the message lists every mismatch.
+    """
+    try:
+        return model.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        wrong = "; ".join(
+            f"{'.'.join(map(str, item['loc'])) or 'file'}: {item['msg']}" for item in error.errors()
+        )
+        raise BadInputError(f"{path} is not what its stage writes: {wrong}; run that stage again") from None
+
+
+def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
+    """Read a safetensors file that holds at least `names`.
+
+    Raises:
+        BadInputError: the file is no safetensors file, or lacks a tensor.
+    """
+    try:
+        tensors = load_file(path)
+    except SafetensorError as error:
+        raise BadInputError(f"{path} is no whole safetensors file ({error}); run its stage again") from None
+    missing = [name for name in names if name not in tensors]
+    if missing:
+        raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")
+    return {name: tensor.astype(np.float64) for name, tensor in tensors.items()}
+
+
+def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
+    """Return the episodes per row and seed of all rows.
+
+    Raises:
+        BadInputError: rows were evaluated differently.
+    """
+    files = [file for of_seeds in evaluations.values() for file in of_seeds.values()]
+    episodes = files[0].episodes
+    wrong = [f"{file.method} seed {file.seed} on {file.task}" for file in files if file.task != task]
+    wrong += [
+        f"{file.method} seed {file.seed} with {file.episodes} episodes"
+        for file in files
+        if file.episodes != episodes
+    ]
+    legs = files[0].leg_scale
+    wrong += [
+        f"{file.method} seed {file.seed} with legs {file.leg_scale:g} times as long"
+        for file in files
+        if file.leg_scale != legs
+    ]
+    if wrong:
+        raise BadInputError(
+            f"expected every row evaluated on {task} with {episodes} episodes, got {', '.join(wrong)}; "
+            "evaluate those rows again"
+        )
+    return episodes
+
+
+def way_to_success(path: Path, evaluation: Evaluation) -> float:
+    """Return the robot's mean way in m in the episodes at `path` that succeeded, NaN for none."""
+    robot = read_tensors(path, ("target.position",))["target.position"][..., :2]
+    ways = np.nansum(np.linalg.norm(np.diff(robot, axis=1), axis=-1), axis=1)
+    succeeded = ways[np.array(evaluation.target.success, dtype=bool)]
+    return float(succeeded.mean()) if len(succeeded) else float("nan")

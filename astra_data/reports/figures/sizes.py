@@ -1,0 +1,109 @@
+"""A score over the size of the dataset, under what each size covers (the paper's data-efficiency figure)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from astra_data.core.naming import is_plus
+from astra_data.reports.figures.style import method_colour, method_title, score_axis, style
+from astra_data.worlds.score import Score
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Visits:
+    """How often the cells of a plane were visited.
+
+    Attributes:
+        counts: indexed [y, x] from the lower left, (height, width).
+        extent: left, right, bottom and top edge.
+    """
+
+    counts: Ints
+    extent: tuple[float, float, float, float]
+
+
+def data_efficiency(
+    score: Score,
+    percents: Sequence[int],
+    scores: Mapping[str, Sequence[Floats]],
+    intervals: Mapping[str, Floats],
+    covered: Mapping[str, Sequence[Visits]],
+) -> Figure:
+    """Draw a map per size for each of `covered`, and below them a score with a band per row.
+
+    Args:
+        score: what is drawn over the size.
+        percents: the K sizes.
+        scores: those of each row's seeds, K times (seeds,).
+        intervals: interquartile mean, low and high of each row, (3, K); low and high NaN for a single seed.
+        covered: what is mapped, such as "position (m)" → the visits of each size.
+    """
+    with style():
+        order = np.argsort(percents)
+        sizes = np.array(percents, dtype=float)[order]
+        ratios = [1.0] * len(covered) + [2.2]
+        figure = Figure(figsize=(1.0 + 1.5 * max(4, len(percents)), 1.6 * sum(ratios)), layout="constrained")
+        grid = figure.add_gridspec(len(ratios), len(percents), height_ratios=ratios)
+        for row, (label, visits) in enumerate(covered.items()):
+            first = figure.add_subplot(grid[row, 0])
+            panels = [first]
+            panels += [
+                figure.add_subplot(grid[row, k], sharex=first, sharey=first) for k in range(1, len(percents))
+            ]
+            _maps(panels, [visits[k] for k in order], label)
+            if row == 0:
+                for axes, k in zip(panels, order, strict=True):
+                    axes.set_title(f"{percents[k]} %")
+        axes = figure.add_subplot(grid[len(covered), :])
+        for method, seeds in scores.items():
+            _band(
+                axes,
+                np.array(percents, dtype=float)[order],
+                [seeds[k] for k in order],
+                intervals[method][:, order],
+                method,
+            )
+        axes.set_xticks(sizes, [f"{percent:g} %" for percent in sizes])
+        axes.set_xlabel("size of the dataset")
+        score_axis(axes, score)
+        axes.set_ylabel(f"{score.quantity} in the target")
+        axes.legend(loc="lower right", ncols=2)
+        return figure
+
+
+def _maps(panels: Sequence[Axes], visits: Sequence[Visits], label: str) -> None:
+    """Draw one map per panel, with the colours and the limits of the one that covers most."""
+    most = max(2, max(int(visit.counts.max()) for visit in visits))
+    extents = np.array([visit.extent for visit in visits])
+    for axes, visit in zip(panels, visits, strict=True):
+        axes.imshow(
+            np.where(visit.counts > 0, visit.counts, np.nan),
+            origin="lower",
+            extent=visit.extent,
+            cmap="viridis",
+            norm=LogNorm(vmin=1, vmax=most),
+            interpolation="nearest",
+        )
+        axes.grid(visible=False)
+        axes.tick_params(labelleft=axes is panels[0], labelsize=6.5)
+    panels[0].set_xlim(extents[:, 0].min(), extents[:, 1].max())
+    panels[0].set_ylim(extents[:, 2].min(), extents[:, 3].max())
+    panels[0].set_ylabel(label)
+
+
+def _band(axes: Axes, percents: Floats, seeds: Sequence[Floats], interval: Floats, method: str) -> None:
+    middle, low, high = interval
+    colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
+    if np.isfinite(low).all():
+        axes.fill_between(percents, low, high, color=colour, alpha=0.18, lw=0)
+    axes.plot(percents, middle, dashes, color=colour, marker="o", ms=4, label=method_title(method))
+    places = np.repeat(percents, [len(of_size) for of_size in seeds])
+    axes.plot(places, np.concatenate(seeds), ".", color=colour, alpha=0.45, ms=4, zorder=1)

@@ -1,0 +1,161 @@
+"""One look for all figures: each method has one colour and one title wherever it appears."""
+
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.style import context
+from PIL import Image
+
+from astra_data.core.naming import base_method, is_plus
+from astra_data.worlds.score import Score
+
+TITLES = {
+    "direct_transfer": "Direct transfer",
+    "domain_randomization": "Domain randomization",
+    "compass": "COMPASS",
+    "compass_uniform": "COMPASS, uniform",
+    "rma": "RMA",
+    "nas": "NAS",
+    "nas_golemo": "NAS (Golemo et al.)",
+    "astra": "ASTRA",
+    "astra_without_latent": "ASTRA w/o L_trans",
+    "astra_without_reward": "ASTRA w/o L_rew",
+    "astra_task_reward": "ASTRA, task reward",
+    "behavior_cloning": "Behavior cloning",
+    "iql": "IQL",
+    "direct_transfer_iql": "Direct transfer + IQL",
+    "target": "Target",
+    "full_obs": "Full Obs",
+    "follower": "Careful follower",
+    "raw": "Raw simulator",
+    "gains": "One gain per axis",
+    "ridge": "Ridge regression",
+    "mlp": "Feed-forward network",
+}
+
+COLOURS = {
+    "direct_transfer": "#E69F00",
+    "domain_randomization": "#CC79A7",
+    "compass": "#F0E442",
+    "compass_uniform": "#B8A000",
+    "rma": "#A6761D",
+    "nas": "#56B4E9",
+    "nas_golemo": "#0072B2",
+    "astra": "#009E73",
+    "astra_without_latent": "#44AA99",
+    "astra_without_reward": "#999933",
+    "astra_task_reward": "#117733",
+    "behavior_cloning": "#AA4499",
+    "iql": "#D55E00",
+    "direct_transfer_iql": "#7B3294",
+    "target": "#4D4D4D",
+    "full_obs": "#1A1A1A",
+    "follower": "#9A9A9A",
+    "raw": "#2B2B2B",
+    "gains": "#B58900",
+    "ridge": "#D33682",
+    "mlp": "#6C71C4",
+}
+"""Okabe and Ito's palette, which colour-blind readers can tell apart."""
+
+SPARE_COLOURS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
+"""For methods without a colour of their own."""
+
+ROLES = {
+    "direct_transfer": "floor",
+    "target": "trained there",
+    "full_obs": "trained there",
+    "follower": "ceiling",
+}
+"""Rows that the others are seen against: no grounding at all; trained in the target itself, which the same
+steps need not teach as much; written by hand."""
+
+SIMULATED = "#E07B00"
+"""A simulator, in every figure (as in the paper's Fig. 3)."""
+
+DEPLOYED = "#0060A8"
+"""The target environment, likewise."""
+
+INK = "#2B2B2B"
+FAINT = "#8A8A8A"
+WALL = "#D9D9D6"
+
+_RC = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "axes.labelsize": 9.0,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "#E8E8E6",
+    "grid.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.8,
+    "lines.solid_capstyle": "round",
+    "hatch.linewidth": 0.9,
+    "figure.facecolor": "white",
+    "figure.dpi": 200,
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw in the figures' style, whatever the caller's matplotlib settings are."""
+    with context(_RC, after_reset=True):
+        yield
+
+
+def method_title(method: str) -> str:
+    """Return the title of a row: "astra_plus" is "ASTRA+"."""
+    base = base_method(method)
+    title = TITLES.get(base, base.replace("_", " ").capitalize())
+    return f"{title}+" if is_plus(method) else title
+
+
+def method_colour(method: str) -> str:
+    """Return the colour of a row as "#rrggbb": a variant's is its base row's, darker."""
+    base = base_method(method)
+    spare = SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
+    colour = COLOURS.get(base, spare)
+    if is_plus(method):
+        red, green, blue = to_rgb(colour)
+        return to_hex((0.68 * red, 0.68 * green, 0.68 * blue))
+    return colour.lower()
+
+
+def score_axis(axes: Axes, score: Score) -> None:
+    """Let the vertical axis begin at no score, and end at the limit if there is one."""
+    if score.limit is None:
+        axes.set_ylim(bottom=0)
+    else:
+        axes.set_ylim(-0.02 * score.limit, 1.02 * score.limit)
+
+
+def png(figure: Figure) -> bytes:
+    """Render a figure as PNG of 256 colours (a fifth of the bytes of all colours), without a display."""
+    drawn, small = BytesIO(), BytesIO()
+    with style():
+        figure.savefig(drawn, format="png")
+    with Image.open(drawn) as picture:
+        palette = picture.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette.save(small, format="png", optimize=True)
+    return small.getvalue()

@@ -1,0 +1,64 @@
+"""Results as files: JSON, the page, and figures."""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from astra_data.core.errors import BadInputError
+from astra_data.reports.page import HOW_TO_READ
+from astra_data.reports.schema import Results
+from astra_data.reports.sizes import HOW_TO_READ as HOW_TO_READ_SIZES
+from astra_data.reports.sizes import SizesResults
+
+Found = Results | SizesResults
+Page = Callable[[Mapping[str, str]], str]
+"""Returns the page with the figures of these names and files."""
+
+
+def read_published(path: Path) -> Found:
+    """Return the results in a JSON file.
+
+    Raises:
+        BadInputError: there are none, or they are not as they are written now.
+    """
+    if not path.is_file():
+        raise BadInputError(f"expected published results in {path}, found none: leave out what asks for them")
+    try:
+        return TypeAdapter[Found](Found).validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise BadInputError(f"{path} does not hold results as they are written now: {error}") from None
+
+
+def published_figures(folder: Path, recipe: str) -> dict[str, bytes]:
+    """Return the figures of a recipe that are in `folder`, by name."""
+    paths = {name: folder / f"{recipe}_{name}.png" for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES)}
+    return {name: path.read_bytes() for name, path in paths.items() if path.exists()}
+
+
+def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:
+    """Write to `folder` under the recipe's name, in place of what was there before."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES):
+        (folder / f"{found.recipe}_{name}.png").unlink(missing_ok=True)
+    write_results(found, page, images, folder, found.recipe, f"{found.recipe}_")
+
+
+def write_results(
+    found: Found, page: Page, images: dict[str, bytes], folder: Path, stem: str, prefix: str = ""
+) -> None:
+    """Write `stem`.json, `stem`.md and the PNG `images`, each with `prefix` before its name."""
+    names = {name: f"{prefix}{name}.png" for name in images}
+    (folder / f"{stem}.json").write_text(_json(found), encoding="utf-8")
+    (folder / f"{stem}.md").write_text(page(names), encoding="utf-8")
+    for name, image in images.items():
+        (folder / names[name]).write_bytes(image)
+
+
+def _json(results: Found) -> str:
+    """Return indented JSON in which a list of numbers takes one line."""
+    values = json.loads(results.model_dump_json(by_alias=True))
+    text = json.dumps(values, indent=2, ensure_ascii=False)
+    return re.sub(r"\[\n[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"

@@ -1,0 +1,50 @@
+"""How numbers and tables look on the page."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from astra_data.reports.statistics import Summary
+
+
+def table(head: Sequence[str], rows: Iterable[Iterable[str]], *, words: int = 1) -> str:
+    """Return a Markdown table whose first `words` columns are aligned left, the others right."""
+    rule = ["---"] * words + ["---:"] * (len(head) - words)
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *rows))
+
+
+def spread(summary: Summary, digits: int) -> str:
+    """Return mean ± standard deviation."""
+    return _mean_std(summary.mean, summary.std, digits)
+
+
+def mean_std(values: list[float], digits: int) -> str:
+    """Return mean ± standard deviation of one value per seed."""
+    std = float(np.std(values, ddof=1)) if len(values) > 1 else None
+    return _mean_std(float(np.mean(values)), std, digits)
+
+
+def _mean_std(mean: float, std: float | None, digits: int) -> str:
+    return f"{mean:.{digits}f}" + ("" if std is None else f" ± {std:.{digits}f}")
+
+
+def interval(value: float, low: float | None, high: float | None, digits: int = 2) -> str:
+    """Return a value with its interval, where it has one."""
+    ends = "" if low is None or high is None else f" [{low:.{digits}f}, {high:.{digits}f}]"
+    return f"{value:.{digits}f}{ends}"
+
+
+def short(rate: float) -> str:
+    """Return three digits."""
+    return f"{rate / 1000:.3g} k" if rate >= 1000 else f"{rate:.3g}"
+
+
+def duration(seconds: float | None) -> str:
+    """Return a time in a unit that suits it; a dash for None."""
+    if seconds is None:
+        return "-"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"

@@ -1,0 +1,34 @@
+"""Where results come from, each origin and each choice of datasets said once."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from astra_data.reports.schema import DatasetUse, Origin
+
+Named = tuple[str | None, str | None]
+"""Version and hash of the dataset that an evaluation names."""
+
+
+def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
+    """Return every code, machine and set of packages once, with all the stages that it made."""
+    merged: dict[str, Origin] = {}
+    for origin in origins:
+        key = origin.model_dump_json(exclude={"stages"})
+        known = merged.get(key, origin)
+        stages = list(dict.fromkeys([*known.stages, *origin.stages]))
+        merged[key] = known.model_copy(update={"stages": stages})
+    return list(merged.values())
+
+
+def dataset_uses(named: Mapping[str, Sequence[Named]]) -> list[DatasetUse]:
+    """Return the datasets of each row's seeds, with the rows that name the same ones together."""
+    rows: dict[tuple[Named, ...], list[str]] = {}
+    for method, of_seeds in named.items():
+        rows.setdefault(tuple(of_seeds), []).append(method)
+    return [
+        DatasetUse(
+            versions=[version for version, _ in of_seeds],
+            hashes=[digest for _, digest in of_seeds],
+            methods=methods,
+        )
+        for of_seeds, methods in rows.items()
+    ]

@@ -1,0 +1,136 @@
+"""Find the artefacts of all rows and seeds of a recipe."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from astra_data.core.errors import BadInputError, MissingStageError
+from astra_data.core.naming import base_method, place
+from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
+
+SHARED = ("ground", "align")
+"""Stages whose artefacts a "_plus" row takes from its base row."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The artefacts of one recipe: `root`/<stage>/<method>/seed_<seed>/.
+
+    Attributes:
+        recipe: the recipe's name.
+        root: its folder of runs.
+        methods: the rows.
+        seeds: to report, of each row those whose evaluation is finished.
+        groundings: row → the folder of its grounding and alignment, where that is not its base's.
+        percent: the size of the dataset, where there are several.
+    """
+
+    recipe: str
+    root: Path
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    groundings: Mapping[str, str] = field(default_factory=dict)
+    percent: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check that there is something to report."""
+        if not self.methods or not self.seeds:
+            raise BadInputError(
+                f"{self.recipe}: expected methods and seeds, got none; name some in the recipe"
+            )
+
+    def owner(self, stage: str, method: str) -> str:
+        """Return the name of a row's folder: rows may share a grounding and its alignment."""
+        if stage in SHARED and not (self.root / stage / method).is_dir():
+            return self.groundings.get(method, base_method(method))
+        return method
+
+    def path(self, stage: str, method: str, seed: int, name: str) -> Path:
+        """Return where a stage leaves a file of one row and seed."""
+        return self.root / stage / self.owner(stage, method) / place(seed, self.percent) / name
+
+    @cached_property
+    def _seeds(self) -> dict[str, tuple[int, ...]]:
+        return {
+            method: tuple(
+                seed for seed in self.seeds if self.path("evaluate", method, seed, EVALUATION).exists()
+            )
+            for method in self.methods
+        }
+
+    @property
+    def any_finished(self) -> bool:
+        """Whether any row has an evaluation."""
+        return any(self._seeds.values())
+
+    @property
+    def finished(self) -> dict[str, tuple[int, ...]]:
+        """The seeds of each row whose evaluation is finished; rows without any are left out.
+
+        Raises:
+            MissingStageError: no row has one.
+        """
+        if not self.any_finished:
+            self._require("evaluate", EVALUATION, dict.fromkeys(self.methods, self.seeds))
+        return {method: found for method, found in self._seeds.items() if found}
+
+    def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
+        """Read a file of every row and its finished seeds: row → seed → file."""
+        return self._read(stage, name, model, tuple(self.finished))
+
+    def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
+        """Read a file of the rows that have it, by `owner`: for all of their finished seeds, or for none."""
+        present = [
+            method
+            for method, seeds in self.finished.items()
+            if any(self.path(stage, method, seed, name).exists() for seed in seeds)
+        ]
+        return self._read(stage, name, model, present)
+
+    def datasets(self, stage: str) -> dict[int, DatasetFile]:
+        """Read what is known of the datasets that a stage wrote, by seed."""
+        percent = self.percent if stage == "subset" else None
+        paths = {
+            seed: self.root / stage / place(seed, percent) / "meta" / "astra" / "dataset.json"
+            for seed in self.seeds
+        }
+        return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}
+
+    def require(self, stage: str, name: str, methods: Sequence[str]) -> None:
+        """Check that the rows have a file for every finished seed.
+
+        Raises:
+            MissingStageError: some have not; the message lists them and says how to make the first.
+        """
+        self._require(stage, name, {method: self.finished[method] for method in methods})
+
+    def _require(self, stage: str, name: str, wanted: Mapping[str, Sequence[int]]) -> None:
+        missing = {
+            method: [seed for seed in seeds if not self.path(stage, method, seed, name).exists()]
+            for method, seeds in wanted.items()
+        }
+        missing = {method: seeds for method, seeds in missing.items() if seeds}
+        if not missing:
+            return
+        method, (seed, *_) = next(iter(missing.items()))
+        absent = "; ".join(f"{row} seed {', '.join(map(str, seeds))}" for row, seeds in missing.items())
+        option = "" if self.root.parent == Path("runs") else f" --root {self.root.parent}"
+        raise MissingStageError(
+            f"expected {name} in {self.root / stage}/<method>/seed_<seed>/, found none for {absent}; "
+            f"run `astra-data {stage} recipes/{self.recipe}.toml --method {method} --seed {seed}{option}`"
+        )
+
+    def _read[T: Artefact](
+        self, stage: str, name: str, model: type[T], methods: Sequence[str]
+    ) -> dict[str, dict[int, T]]:
+        self.require(stage, name, methods)
+        paths: dict[str, dict[int, Path]] = {}
+        for method in methods:
+            # Rows that share an artefact may have different seeds of it.
+            found = paths.setdefault(self.owner(stage, method), {})
+            found |= {seed: self.path(stage, method, seed, name) for seed in self.finished[method]}
+        return {
+            owner: {seed: read_json(model, found[seed]) for seed in self.seeds if seed in found}
+            for owner, found in paths.items()
+        }

@@ -1,0 +1,180 @@
+"""How a few seeds are summarised: mean and spread, interquartile mean, intervals, comparisons, correlations.
+
+Follows "Deep reinforcement learning at the edge of the statistical precipice" (Agarwal et al., 2021) by means
+of its own library, rliable. One score per seed and task, in any unit that all tasks share; resampling is over
+seeds, within each task.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import BadInputError
+
+Floats = NDArray[np.float64]
+
+REPLICATES = 2000
+"""Bootstrap resamples behind each interval."""
+
+CONFIDENCE = 0.95
+"""Share of the resamples that lie inside an interval."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a row's seeds say together.
+
+    Attributes:
+        mean: mean over seeds.
+        std: sample standard deviation over seeds; None for a single seed.
+        iqm: interquartile mean: the mean of the middle half of the seeds.
+        low: lower end of the 95 % interval of `iqm`; None for a single seed.
+        high: upper end of the 95 % interval of `iqm`; None for a single seed.
+    """
+
+    mean: float
+    std: float | None
+    iqm: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The probability that a seed of one row beats a seed of another; ties count half.
+
+    Attributes:
+        probability: the estimate, in [0, 1].
+        low: lower end of its 95 % interval; None where a row has a single seed.
+        high: upper end of its 95 % interval; None where a row has a single seed.
+    """
+
+    probability: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """A coefficient of correlation.
+
+    Attributes:
+        value: in [-1, 1]. low: lower end of its 95 % interval. high: upper end.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+def summarise(scores: Floats, *, replicates: int = REPLICATES) -> Summary:
+    """Summarise the `scores` (seeds,) or (seeds, tasks) of one row.
+
+    Raises:
+        BadInputError: there is no score, or one that is not finite.
+    """
+    from rliable import metrics  # type: ignore[import-untyped]
+
+    matrix = _matrix(scores)
+    mean, iqm = float(matrix.mean()), float(metrics.aggregate_iqm(matrix))
+    if len(matrix) == 1:
+        return Summary(mean, None, iqm, None, None)
+    # Seeds are the unit of repetition, so tasks are averaged before the spread is taken.
+    std = float(matrix.mean(axis=1).std(ddof=1))
+    low, high = _interval(matrix, metrics.aggregate_iqm, replicates)
+    return Summary(mean, std, iqm, low, high)
+
+
+def probability_of_improvement(scores: Floats, others: Floats, *, replicates: int = REPLICATES) -> Comparison:
+    """Estimate how likely a seed of `scores` (seeds,) or (seeds, tasks) beats one of `others` (same tasks).
+
+    Raises:
+        BadInputError: there is no score, or one that is not finite.
+    """
+    from rliable import metrics
+
+    matrix, other_matrix = _matrix(scores), _matrix(others)
+    probability = float(metrics.probability_of_improvement(matrix, other_matrix))
+    if min(len(matrix), len(other_matrix)) == 1:
+        return Comparison(probability, None, None)
+    low, high = _interval((matrix, other_matrix), metrics.probability_of_improvement, replicates)
+    return Comparison(probability, low, high)
+
+
+def correlation(
+    first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False, replicates: int = REPLICATES
+) -> Correlation | None:
+    """Correlate two scores of every seed of some rows: Pearson's coefficient, or of `ranks`, Spearman's.
+
+    The seeds of a row are alike, so the interval resamples rows, and seeds within each.
+
+    Args:
+        first: one score, an array (seeds,) per row.
+        second: the other, likewise.
+        ranks: correlate ranks.
+        replicates: bootstrap resamples.
+
+    Returns:
+        None where there are fewer than three seeds in all, or one side does not vary.
+    """
+    from scipy.stats import rankdata
+
+    rng = np.random.default_rng(0)
+
+    def of(rows: NDArray[np.intp], seeds: Sequence[NDArray[np.intp]]) -> float:
+        pairs = [
+            np.concatenate([scores[row][drawn] for row, drawn in zip(rows, seeds, strict=True)])
+            for scores in (first, second)
+        ]
+        # A resample in which one side does not vary has no correlation.
+        if not all(map(np.ptp, pairs)):
+            return np.nan
+        one, other = map(rankdata, pairs) if ranks else pairs
+        return float(np.corrcoef(one, other)[0, 1])
+
+    def resampled() -> float:
+        rows = rng.integers(len(first), size=len(first))
+        return of(rows, [rng.integers(len(first[row]), size=len(first[row])) for row in rows])
+
+    value = of(np.arange(len(first)), [np.arange(len(scores)) for scores in first])
+    if sum(map(len, first)) < 3 or np.isnan(value):
+        return None
+    replicated = [resampled() for _ in range(replicates)]
+    low, high = np.nanquantile(replicated, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Correlation(value, float(low), float(high))
+
+
+def _matrix(scores: Floats) -> Floats:
+    if scores.size == 0 or not np.isfinite(scores).all():
+        raise BadInputError(f"expected one finite score per seed, got {scores.tolist()}")
+    return scores.astype(np.float64).reshape(len(scores), -1)
+
+
+def _interval(
+    scores: Floats | tuple[Floats, Floats], statistic: Callable[..., float], replicates: int
+) -> tuple[float, float]:
+    from rliable import library
+
+    def as_array(*samples: Floats) -> Floats:
+        return np.array([statistic(*samples)])
+
+    with _fixed_global_seed():
+        _, intervals = library.get_interval_estimates(
+            {"row": scores}, as_array, reps=replicates, confidence_interval_size=CONFIDENCE
+        )
+    low, high = intervals["row"].ravel()
+    return float(low), float(high)
+
+
+@contextmanager
+def _fixed_global_seed() -> Iterator[None]:
+    # rliable draws from numpy's global generator whatever `random_state` it is given.
+    state = np.random.get_state()
+    np.random.seed(0)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)

@@ -1,1 +1,0 @@
-"""Abstract simulators: batched, `reset_to(state)`; and the wrappers that scatter and that ground them."""

@@ -1,0 +1,121 @@
+"""Errors of open-loop predictions, per axis and horizon, and what they say together."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.seeding import generator
+from astra_data.studies.motion import chained, wrapped
+from astra_data.studies.predictors import Predictor
+from astra_data.studies.rollouts import predict
+from astra_data.studies.walks import Stretch, Walks
+from astra_data.worlds.plane.geometry import turned
+
+Floats = NDArray[np.float64]
+
+AXES = ("forward_m", "left_m", "turn_rad", "field_x_m", "field_y_m")
+"""Displacement and turn since the start, in the body's frame there; and the displacement in the field's."""
+
+BODY_AXES = AXES[:3]
+MOST_STARTS = 4000
+REPLICATES = 1000
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The starting moments at which models are tested, the same for all.
+
+    Attributes:
+        stretch: histories, and the steps of the longest horizon, (N, ...).
+        piece: which piece each start lies in, (N,). horizons: in steps, K of them.
+    """
+
+    stretch: Stretch
+    piece: NDArray[np.int64]
+    horizons: tuple[int, ...]
+
+    @classmethod
+    def of(cls, walks: Walks, history: int, horizons: Sequence[int]) -> "Trial":
+        """Start at every row of `walks` with a history behind it, or evenly at `MOST_STARTS` of them."""
+        sequence, step = walks.starts(history, min(horizons))
+        # In the order of time, so that even spacing is spread over every piece.
+        order = torch.argsort(walks.piece[sequence] * 10**6 + step, stable=True)
+        order = order[torch.linspace(0, len(order) - 1, min(len(order), MOST_STARTS)).long()]
+        sequence, step = sequence[order], step[order]
+        stretch = walks.stretches(sequence, step, history, max(horizons))
+        return cls(stretch, walks.piece[sequence].numpy(), tuple(horizons))
+
+    @torch.no_grad()
+    def squared_errors(self, model: Predictor) -> Tensor:
+        """Return squared errors (N, K, 5); NaN where the robot does not walk all the way to the horizon."""
+        stretch, chosen = self.stretch, [horizon - 1 for horizon in self.horizons]
+        wrong = predict(model, stretch)[:, chosen] - chained(stretch.motion)[:, chosen]
+        field = turned(wrong[..., :2], stretch.heading[:, None].expand(wrong.shape[:2]))
+        errors = torch.cat([wrong[..., :2], wrapped(wrong[..., 2:]), field], dim=-1).square()
+        walked = stretch.is_walking.long().cumprod(1)[:, chosen].bool()
+        return errors.masked_fill(~walked[..., None], torch.nan)
+
+
+def summary(
+    squared: Mapping[str, Floats], piece: NDArray[np.int64], horizons_s: Sequence[float], seed: int = 0
+) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+    """Return what the errors of several models say, by model, horizon and axis.
+
+    Args:
+        squared: squared errors of each model, (seeds, N, K, 5), at the same N starts; "raw" among them.
+        piece: which piece each start lies in, (N,).
+        horizons_s: the K horizons.
+        seed: of the bootstrap, which resamples pieces: starts within one are alike.
+
+    Returns:
+        For each axis "rmse" with "low" and "high"; "less_than_raw", the share of the raw simulator's RMSE
+        that is gone, with "_low" and "_high"; and likewise "less_than_ridge" where ridge regression is among
+        them. The axis "mean" holds the means of such shares over the three axes of the body.
+    """
+    pieces, number = np.unique(piece, return_inverse=True)
+    rng = generator(seed, "walk bootstrap")
+    weight = rng.multinomial(len(pieces), np.full(len(pieces), 1 / len(pieces)), REPLICATES).astype(float)
+    weight = np.vstack([np.ones(len(pieces)), weight])
+    rmse = {name: _rmse(values.mean(0), number, weight) for name, values in squared.items()}
+    references = [name for name in ("raw", "ridge") if name in rmse]
+    found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for name, values in rmse.items():
+        # The first replicate is the sample itself.
+        less = {reference: 1 - values / rmse[reference] for reference in references}
+        found[name] = {}
+        for k, horizon in enumerate(horizons_s):
+            rows: dict[str, dict[str, float]] = {}
+            for a, axis in enumerate(AXES):
+                rows[axis] = _interval("rmse", values[:, k, a])
+                rows[axis]["low"], rows[axis]["high"] = (
+                    rows[axis].pop("rmse_low"),
+                    rows[axis].pop("rmse_high"),
+                )
+                for reference in references:
+                    rows[axis] |= _interval(f"less_than_{reference}", less[reference][:, k, a])
+            rows["mean"] = {}
+            for reference in references:
+                body = less[reference][:, k, : len(BODY_AXES)].mean(-1)
+                rows["mean"] |= _interval(f"less_than_{reference}", body)
+            found[name][f"{horizon:.3g}"] = rows
+    return found
+
+
+def _rmse(squared: Floats, number: NDArray[np.intp], weight: Floats) -> Floats:
+    """Return the root of the mean of `squared` (N, K, 5) for each row of piece weights (R, P), (R, K, 5)."""
+    count, total = (
+        np.stack([values[number == piece].sum(0) for piece in range(weight.shape[1])])
+        for values in (np.isfinite(squared).astype(float), np.nan_to_num(squared))
+    )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.tensordot(weight, total, 1) / np.tensordot(weight, count, 1)))
+
+
+def _interval(name: str, values: Floats) -> dict[str, float]:
+    low, high = np.nanquantile(values[1:], [0.025, 0.975])
+    told = {name: values[0], f"{name}_low": low, f"{name}_high": high}
+    return {key: round(float(value), 5) for key, value in told.items()}

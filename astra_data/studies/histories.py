@@ -1,0 +1,95 @@
+"""ASTRA and NAS on a walk: the grounding model, with motions in the body's frame for states."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.learning.networks.paired_windows import Windows
+from astra_data.studies.predictors import Predictor, bounded
+from astra_data.studies.walks import Stretch
+
+
+class HistoryModel(Predictor):
+    """A `GroundingModel` whose state is the last step's motion and whose goal is the ball.
+
+    Motions in the body's frame are what is left of abstract states when the place and the heading do not
+    matter, so the model is the same everywhere on the field. The logs hold no reward: in its place, L_rew
+    predicts how much nearer the ball comes (of its bounded distance).
+    """
+
+    def __init__(self, latent_size: int, head_sizes: tuple[int, ...], weights: LossWeights) -> None:
+        super().__init__()
+        shape = GroundingShape(
+            state_size=3,
+            action_size=4,
+            goal_size=2,
+            latent_size=latent_size,
+            head_sizes=head_sizes,
+            position_octaves=0,
+        )
+        self.grounding = GroundingModel(shape)
+        self.weights = weights
+
+    def set_scales(self, stretch: Stretch) -> None:
+        """Take the scales from the histories, and of the correction from the walked steps ahead."""
+        walked = stretch.is_walking
+        nearer = _nearer(stretch.past_ball)
+        model = self.grounding
+        model.set_scales(
+            {
+                "state": stretch.past_motion.flatten(0, 1),
+                "goal": bounded(stretch.past_ball).flatten(0, 1),
+                "correction": (stretch.motion - stretch.simulated)[walked],
+            }
+        )
+        model.set_reward_scales(torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1))
+        # Left and right, the mean is that of the walks that happen to be there.
+        model.state_mean[1:] = 0.0
+        model.goal_mean[1:] = 0.0
+
+    def begin(self, stretch: Stretch) -> Tensor:
+        """Return the hidden state (B, Z) after the history."""
+        inputs = (stretch.past_motion, bounded(stretch.past_ball), stretch.past_action)
+        _, hidden = self.grounding.encoder(self.grounding.encoder_input(*inputs))
+        return torch.as_tensor(hidden[:, -1])
+
+    def motion(self, memory: Tensor, ball: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
+        """Return the corrected motion (f_abs)."""
+        return self.grounding.correct(self.grounding.encoder.latent(memory), action, simulated)
+
+    def after(self, memory: Tensor, motion: Tensor, ball: Tensor, action: Tensor) -> Tensor:
+        """Encode the step."""
+        inputs = self.grounding.encoder_input(motion, bounded(ball), action)
+        return self.grounding.encoder.step(inputs, memory)
+
+    def loss(self, stretch: Stretch) -> Tensor:
+        """Return λ1 L_trans + λ2 L_rew (paper, Section IV-A) over the history, each step given the true past.
+
+        L_state is left to open-loop prediction, see `rollouts`.
+        """
+        if self.weights.latent == self.weights.reward == 0.0:
+            return stretch.motion.new_zeros(())
+        motion, simulated = stretch.past_motion, stretch.past_simulated
+        nearer = _nearer(stretch.past_ball)
+        windows = Windows(
+            state=motion[:, :-1],
+            action=stretch.past_action[:, 1:],
+            previous_action=stretch.past_action[:, :-1],
+            goal=bounded(stretch.past_ball[:, :-1]),
+            simulated_next=simulated[:, 1:],
+            next_state=motion[:, 1:],
+            reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
+            topples_soon=torch.zeros_like(nearer),
+            # Where it was no walking, the simulator's motion stands for the robot's: nothing to learn.
+            mask=(motion != simulated)[:, 1:].any(-1).float(),
+        )
+        total, _ = self.grounding.losses(windows, replace(self.weights, state=0.0))
+        return total
+
+
+def _nearer(ball: Tensor) -> Tensor:
+    """Return how much nearer the ball (B, T, 2) comes, in its bounded distance, (B, T - 1)."""
+    distance: Tensor = bounded(ball).norm(dim=-1)
+    return distance[:, :-1] - distance[:, 1:]

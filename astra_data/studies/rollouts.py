@@ -1,0 +1,195 @@
+"""Open-loop prediction of walks, and fitting by it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from astra_data.core.config import Count, NotNegative, Positive
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress
+from astra_data.core.seeding import derive
+from astra_data.learning.descent import Descent, DescentConfig
+from astra_data.learning.networks.grounding import LossWeights
+from astra_data.studies.histories import HistoryModel
+from astra_data.studies.motion import MIRROR, chained, composed, seen_after
+from astra_data.studies.predictors import Gains, Predictor
+from astra_data.studies.walks import Stretch, Walks
+from astra_data.studies.windows import WindowModel
+
+STRENGTHS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+"""Of ridge regression, from which the best is taken."""
+
+
+class FitConfig(DescentConfig):
+    """How models are fitted; all that learn by gradients alike."""
+
+    updates: Count = 400
+    """Gradient updates in all."""
+    batch: Count = 64
+    """Stretches per update."""
+    steps: Count = 6
+    """Steps that are predicted on end while fitting."""
+    learning_rate: Positive = 2e-3
+    """At the start; falls to zero along a half cosine."""
+    weight_decay: NotNegative = 0.01
+    """Of AdamW."""
+    noise: NotNegative = 1.0
+    """Standard deviation of noise on the history, in units of `NOISE`, against learning it by heart."""
+    latent_size: Count = 64
+    """Z of ASTRA and NAS."""
+    head_sizes: tuple[Count, ...] = (64, 64)
+    """Hidden layers of their heads."""
+    hidden_sizes: tuple[Count, ...] = (128, 64)
+    """Hidden layers of the feed-forward network."""
+
+
+NOISE = ((0.02, 0.02, 0.06), (0.1, 0.1))
+"""Of motions (forward and left in m, turn in rad) and of the ball (m)."""
+
+
+def predict(model: Predictor, stretch: Stretch) -> Tensor:
+    """Return where the steps ahead lead, seen from the start, (B, F, 3).
+
+    The mean of the prediction and the mirrored prediction of the mirror image: left and right are alike.
+    """
+    both = torch.stack(
+        [rollout(model, stretch), rollout(model, stretch.mirrored()) * stretch.motion.new_tensor(MIRROR)]
+    )
+    return both.mean(0)
+
+
+def rollout(model: Predictor, stretch: Stretch) -> Tensor:
+    """Return where the steps ahead lead, (B, F, 3), each from the predictions before; the ball rests."""
+    memory, ball = model.begin(stretch), stretch.past_ball[:, -1]
+    place = torch.zeros_like(stretch.motion[:, 0])
+    places = []
+    for action, simulated in zip(stretch.action.unbind(1), stretch.simulated.unbind(1), strict=True):
+        motion = model.motion(memory, ball, action, simulated)
+        place, ball = composed(place, motion), seen_after(ball, motion)
+        memory = model.after(memory, motion, ball, action)
+        places.append(place)
+    return torch.stack(places, dim=1)
+
+
+def fit(name: str, walks: Walks, history: int, config: FitConfig, seed: int, progress: Progress) -> Predictor:
+    """Fit the model `name` of `MODELS` to `walks`, of which it sees `history` steps.
+
+    Raises:
+        BadInputError: there is too little walking to fit to.
+    """
+    torch.manual_seed(derive(seed, f"walk model {name}"))
+    return MODELS[name](walks, history, config, progress)
+
+
+def _raw(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    return Gains()
+
+
+def _gains(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    model = Gains()
+    model.fit(_sample(walks, history, config.steps))
+    return model
+
+
+def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    """Solve ridge regression with the strength that is best on the last quarter of each sequence."""
+    sequence, step = walks.starts(history, 1)
+    is_late = step > 0.75 * walks.lengths[sequence]
+    everything, early = (
+        walks.stretches(sequence[chosen], step[chosen], history, 1)
+        for chosen in (torch.ones_like(is_late), ~is_late)
+    )
+    late_sequence, late_step = walks.starts(history, config.steps)
+    is_late = late_step > 0.75 * walks.lengths[late_sequence]
+    test = walks.stretches(late_sequence[is_late], late_step[is_late], history, config.steps)
+    end = chained(test.motion)[:, -1]
+
+    def error(strength: float) -> float:
+        model.solve(early, strength)
+        return float(((predict(model, test)[:, -1] - end) / end.std(0)).square().mean())
+
+    model = WindowModel(history).requires_grad_(False)
+    model.set_scales(everything)
+    model.solve(everything, min(STRENGTHS, key=error) if len(test) > 1 else STRENGTHS[-1])
+    return model
+
+
+def _mlp(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    model = WindowModel(history, config.hidden_sizes)
+    model.set_scales(_sample(walks, history, 1))
+    return _descend(model, lambda stretch: torch.zeros(()), walks, history, config, progress)
+
+
+def _history_model(weights: LossWeights) -> Callable[[Walks, int, FitConfig, Progress], Predictor]:
+    def fitted(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
+        model = HistoryModel(config.latent_size, config.head_sizes, weights)
+        model.set_scales(_sample(walks, history, 1))
+        return _descend(model, model.loss, walks, history, config, progress)
+
+    return fitted
+
+
+MODELS: dict[str, Callable[[Walks, int, FitConfig, Progress], Predictor]] = {
+    "raw": _raw,
+    "gains": _gains,
+    "ridge": _ridge,
+    "mlp": _mlp,
+    "nas": _history_model(LossWeights(0.0, 0.0, 1.0)),
+    "astra": _history_model(LossWeights(0.1, 1.0, 1.0)),
+}
+"""By name; each is fitted to walks. λ of ASTRA as in the mazes' recipes."""
+
+_SAMPLE = 20_000
+
+
+def _sample(walks: Walks, history: int, steps: int) -> Stretch:
+    """Return at most `_SAMPLE` walked stretches of `steps` steps, evenly spread over all."""
+    sequence, step = walks.starts(history, steps)
+    if len(sequence) < 2:
+        raise BadInputError(
+            f"expected stretches of {history} + {steps} steps of walking to fit to, found none"
+        )
+    chosen = torch.linspace(0, len(sequence) - 1, min(len(sequence), _SAMPLE)).long()
+    return walks.stretches(sequence[chosen], step[chosen], history, steps)
+
+
+def _descend[M: (WindowModel, HistoryModel)](
+    model: M,
+    own_loss: Callable[[Stretch], Tensor],
+    walks: Walks,
+    history: int,
+    config: FitConfig,
+    progress: Progress,
+) -> M:
+    """Fit by gradients: open-loop errors after 1, 2, ... steps, each in units of its spread; `own_loss`."""
+    spread = chained(_sample(walks, history, config.steps).motion).std(0)
+    sequence, step = walks.starts(history, 1)
+    descent = Descent(model, config, weight_decay=config.weight_decay)
+    while not descent.is_over:
+        chosen = torch.randint(len(sequence), (config.batch,))
+        stretch = walks.stretches(sequence[chosen], step[chosen], history, config.steps)
+        stretch = stretch.mirrored(torch.rand(config.batch) < 0.5)
+        # What follows a jump within a stretch cannot be judged.
+        judged = stretch.is_walking.long().cumprod(1)[..., None].bool().expand_as(stretch.motion)
+        error = (rollout(model, _noisy(stretch, config.noise)) - chained(stretch.motion)) / spread
+        missed = error[judged].square().mean()
+        descent.update(missed + own_loss(stretch))
+        if isinstance(model, HistoryModel):
+            model.grounding.update_target(_EMA_RATE)
+        if descent.done % 20 == 0:
+            progress(descent.share, f"error² {float(missed.detach()):.3f}")
+    return model.requires_grad_(False)
+
+
+_EMA_RATE = 0.01
+
+
+def _noisy(stretch: Stretch, size: float) -> Stretch:
+    motion, ball = (stretch.motion.new_tensor(scale) * size for scale in NOISE)
+    return replace(
+        stretch,
+        past_motion=stretch.past_motion + motion * torch.randn_like(stretch.past_motion),
+        past_ball=stretch.past_ball + ball * torch.randn_like(stretch.past_ball),
+    )

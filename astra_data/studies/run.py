@@ -1,0 +1,98 @@
+"""The gap between models of a robot's walk and its recordings: from recipe and logs to a page."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from astra_data.core.config import load_recipe, load_tables
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.experiments.display import shown
+from astra_data.reports.figures import png
+from astra_data.studies.page import figure, render
+from astra_data.studies.recordings import place_name, read_recordings
+from astra_data.studies.study import GapRecipe, run_study
+
+RUNS = Path("runs")
+
+
+def is_gap_recipe(path: Path) -> bool:
+    """Tell whether the file at `path` names what recipes for `astra-data gap` have and others have not.
+
+    Raises:
+        RecipeError: it is missing or not TOML.
+    """
+    return {"mapping", "models"} <= load_tables(path).keys()
+
+
+def load_gap_recipe(recipe_path: Path) -> GapRecipe:
+    """Read a `GapRecipe` whose mapping is there.
+
+    Raises:
+        RecipeError: it has faults.
+    """
+    recipe = load_recipe(recipe_path, GapRecipe)
+    mapping = recipe_path.parent / recipe.mapping
+    if not mapping.is_file():
+        raise RecipeError(f"{recipe_path}: mapping: expected a file of `astra-data import`, got {mapping}")
+    return recipe
+
+
+def measure_gap(
+    recipe_path: Path,
+    data: Path,
+    train: Path | None = None,
+    *,
+    seeds: Sequence[int] = (),
+    publish: bool = False,
+    root: Path = RUNS,
+) -> Path:
+    """Fit models to recordings, test them on others, and write page, figure and numbers; return the page.
+
+    Args:
+        recipe_path: a `GapRecipe`.
+        data: recordings to predict.
+        train: recordings to learn from; by default a part of `data`.
+        seeds: those of the recipe's seeds to use, by default all.
+        publish: also copy the results to results/ beside the recipe.
+        root: where the recipe's folder is.
+
+    Raises:
+        RecipeError: the recipe has faults.
+        BadInputError: there are no usable recordings, or the folder holds what other settings gave.
+    """
+    recipe = load_gap_recipe(recipe_path)
+    unknown = sorted(set(seeds) - set(recipe.seeds))
+    if unknown:
+        raise BadInputError(f"the recipe has no seed {', '.join(map(str, unknown))}; it has {recipe.seeds}")
+    if seeds:
+        recipe = recipe.model_copy(update={"seeds": tuple(dict.fromkeys(seeds))})
+    name = recipe_path.stem
+    home, mapping = root / name, recipe_path.parent / recipe.mapping
+    imported = home / "recordings"
+    tested = read_recordings(data, mapping, imported, recipe.walking)
+    learned = [] if train is None else read_recordings(train, mapping, imported, recipe.walking)
+    both = {recording.content_hash for recording in tested} & {
+        recording.content_hash for recording in learned
+    }
+    if both:
+        raise BadInputError(
+            f"{data} and {train} hold the same recordings: expected to predict what is not learned"
+        )
+    label = "_from_".join(place_name(place) for place in (data, train) if place is not None)
+    folder = home / label
+    # The networks are so small that one thread is the fastest.
+    torch.set_num_threads(1)
+    with shown(f"{name}/{folder.name}") as progress:
+        found = run_study(recipe, tested, learned, folder, progress)
+    command = f"uv run astra-data gap {recipe_path} --data {data.name}" + (
+        f" --train {train.name}" if train else ""
+    )
+    image = png(figure(found))
+    for place, stem in [(folder, "results")] + ([(recipe_path.parent / "results", name)] if publish else []):
+        place.mkdir(parents=True, exist_ok=True)
+        (place / f"{stem}.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        (place / f"{stem}.png").write_bytes(image)
+        (place / f"{stem}.md").write_text(render(found, name, command, f"{stem}.png"), encoding="utf-8")
+    return folder / "results.md"

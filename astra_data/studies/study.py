@@ -1,0 +1,284 @@
+"""Which models learn from which walks, and on which they are tested; each fit is kept and never repeated."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.config import Config, Positive, did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.core.lock import held
+from astra_data.core.progress import Progress, part
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import generator
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.studies.errors import AXES, Trial, summary
+from astra_data.studies.recordings import Piece, Recording, WalkingConfig
+from astra_data.studies.rollouts import MODELS, FitConfig, fit
+from astra_data.studies.walks import StepsConfig, Walks
+
+LEARNED = ("mlp", "nas", "astra")
+"""Models that a seed changes beyond the choice of the data."""
+
+
+class GapRecipe(Config):
+    """How well models of a robot's walk predict recordings of it."""
+
+    mapping: str
+    """How logs become columns: a file of `astra-data import`, relative to the recipe."""
+    models: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Names in `rollouts.MODELS`; the raw simulator is always among them."""
+    seeds: Annotated[tuple[int, ...], Field(min_length=1)]
+    """Each chooses the data of the smaller sizes, and begins the networks."""
+    minutes: tuple[Positive, ...] = ()
+    """Sizes of the training data, besides all of it; smaller ones lie inside larger ones."""
+    horizons_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.5, 1.0, 2.0, 3.0)
+    """After which errors are taken, besides one step; whole control steps."""
+    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    """Share of the pieces of each recording that nothing learns from, where no other recordings are given."""
+    notes: tuple[str, ...] = ()
+    """Paragraphs for the page, such as what was tuned on what."""
+    walking: WalkingConfig = WalkingConfig()
+    """What is walking."""
+    steps: StepsConfig = StepsConfig()
+    """How rows become control steps."""
+    fit: FitConfig = FitConfig()
+    """How models are fitted."""
+
+    @field_validator("models")
+    @classmethod
+    def _are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
+        for name in models:
+            if name not in MODELS:
+                raise ValueError(f"unknown model '{name}'{did_you_mean(name, MODELS)}")
+        return ("raw", *(name for name in dict.fromkeys(models) if name != "raw"))
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is learned from, and what is predicted.
+
+    Attributes:
+        name: of its folder. title: a sentence's beginning.
+        training: pieces to learn from. test: pieces to predict.
+        minutes: sizes of the training data besides all of it.
+    """
+
+    name: str
+    title: str
+    training: tuple[Piece, ...]
+    test: tuple[Piece, ...]
+    minutes: tuple[float, ...] = ()
+
+
+def cases(recipe: GapRecipe, data: Sequence[Recording], train: Sequence[Recording]) -> Iterator[Case]:
+    """Yield the cases for the recordings `data`: learned from `train`, or else from parts of `data`."""
+    if train:
+        test = tuple(piece for recording in data for piece in recording.pieces)
+        training = tuple(piece for recording in train for piece in recording.pieces)
+        title = f"Learned from {_listed(train)}, tested on {_listed(data)}"
+        yield Case("new_recordings", title, training, test, recipe.minutes)
+        return
+    training, test = _held_out(data, recipe.held_out_share)
+    title = f"Tested on held-out pieces of {_listed(data)}"
+    yield Case("held_out_pieces", title, training, test, recipe.minutes)
+    for recording in data if len(data) > 1 else ():
+        others = [other for other in data if other is not recording]
+        training = tuple(piece for other in others for piece in other.pieces)
+        title = f"Learned from {_listed(others)}, tested on {recording.name}"
+        yield Case(f"tested_on_{recording.name}", title, training, recording.pieces)
+
+
+def _listed(recordings: Sequence[Recording]) -> str:
+    return " and ".join(recording.name for recording in recordings)
+
+
+def _held_out(data: Sequence[Recording], share: float) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
+    training: list[Piece] = []
+    test: list[Piece] = []
+    for recording in data:
+        order = generator(0, f"held-out pieces of {recording.content_hash}").permutation(
+            len(recording.pieces)
+        )
+        count = max(1, round(share * len(order)))
+        for place, number in enumerate(order):
+            (test if place < count else training).append(recording.pieces[number])
+    if not training:
+        raise BadInputError(
+            f"{_listed(data)}: expected at least two pieces without a split, to learn from one and predict "
+            "the other; pass recordings to learn from with --train"
+        )
+    return tuple(training), tuple(test)
+
+
+def shortened(pieces: Sequence[Piece], rows: int, seed: int) -> tuple[Piece, ...]:
+    """Return pieces of `rows` rows in all, in a random order whose beginnings are the smaller sizes."""
+    kept: list[Piece] = []
+    for number in generator(seed, "pieces to learn from").permutation(len(pieces)):
+        piece, room = pieces[number], rows - sum(map(len, kept))
+        if room <= 0:
+            break
+        kept.append(Piece(piece.recording, piece.state[: room + 1], piece.action[:room], piece.broken[:room]))
+    return tuple(kept)
+
+
+def run_study(
+    recipe: GapRecipe,
+    data: Sequence[Recording],
+    train: Sequence[Recording],
+    folder: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Fit and test every model of every case, but for what is in `folder` already; return what was found.
+
+    Raises:
+        BadInputError: `folder` holds what other settings or recordings gave, or is in use; or the recordings
+            are too short.
+    """
+    every = [*data, *train]
+    rates = {recording.fps for recording in every}
+    if len(rates) > 1:
+        raise BadInputError(
+            f"expected recordings of one rate, got {', '.join(map(str, sorted(rates)))} per second"
+        )
+    fps = rates.pop()
+    told = {
+        "recipe": recipe.model_dump(mode="json", exclude={"notes", "models", "seeds", "minutes"}),
+        "data": [recording.content_hash for recording in data],
+        "train": [recording.content_hash for recording in train],
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        _check_same(folder / "config.json", told)
+        made, stopwatch, found = origin(), Stopwatch(), []
+        chosen = list(cases(recipe, data, train))
+        amounts = [len(list(_fits(recipe, case, fps))) for case in chosen]
+        for number, case in enumerate(chosen):
+            before, after = (sum(amounts[:end]) / sum(amounts) for end in (number, number + 1))
+            found.append(_tested(recipe, case, fps, folder / case.name, part(progress, before, after)))
+        return {
+            "config": recipe.model_dump(mode="json"),
+            "step_s": recipe.steps.rows / fps,
+            "recordings": [_described(recording) for recording in every],
+            "cases": found,
+            "origin": made | stopwatch.spent(),
+        }
+
+
+def _check_same(path: Path, told: dict[str, Any]) -> None:
+    if path.exists() and json.loads(path.read_text()) != told:
+        raise BadInputError(
+            f"{path.parent} holds results of other settings or other recordings: remove it, or name another "
+            "folder with --root"
+        )
+    path.write_text(json.dumps(told, indent=1))
+
+
+def _described(recording: Recording) -> dict[str, Any]:
+    return {
+        "name": recording.name,
+        "content_hash": recording.content_hash,
+        "minutes": recording.minutes,
+        "pieces": len(recording.pieces),
+        "broken_share": recording.broken_share,
+    }
+
+
+def _sizes(case: Case, fps: int) -> list[float]:
+    """Return the minutes of data that the case learns from, all of them first."""
+    whole = sum(map(len, case.training)) / fps / 60
+    return [whole, *(minutes for minutes in sorted(case.minutes, reverse=True) if minutes < whole)]
+
+
+def _fits(recipe: GapRecipe, case: Case, fps: int) -> Iterator[tuple[float, str, int]]:
+    """Yield minutes, model and seed of every fit; with all the data, seeds change only the networks."""
+    sizes = _sizes(case, fps)
+    for minutes, name, seed in product(sizes, recipe.models, recipe.seeds):
+        needs_seeds = name in LEARNED or (minutes < sizes[0] and name != "raw")
+        if needs_seeds or seed == recipe.seeds[0]:
+            yield minutes, name, seed
+
+
+def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Fit and test the models of one case; return their errors by size of the data."""
+    steps_config = recipe.steps
+    step_s = steps_config.rows / fps
+    horizons = (1, *(round(seconds / step_s) for seconds in recipe.horizons_s))
+    horizons_s = [horizon * step_s for horizon in horizons]
+    trial = Trial.of(Walks.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
+    fits = list(_fits(recipe, case, fps))
+    squared: dict[float, dict[str, list[Any]]] = {}
+    walks: dict[tuple[float, int], Walks] = {}
+    cpu_seconds = 0.0
+    for number, (minutes, name, seed) in enumerate(fits):
+        size = "all" if minutes == fits[0][0] else f"{minutes:g}_min"
+        path = folder / name / size / f"seed_{seed}.safetensors"
+        if not path.exists():
+            drawn = (minutes, recipe.seeds[0] if size == "all" else seed)
+            if drawn not in walks:
+                rows = round(minutes * 60 * fps)
+                pieces = case.training if size == "all" else shortened(case.training, rows, seed)
+                walks[drawn] = Walks.of_pieces(pieces, fps, steps_config)
+            share = part(progress, number / len(fits), (number + 1) / len(fits))
+            _fit_one(
+                name,
+                walks[drawn],
+                recipe,
+                seed,
+                trial,
+                path,
+                _labelled(share, f"{case.name}/{name}/{size}/{seed}"),
+            )
+        tensors, told = load_tensors(path)
+        cpu_seconds += told["cpu_seconds"]
+        errors = tensors[_ERRORS].double().numpy()
+        squared.setdefault(minutes, {}).setdefault(name, []).append(errors)
+    by_size = [
+        {
+            "minutes": minutes,
+            "models": summary(
+                {name: np.stack(values) for name, values in models.items()}, trial.piece, horizons_s
+            ),
+        }
+        for minutes, models in sorted(squared.items())
+    ]
+    walked = trial.stretch.is_walking.long().cumprod(1)[:, [horizon - 1 for horizon in horizons]]
+    return {
+        "name": case.name,
+        "title": case.title,
+        "axes": list(AXES),
+        "horizons_s": horizons_s,
+        "starts": walked.sum(0).tolist(),
+        "pieces": len(np.unique(trial.piece)),
+        "test_minutes": sum(map(len, case.test)) / fps / 60,
+        "fit_cpu_seconds": cpu_seconds,
+        "sizes": by_size,
+    }
+
+
+_ERRORS = "squared_error"
+
+
+def _fit_one(
+    name: str, walks: Walks, recipe: GapRecipe, seed: int, trial: Trial, path: Path, progress: Progress
+) -> None:
+    """Fit a model, test it, and write both its weights and its errors to `path`."""
+    stopwatch = Stopwatch()
+    model = fit(name, walks, recipe.steps.history, recipe.fit, seed, progress)
+    tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    told = {"model": name, "seed": seed, **stopwatch.spent()}
+    save_tensors(path, tensors | {_ERRORS: trial.squared_errors(model)}, told)
+
+
+def _labelled(progress: Progress, label: str) -> Progress:
+    """Return the progress of a job that says its name in every note."""
+    return lambda fraction, note: progress(fraction, f"{label}  {note}")

@@ -1,0 +1,1 @@
+"""Environments for policies, and policies at work."""

@@ -1,0 +1,100 @@
+"""Behaviours: what acts in the target while data is collected."""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.seeding import derive, generator
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.worlds.task import Task
+
+_FORESIGHT_S = 1.0
+_CHOICES = 16
+"""Commands that somebody who steers clear of walls chooses from."""
+
+
+class Behavior(Protocol):
+    """Acts on B robots."""
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots; `seed` decides everything random."""
+        ...
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        ...
+
+
+class WallWatch:
+    """Foresees in the abstract simulator how near commands lead to the walls within a second."""
+
+    def __init__(self, task: Task, clearance_m: float) -> None:
+        """Watch that robots stay `clearance_m` away from the walls of the task's maze."""
+        self.clearance_m = clearance_m
+        self._task, self._maze = task, task.maze
+
+    def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the least clearance in m (B, K) on the ways of `commands` (B, K, A) from `state` (B, S)."""
+        task, (count, choices, _) = self._task, commands.shape
+        simulator = task.simulator(count * choices)
+        simulator.reset_to(task.abstraction(state).repeat_interleave(choices, dim=0))
+        action = torch.from_numpy(commands).float().flatten(0, 1)
+        nearest = np.full((count, choices), np.inf)
+        for _ in range(round(_FORESIGHT_S / task.timestep_s)):
+            position = simulator.step(action)[:, :2].double().numpy()
+            nearest = np.minimum(nearest, self._maze.clearance(position).reshape(count, choices))
+        return nearest
+
+
+class RandomCommands:
+    """Commands from U[-1, 1] per axis, each held for a random number of steps."""
+
+    def __init__(self, action_size: int, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
+        """Hold commands (A,) from the fewest to the most steps, or until `watch` foresees a wall."""
+        self._size = action_size
+        self._hold_steps = hold_steps
+        self._watch = watch
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots."""
+        self._rng = generator(seed, "behavior")
+        self._command = np.zeros((count, self._size))
+        self._left = np.zeros(count, dtype=int)
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return commands (B, A); goals do not matter, nor do states unless walls are watched for."""
+        over = self._left == 0
+        if self._watch is not None:
+            over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
+        due = np.flatnonzero(over)
+        fewest, most = self._hold_steps
+        self._command[due] = self._drawn(state, due)
+        self._left[due] = self._rng.integers(fewest, most + 1, len(due))
+        self._left -= 1
+        return torch.from_numpy(self._command).float()
+
+    def _drawn(self, state: Tensor, due: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Draw commands (n, A) for the robots `due` (n,): of some, the first that stays clear or clearest."""
+        if self._watch is None:
+            return self._rng.uniform(-1.0, 1.0, (len(due), self._size))
+        choices = self._rng.uniform(-1.0, 1.0, (len(due), _CHOICES, self._size))
+        clearance = self._watch.clearance(state[due], choices).clip(max=self._watch.clearance_m)
+        return np.asarray(choices[np.arange(len(due)), clearance.argmax(axis=1)])
+
+
+class PolicyBehavior:
+    """A policy that draws its actions from its distribution, as it does in training."""
+
+    def __init__(self, deployed: DeployedPolicy) -> None:
+        self._deployed = deployed
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots."""
+        self._deployed.start(count, torch.Generator().manual_seed(derive(seed, "behavior")))
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        return self._deployed.act(state, goal)

@@ -1,0 +1,155 @@
+"""Policies that were stopped early: better than chance, far from good."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from astra_data.core.config import Config
+from astra_data.core.errors import BadInputError
+from astra_data.core.logbook import Logbook
+from astra_data.core.progress import Progress
+from astra_data.core.seeding import derive
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.policy import Policy, PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.learning.ppo import Ppo, PpoConfig
+from astra_data.learning.sac import Sac, SacConfig
+from astra_data.training.behaviors import PolicyBehavior
+from astra_data.training.deployment import DeployedPolicy, Observed
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.target_env import TargetWorld
+from astra_data.worlds.task import Task
+
+_PPO_ENVS = 128
+_SAC_ENVS = 32
+"""Targets that they are trained in."""
+
+_SAC = SacConfig(discount=0.99, reward_scale=0.1, learning_rate=3e-4)
+"""With which the humanoid learns to stay up: rewards are 5 a step there."""
+_SAC_SIZES = (256, 256)
+"""Hidden layers of actor and critics."""
+
+type Told = dict[str, Any]
+"""What a dataset records about the behaviour."""
+
+_TRIALS = 32
+"""Episodes after each iteration, which tell how long they last by now."""
+
+
+def suboptimal_by_ppo(
+    task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
+) -> tuple[PolicyFile, Told]:
+    """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
+
+    A checkpoint in `folder` lets the same call go on after an interruption.
+
+    Returns:
+        the policy, and how it was trained.
+    """
+    torch.manual_seed(derive(seed, "suboptimal policy"))
+    world = TargetWorld(task, _PPO_ENVS, num_threads=num_threads)
+    policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
+    config = PpoConfig(total_steps=steps)
+    ppo = Ppo(world, policy, config, horizon=task.objective.horizon, seed=seed)
+
+    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
+        return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
+
+    spent = _train(ppo, world, judge, folder, progress)
+    return _finished(policy, "abstract"), _told(ppo, policy, config, spent)
+
+
+def suboptimal_by_sac(
+    task: Task,
+    *,
+    steps: int,
+    episode_steps: int,
+    seed: int,
+    folder: Path,
+    num_threads: int | None,
+    progress: Progress,
+) -> tuple[PolicyFile, Told]:
+    """Train a policy without memory by SAC in the target, on its full state.
+
+    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest. A checkpoint in
+    `folder` lets the same call go on after an interruption.
+
+    Returns:
+        the policy, and how it was trained.
+
+    Raises:
+        BadInputError: success ends the task's episodes, so that how long they last tells nothing.
+    """
+    if not task.objective.is_lasting:
+        raise BadInputError(f"in {task.name} good episodes are short: take 'suboptimal_ppo'")
+    torch.manual_seed(derive(seed, "suboptimal policy"))
+    world = TargetWorld(task, _SAC_ENVS, observed="full", num_threads=num_threads)
+    actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))
+    config = _SAC.model_copy(update={"total_steps": steps})
+    sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
+    deployed = DeployedPolicy(task, actor, observed="full")
+
+    def judge(figures: Mapping[str, float]) -> tuple[float, str]:
+        lasted = _lasts(deployed, derive(seed, f"trial {sac.steps}"), num_threads)
+        return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
+
+    spent = _train(sac, world, judge, folder, progress)
+    return _finished(actor, "full"), _told(sac, actor, config, spent)
+
+
+def _train(
+    learner: Ppo | Sac,
+    world: TargetWorld,
+    judge: Callable[[Mapping[str, float]], tuple[float, str]],
+    folder: Path,
+    progress: Progress,
+) -> dict[str, float]:
+    """Train until `judge`, given the figures of an iteration, says that a share of 1 is done, and a note.
+
+    Returns:
+        the time that it took, with that before an interruption.
+    """
+
+    def go_on(state: dict[str, Any]) -> None:
+        learner.load_state_dict(state["learner"], world.load_state_dict(state["world"]))
+
+    logbook = Logbook(folder / "training.safetensors", go_on)
+    share = logbook.points[-1]["share"] if logbook.points else 0.0
+    while share < 1.0:
+        share, note = judge(learner.iterate())
+        logbook.points.append({"steps": learner.steps, "share": share})
+        rate = learner.steps / logbook.stopwatch.seconds
+        progress(min(1.0, share), f"training the behaviour: {rate:,.0f} steps/s  {note}")
+        if logbook.is_due or share >= 1.0:
+            logbook.keep({"learner": learner.state_dict(), "world": world.state_dict()})
+    return logbook.stopwatch.spent()
+
+
+def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:
+    """Return how many steps episodes of the policy last that draws its actions, on average.
+
+    Episodes that end while it learns tell that too late: they began when it was worse.
+    """
+    behavior, task = PolicyBehavior(deployed), deployed.task
+    env = task.target(_TRIALS, seed=derive(seed, "starts"), num_threads=num_threads)
+    env.reset()
+    behavior.start(_TRIALS, seed)
+    active, lasted = torch.ones(_TRIALS, dtype=torch.bool), 0
+    for _ in range(task.objective.horizon):
+        if not active.any():
+            break
+        lasted += int(active.sum())
+        active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
+    return lasted / _TRIALS
+
+
+def _finished(policy: Policy, observed: Observed) -> PolicyFile:
+    return PolicyFile(policy.requires_grad_(False), None, None, None, observed)
+
+
+def _told(learner: Ppo | Sac, policy: Policy, config: Config, spent: Mapping[str, float]) -> Told:
+    sizes = list(policy.shape.hidden_sizes)
+    settings = {"num_envs": learner.env.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
+    return {"trained_steps": learner.steps, "learner": settings, "spent": spent}

@@ -1,0 +1,48 @@
+"""The paper's upper bounds: policies that are trained in the target itself (Section V-A)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from astra_data.core.config import Config, Count, Number
+from astra_data.training.deployment import Observed
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.target_env import TargetStarts, TargetWorld
+from astra_data.training.train import Training, train_in
+
+
+class TargetConfig(Config):
+    """What may differ from `[train]` in the target, whose steps are slow; not in the paper."""
+
+    total_steps: Count | None = None
+    """Environment steps in all; by default as many."""
+    num_envs: Count | None = None
+    """Target environments stepped side by side; by default as many."""
+    memory_size: Number | None = None
+    """Of the policy's own GRU; by default as large. A policy that sees the complete state needs none."""
+
+
+@dataclass(frozen=True)
+class InTarget:
+    """Train in the target, from its own rewards.
+
+    Attributes:
+        observed: whether the policy sees φ of the state or all of it.
+    """
+
+    observed: Observed
+
+    def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        """Return the policy and its learning curve."""
+        settings, episodes = training.settings, training.episodes
+        config = training.config.model_copy(update=settings.model_dump(exclude_none=True) if settings else {})
+        env = TargetWorld(
+            training.task,
+            config.num_envs,
+            observed=self.observed,
+            starts=TargetStarts.of(episodes),
+            data_start_share=config.data_start_share,
+            device=training.device,
+            num_threads=training.num_threads,
+        )
+        policy, curve = train_in(env, config, config.memory_size, training, training.task.objective.horizon)
+        return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve

@@ -1,0 +1,1 @@
+"""Gymnasium's ant in a maze, and the point mass that stands for it."""

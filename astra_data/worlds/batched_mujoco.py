@@ -1,0 +1,110 @@
+"""Step B copies of one MuJoCo model at once, on every core.
+
+The copies' states, warm starts included, lie in one array, so that each goes on exactly as a single
+Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thread carries them through one
+`MjData`, which so stays in the core's cache; `mj_step` releases the interpreter lock.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.cores import cores
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
+
+
+class BatchedPhysics:
+    """B independent copies of `model`, stepped `substeps` physics steps per control step.
+
+    Attributes:
+        qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`.
+        qvel: velocities, (B, nv) float64, likewise.
+        state: all that the copies' futures depend on, warm starts included, (B, N) float64; what was copied
+            from it may be written back into it.
+        touching: whether anything touched a watched geom when the copy was last stepped, (B,) bool.
+        measured: what was measured of each copy when it was last stepped or set, (B, M) float64.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        *,
+        substeps: int,
+        watched_geoms: tuple[int, int] | None = None,
+        measure: Callable[[mujoco.MjData], Sequence[float]] | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        """Allocate B copies in the model's initial state.
+
+        Args:
+            model: what is stepped.
+            num_envs: B.
+            substeps: physics steps per control step.
+            watched_geoms: first and last id of the geoms whose touch is reported, by default none.
+            measure: reads M numbers off a copy that was just stepped or set; must not change its state.
+            num_threads: by default one per core.
+        """
+        self.model = model
+        self.num_envs = num_envs
+        self.substeps = substeps
+        self.num_threads = min(num_threads or cores(), num_envs)
+        self._watched = watched_geoms
+        self._measure = measure
+        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
+        after_time, end = 1 + model.nq, 1 + model.nq + model.nv
+        self.qpos: Floats = self.state[:, 1:after_time]
+        self.qvel: Floats = self.state[:, after_time:end]
+        self.touching: Bools = np.zeros(num_envs, dtype=bool)
+        self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
+        self._rows = list(self.state)
+        self._data = [mujoco.MjData(model) for _ in range(self.num_threads)]
+        self._pool = ThreadPoolExecutor(self.num_threads)
+        size = 0 if measure is None else len(measure(self._data[0]))
+        self.measured: Floats = np.zeros((num_envs, size))
+        self.set_state(np.arange(num_envs), np.tile(model.qpos0, (num_envs, 1)), np.zeros_like(self.qvel))
+
+    def set_state(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats) -> None:
+        """Reset the copies `rows` (n,) to `qpos` (n, nq) and `qvel` (n, nv), clearing warm starts."""
+        data = self._data[0]
+        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:] = position
+            data.qvel[:] = velocity
+            mujoco.mj_forward(self.model, data)
+            mujoco.mj_getState(self.model, data, self._rows[row], _STATE)
+            if self._measure is not None:
+                self.measured[row] = self._measure(data)
+        self.touching[rows] = False
+
+    def step(self, control: Floats, active: Bools | None = None) -> None:
+        """Apply `control` (B, nu) for one control step to the copies in `active` (B,), by default to all."""
+        self._control[:] = control
+        # All threads draw from one iterator (its `next` is atomic), so that none waits for a slow share.
+        waiting = iter(range(self.num_envs) if active is None else np.flatnonzero(active).tolist())
+        helpers = [self._pool.submit(self._step_rows, data, waiting) for data in self._data[1:]]
+        self._step_rows(self._data[0], waiting)
+        for helper in helpers:
+            helper.result()
+
+    def _step_rows(self, data: mujoco.MjData, rows: Iterator[int]) -> None:
+        model, substeps, watched, measure = self.model, self.substeps, self._watched, self._measure
+        get_state, set_state, step = mujoco.mj_getState, mujoco.mj_setState, mujoco.mj_step
+        for row in rows:
+            state = self._rows[row]
+            set_state(model, data, state, _STATE)
+            step(model, data, substeps)
+            get_state(model, data, state, _STATE)
+            if watched is not None:
+                geoms = data.contact.geom
+                self.touching[row] = ((geoms >= watched[0]) & (geoms <= watched[1])).any()
+            if measure is not None:
+                self.measured[row] = measure(data)

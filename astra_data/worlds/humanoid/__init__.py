@@ -1,0 +1,7 @@
+"""Gymnasium's humanoid under four joint commands: its model, its bodies at once, what is abstracted of it."""
+
+from astra_data.worlds.humanoid.bodies import Humanoids
+from astra_data.worlds.humanoid.locomotion import Locomotion
+from astra_data.worlds.humanoid.model import CommandRanges, humanoid_model
+
+__all__ = ["CommandRanges", "Humanoids", "Locomotion", "humanoid_model"]

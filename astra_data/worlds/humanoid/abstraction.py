@@ -1,0 +1,144 @@
+"""φ of the humanoid: what each of its abstract simulators knows of target states (..., 47).
+
+numpy in, numpy out, torch in, torch out. Where the humanoid is on the floor is dropped by all: it does not
+matter to how it walks.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from astra_data.core.numbers import normalised
+from astra_data.worlds.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
+from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
+from astra_data.worlds.humanoid.spread import VELOCITY_M_S, in_spreads
+
+_HEIGHT = 2
+_QUATERNION = slice(3, 7)
+_JOINTS = slice(7, POSITIONS)
+_VELOCITY = slice(POSITIONS, POSITIONS + 3)
+_SPIN = slice(POSITIONS + 3, POSITIONS + 6)
+_RATES = slice(POSITIONS + 6, None)
+
+
+def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+    """Keep what a planar walker has: (..., 47) to (..., 15).
+
+    Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee;
+    velocities of all of these, after the torso's forward one; and whether left and right foot touch the
+    floor, 1 or 0. The pitch is the angle by which the torso's forward axis points below the horizon, whatever
+    its heading. Velocities forward, which is level, and up are in m/s. Dropped: the velocity to the side, the
+    heading, how the torso rolls and turns, and the joints that no command moves, though the feet's height is
+    theirs too.
+    """
+    return _mapped(_walker2d, state)
+
+
+def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+    """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34).
+
+    Dropped: everything that tells how the body stands in the world.
+    """
+    return _mapped(_kinematics, state)
+
+
+def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
+    state: Array,
+) -> Array:
+    """Keep all joints, how the centre of mass moves and how the torso leans: (..., 47) to (..., 46).
+
+    After the joints (34): x and y of the centre of mass, seen from the middle between the feet, and its
+    height above the floor, in m; its velocity (3) in m/s. These along level axes of which x is the torso's
+    heading, so that a step looks the same in whatever direction it goes. A humanoid that falls first moves
+    its centre of mass from above its feet, then down. Then, along the torso's axes, which way is up (3) and
+    how fast the torso turns (3) in rad/s: what the paper calls robot-level information, with a reference
+    whose robot is shown both (Radosavovic et al. 2024). Dropped: the heading.
+    """
+    return _mapped(_extended_kinematics, state)
+
+
+def beyond_walker2d(state: Tensor) -> Tensor:
+    """Return what `humanoid_to_walker2d` drops: (..., 47) to (..., 34), in spreads.
+
+    How the torso is turned and spins, its velocity to the left, and the joints that no command moves.
+    """
+    seen = in_spreads(state)
+    velocity = _headed(rotation(state[..., _QUATERNION]), state[..., _VELOCITY])
+    rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
+    joints, rates = seen[..., _JOINTS][..., rest], seen[..., _RATES][..., rest]
+    left = normalised(velocity[..., 1:2], 0.0, VELOCITY_M_S)
+    return torch.cat([seen[..., _QUATERNION], joints, left, seen[..., _SPIN], rates], dim=-1)
+
+
+def beyond_kinematics(state: Tensor) -> Tensor:
+    """Return what `humanoid_to_kinematics` drops, but for x and y: (..., 47) to (..., 11), in spreads."""
+    seen = in_spreads(state)
+    height, quaternion = seen[..., [_HEIGHT]], seen[..., _QUATERNION]
+    return torch.cat([height, quaternion, seen[..., _VELOCITY], seen[..., _SPIN]], dim=-1)
+
+
+def beyond_extended_kinematics(state: Tensor) -> Tensor:
+    """Return what `humanoid_to_extended_kinematics` drops, but for x and y: (..., 47) to (..., 2).
+
+    The heading, as cosine and sine.
+    """
+    return _heading(rotation(state[..., _QUATERNION]))
+
+
+def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
+    abstraction: Callable[[Tensor], Tensor], state: Array
+) -> Array:
+    return abstraction(state) if isinstance(state, Tensor) else abstraction(torch.from_numpy(state)).numpy()
+
+
+def _walker2d(state: Tensor) -> Tensor:
+    height, spin = state[..., _HEIGHT], state[..., _SPIN]
+    joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
+    velocity = _headed(turn, state[..., _VELOCITY])
+    # How far the torso's axes point up.
+    forward, left, up = turn[..., 2, :].unbind(-1)
+    level = torch.hypot(left, up).clamp_min(1e-6)
+    pitch = torch.atan2(-forward, level)
+    pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level
+    _, feet = mass_and_feet(joints)
+    axes = torch.stack([forward, left, up], dim=-1).unsqueeze(-2)
+    clearance = height.unsqueeze(-1) + (axes * feet).sum(-1) - FOOT_RADIUS_M
+    pose = [torch.stack([height, pitch], dim=-1), joints[..., COMMANDED]]
+    rates = [velocity[..., [0, 2]], pitch_rate.unsqueeze(-1), state[..., _RATES][..., COMMANDED]]
+    return torch.cat([*pose, *rates, (clearance < CONTACT_M).to(state.dtype)], dim=-1)
+
+
+def _kinematics(state: Tensor) -> Tensor:
+    return torch.cat([state[..., _JOINTS], state[..., _RATES]], dim=-1)
+
+
+def _extended_kinematics(state: Tensor) -> Tensor:
+    joints, rates = state[..., _JOINTS], state[..., _RATES]
+    turn = rotation(state[..., _QUATERNION])
+
+    def turned(vector: Tensor) -> Tensor:
+        return (turn @ vector.unsqueeze(-1)).squeeze(-1)
+
+    mass, feet = mass_and_feet(joints)
+    aside = _headed(turn, turned(mass - feet.mean(-2)))[..., :2]
+    height = state[..., _HEIGHT, None] + turned(mass)[..., 2:]
+    spin = state[..., _SPIN]
+    swept = torch.linalg.cross(spin, mass) + mass_velocity(joints, rates)
+    velocity = _headed(turn, state[..., _VELOCITY] + turned(swept))
+    return torch.cat([joints, rates, aside, height, velocity, turn[..., 2, :], spin], dim=-1)
+
+
+def _heading(turn: Tensor) -> Tensor:
+    """Return where torsos turned by (..., 3, 3) look on the floor, as cosine and sine (..., 2)."""
+    return functional.normalize(turn[..., :2, 0], dim=-1)
+
+
+def _headed(turn: Tensor, vector: Tensor) -> Tensor:
+    """Return vectors (..., 3) along level axes of which x is where torsos turned by (..., 3, 3) look."""
+    cosine, sine = _heading(turn).unbind(-1)
+    x, y, z = vector.unbind(-1)
+    return torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=-1)

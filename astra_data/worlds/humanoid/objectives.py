@@ -1,0 +1,176 @@
+"""What walking asks for, on what each abstraction of the humanoid knows: the target's reward, without costs.
+
+All pay for going forward and for staying up, as `Locomotion` does; none knows of effort and contact forces,
+which cost the target little. Nothing is to be reached: who lasts to the horizon without falling succeeds.
+
+Under random commands the pay for a step differs from the target's, costs aside, by 0.1 to 0.2 (root mean
+square) where the centre of mass is known but not the heading, by 0.6 in the plane, and by 2 of the joints
+alone, whose pay has nothing to do with the target's there: the level torso that it goes by is what such a
+body does not have.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.numbers import normalised
+from astra_data.worlds.humanoid.abstraction import (
+    humanoid_to_extended_kinematics,
+    humanoid_to_kinematics,
+    humanoid_to_walker2d,
+)
+from astra_data.worlds.humanoid.locomotion import Locomotion
+from astra_data.worlds.humanoid.model import COMMANDED, JOINTS, STANDING, TIMESTEP_S
+from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity
+from astra_data.worlds.humanoid.spread import (
+    JOINT_RATES_RAD_S,
+    JOINTS_RAD,
+    LEAN_RAD,
+    POSITION_M,
+    SPIN_RAD_S,
+    VELOCITY_M_S,
+)
+from astra_data.worlds.objective import Objective
+
+_COUNT = len(JOINTS)
+_LEGS_RAD = tuple(JOINTS_RAD[joint] for joint in COMMANDED)
+_LEG_RATES_RAD_S = tuple(JOINT_RATES_RAD_S[joint] for joint in COMMANDED)
+
+
+@dataclass(frozen=True)
+class Walking(Objective):
+    """Walk along x and do not fall; there is no goal.
+
+    Attributes:
+        locomotion: how the target pays and where it starts.
+        failure_reward: what a step that ends in a fall lacks, which is the reward for staying up.
+    """
+
+    action_size = len(COMMANDED)
+    goal_size = 0
+    is_lasting = True
+    spread: ClassVar[tuple[float, ...]]
+    """How far each number of a state usually is from standing, (X,)."""
+
+    locomotion: Locomotion = field(default_factory=Locomotion)
+    failure_reward: float = field(default=-5.0, kw_only=True)
+
+    @abstractmethod
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, X)."""
+
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return how far states (..., X) are from standing, in spreads and cut off at ±5, (..., X)."""
+        return normalised(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
+
+    @cached_property
+    def _standing(self) -> NDArray[np.float64]:
+        return self.abstracted(np.array(STANDING))
+
+    @abstractmethod
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return how fast the body went forward in a step between states (B, X), (B,) in m/s."""
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X) as the target does: almost upright and at rest."""
+        return self.abstracted(self.locomotion.draw_starts(rng, count))
+
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Return no goals, (count, 0)."""
+        return np.empty((count, 0))
+
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return that none of the states (B, X) ends the task well, (B,)."""
+        return torch.zeros(len(state), dtype=torch.bool, device=state.device)
+
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states (B, X), which perhaps ended in a fall (B,)."""
+        task = self.locomotion
+        return (
+            task.forward_reward * self.velocity(before, after)
+            + task.healthy_reward
+            + self.failure_reward * failed
+        )
+
+
+@dataclass(frozen=True)
+class PlanarWalking(Walking):
+    """Of the planar walker, states (..., 15); it falls as the target does: at no healthy height."""
+
+    spread = (
+        *(POSITION_M, LEAN_RAD, *_LEGS_RAD),
+        *(VELOCITY_M_S, VELOCITY_M_S, SPIN_RAD_S, *_LEG_RATES_RAD_S),
+        *(1.0, 1.0),
+    )
+
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, 15)."""
+        return humanoid_to_walker2d(state)
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell which torsos (B,) of states (B, 15) are at no healthy height."""
+        low, high = self.locomotion.healthy_m
+        return ~((state[:, 0] > low) & (state[:, 0] < high))
+
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return how fast the centre of mass goes forward after the step, (B,) in m/s, arms stiff."""
+        joints = after.new_zeros(2, len(after), _COUNT)
+        joints[..., COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
+        mass, _ = mass_and_feet(joints[0])
+        swept = mass_velocity(*joints)
+        pitch, pitch_rate = after[:, 1], after[:, 8]
+        forward, up = swept[:, 0] + pitch_rate * mass[:, 2], swept[:, 2] - pitch_rate * mass[:, 0]
+        return after[:, 6] + torch.cos(pitch) * forward + torch.sin(pitch) * up
+
+
+@dataclass(frozen=True)
+class JointWalking(Walking):
+    """Of the joints alone, states (..., 34): nothing in them tells a fall, so every episode succeeds."""
+
+    spread = (*JOINTS_RAD, *JOINT_RATES_RAD_S)
+
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, 34)."""
+        return humanoid_to_kinematics(state)
+
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return how fast a level torso goes over its lower foot, which does not slip, (B,) in m/s."""
+        feet, later = (mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
+        rows = torch.arange(len(feet), device=feet.device)
+        lower = feet[..., 2].argmin(dim=-1)
+        return (feet[rows, lower, 0] - later[rows, lower, 0]) / TIMESTEP_S
+
+
+@dataclass(frozen=True)
+class MassWalking(Walking):
+    """Of joints, centre of mass and how the torso leans, states (..., 46).
+
+    Attributes:
+        lowest_mass_m: a centre of mass lower than this has fallen, two steps before the target says so on
+            average; that of one who stands is 0.9 m high.
+    """
+
+    spread = (
+        *JointWalking.spread,
+        *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3),
+    )
+
+    lowest_mass_m: float = 0.65
+
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, 46)."""
+        return humanoid_to_extended_kinematics(state)
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell which centres of mass (B,) of states (B, 46) have fallen."""
+        return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
+
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return the velocity of the centre of mass along the heading after the step, (B,) in m/s."""
+        return after[:, 2 * _COUNT + 3]

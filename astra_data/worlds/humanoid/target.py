@@ -1,0 +1,123 @@
+"""Gymnasium's humanoid, driven by position commands for its hips and knees."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.batched import Step
+from astra_data.worlds.batched_mujoco import Floats
+from astra_data.worlds.humanoid import CommandRanges, Humanoids, Locomotion
+from astra_data.worlds.humanoid.model import COMMANDED, JOINTS, STATE_SIZE
+
+
+class HumanoidEnv:
+    """B humanoids; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
+
+    State (B, 47): qpos (24) then qvel (23), as in Gymnasium. Observation (B, 45): the state without x and y,
+    which Humanoid-v5 begins with too. Falling ends an episode; nothing else does.
+
+    Attributes:
+        bodies: the humanoids. goal: (B, 0), there is none.
+        failed: (B,) bool, at an unhealthy height after the last step.
+    """
+
+    observation_size = STATE_SIZE - 2
+    action_size = len(COMMANDED)
+
+    def __init__(
+        self,
+        locomotion: Locomotion,
+        num_envs: int,
+        *,
+        seed: int,
+        leg_scale: float = 1.0,
+        start_anywhere: bool = False,
+        ranges: CommandRanges | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        """Build B humanoids.
+
+        Args:
+            locomotion: reward, ends and starts.
+            num_envs: B.
+            seed: of starts.
+            leg_scale: 1; a humanoid's legs are as they are.
+            start_anywhere: false; a humanoid has no place, and starts upright.
+            ranges: what commands stand for.
+            num_threads: physics threads, by default one per core.
+
+        Raises:
+            BadInputError: another leg scale or start.
+        """
+        if leg_scale != 1.0:
+            raise BadInputError(f"evaluate.leg_scale: expected 1 for a humanoid, got {leg_scale}")
+        if start_anywhere:
+            raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")
+        self.locomotion = locomotion
+        self.num_envs = num_envs
+        self.ranges = ranges or CommandRanges()
+        self.bodies = Humanoids(locomotion, num_envs, num_threads=num_threads)
+        self.goal = torch.zeros(num_envs, 0)
+        self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self.reseed(seed)
+
+    @property
+    def state(self) -> Tensor:
+        """The full target states, (B, 47) float32."""
+        return torch.from_numpy(self.bodies.state).float()
+
+    @property
+    def position(self) -> Tensor:
+        """Where the humanoids are, (B, 2) float32 in m."""
+        return self.state[:, :2]
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Nothing, for there are no walls: (B,) bool."""
+        return torch.zeros(self.num_envs, dtype=torch.bool)
+
+    def reseed(self, seed: int) -> None:
+        """Draw later starts from `seed`."""
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Stand the humanoids in `mask` (B,) up, almost upright and at rest, by default all."""
+        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
+        self.reset_to(rows, self.locomotion.draw_starts(self._rng, len(rows)))
+        return self._observe()
+
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
+        """Set the humanoids `rows` (n,) to `state` (n, 47)."""
+        self.bodies.reset_to(rows, state)
+        self.failed[rows] = False
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
+        physics = self.bodies.physics
+        return {
+            "physics": torch.from_numpy(physics.state.copy()),
+            "measured": torch.from_numpy(physics.measured.copy()),
+        }
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state`."""
+        self.bodies.physics.state[:] = state["physics"].numpy()
+        self.bodies.physics.measured[:] = state["measured"].numpy()
+
+    def step(self, action: Tensor, active: Tensor | None = None) -> Step:
+        """Follow the commands `action` (B, 4) for 0.015 s; rows outside `active` (B,) stand frozen."""
+        targets = np.zeros((self.num_envs, len(JOINTS)))
+        targets[:, COMMANDED] = self.ranges.targets(action.double()).numpy()
+        self.bodies.step(targets, None if active is None else active.numpy())
+        self.failed = torch.from_numpy(~self.bodies.healthy)
+        return Step(
+            observation=self._observe(),
+            reward=torch.from_numpy(self.bodies.reward).float(),
+            terminated=self.failed.clone(),
+            success=torch.zeros(self.num_envs, dtype=torch.bool),
+        )
+
+    def _observe(self) -> Tensor:
+        return self.state[:, 2:]

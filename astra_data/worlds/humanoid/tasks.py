@@ -1,0 +1,138 @@
+"""The humanoid's tasks: Gymnasium's humanoid walks, and three simulators that know less and less of it."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column
+from astra_data.worlds.humanoid.abstraction import (
+    beyond_extended_kinematics,
+    beyond_kinematics,
+    beyond_walker2d,
+)
+from astra_data.worlds.humanoid.camera import photograph
+from astra_data.worlds.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
+from astra_data.worlds.humanoid.model import DAMPING, JOINTS, STATE_SIZE, STIFFNESS, TIMESTEP_S, CommandRanges
+from astra_data.worlds.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
+from astra_data.worlds.humanoid.target import HumanoidEnv
+from astra_data.worlds.humanoid.varied import VariedHumanoid
+from astra_data.worlds.humanoid.walker2d import HumanoidWalker2d
+from astra_data.worlds.task import Task, Varied, roles
+from astra_data.worlds.variation import JointVariation
+
+_COUNT = len(JOINTS)
+_HORIZON = 1000
+"""Of Gymnasium's Humanoid-v5: 15 s."""
+
+_STATE = roles(
+    (
+        *("x", "y", "z", "qw", "qx", "qy", "qz", *JOINTS),
+        *("vx", "vy", "vz", "wx", "wy", "wz", *(f"{joint}_rate" for joint in JOINTS)),
+    ),
+    ["m"] * 3 + ["1"] * 4 + ["rad"] * _COUNT + ["m/s"] * 3 + ["rad/s"] * (3 + _COUNT),
+    ["world"] * 7 + ["joint"] * _COUNT + ["world"] * 3 + ["body"] * 3 + ["joint"] * _COUNT,
+    ["position"] * 2
+    + ["invariant"]
+    + ["quaternion"] * 4
+    + ["invariant"] * _COUNT
+    + ["vector"] * 2
+    + ["invariant"] * (4 + _COUNT),
+)
+_COMMANDS = ("left_hip", "left_knee", "right_hip", "right_knee")
+_COMMAND = roles(_COMMANDS, ["1"] * 4, ["joint"] * 4, ["invariant"] * 4)
+_COLUMNS = (
+    Column(STATE, size=STATE_SIZE, meaning="qpos (24) and qvel (23) of the humanoid", **_STATE),
+    Column(ACTION, size=4, meaning="commanded joint angles, ±1 over their ranges", **_COMMAND),
+    Column(NEXT_STATE, size=STATE_SIZE, meaning="qpos and qvel one control step later", **_STATE),
+)
+
+RANDOMIZED_ACTIONS = JointVariation(action_noise=(0.05, 0.05), action_scale=(-0.05, 0.05))
+"""Of domain randomization, as printed (Section V-B)."""
+
+WIDE_RANGES = JointVariation(
+    friction=(0.8, 1.2),
+    action_scale=(-0.05, 0.05),
+    action_noise=(0.05, 0.05),
+    observation_scale=(0.9, 1.1),
+    timestep_scale=(1.0, 0.025 / TIMESTEP_S),
+)
+"""Of COMPASS, as printed (Section V-B): "additionally" to domain randomization. A control period of 0.015 to
+0.025 s begins at the simulator's own, so it only ever gets longer; in navigation, whose simulators have
+another, it is read as shares around theirs."""
+
+Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
+Quantities = Mapping[str, tuple[int, ...]]
+
+_JOINT_QUANTITIES: Quantities = {
+    "joints_rad": tuple(range(_COUNT)),
+    "joint_rates_rad_s": tuple(range(_COUNT, 2 * _COUNT)),
+}
+_BODY_QUANTITIES: Quantities = {
+    "mass_m": tuple(range(2 * _COUNT, 2 * _COUNT + 3)),
+    "mass_velocity_m_s": tuple(range(2 * _COUNT + 3, 2 * _COUNT + 6)),
+    "up": tuple(range(2 * _COUNT + 6, 2 * _COUNT + 9)),
+    "spin_rad_s": tuple(range(2 * _COUNT + 9, 2 * _COUNT + 12)),
+}
+_WALKER_QUANTITIES: Quantities = {
+    "height_m": (0,),
+    "pitch_rad": (1,),
+    "joints_rad": (2, 3, 4, 5),
+    "velocity_m_s": (6, 7),
+    "pitch_rate_rad_s": (8,),
+    "joint_rates_rad_s": (9, 10, 11, 12),
+}
+
+
+def _humanoids(objective: Walking, num_envs: int, **options: Any) -> HumanoidEnv:  # noqa: ANN401 - handed on
+    return HumanoidEnv(objective.locomotion, num_envs, **options)
+
+
+def _task(
+    name: str, objective: Walking, kind: Kind, beyond: Callable[[Tensor], Tensor], quantities: Quantities
+) -> Task:
+    return Task(
+        name=f"humanoid-{name}",
+        instruction="walk forward without falling",
+        objective=objective,
+        make_target=_humanoids,
+        target_id="humanoid",
+        make_simulator=kind,
+        abstraction=kind.abstraction,
+        beyond=beyond,
+        state_columns=_COLUMNS,
+        abstract_state=kind.abstract_state,
+        quantities=quantities,
+        timestep_s=TIMESTEP_S,
+        action_limit=1.0,
+        simulator_id=f"humanoid_{name}",
+        photograph=photograph,
+        facts={"stiffness": STIFFNESS, "damping": DAMPING, **CommandRanges().parameters},
+        varied=Varied(partial(VariedHumanoid, kind), RANDOMIZED_ACTIONS, WIDE_RANGES),
+    )
+
+
+HUMANOID_TASKS = (
+    _task(
+        "walker2d",
+        PlanarWalking(horizon=_HORIZON),
+        HumanoidWalker2d,
+        beyond_walker2d,
+        _WALKER_QUANTITIES,
+    ),
+    _task(
+        "kinematics",
+        JointWalking(horizon=_HORIZON),
+        HumanoidKinematics,
+        beyond_kinematics,
+        _JOINT_QUANTITIES,
+    ),
+    _task(
+        "extended",
+        MassWalking(horizon=_HORIZON),
+        HumanoidExtendedKinematics,
+        beyond_extended_kinematics,
+        {**_JOINT_QUANTITIES, **_BODY_QUANTITIES},
+    ),
+)

@@ -1,0 +1,150 @@
+"""The most abstract simulator of the humanoid: a walker in the plane, with legs under one rigid link.
+
+It has what the plane has. The legs' links, feet, joints, motors and masses are the humanoid's; trunk, head
+and arms are one link that weighs and balances as they do with their joints at zero. It stands, steps, swings
+its legs and falls forward or backward, by the same physics and the same position control.
+
+It leaves out:
+
+* Falling to the side, as a humanoid that learns to walk mostly does. Here no policy ever pays for it, nor
+  learns to shift its weight from foot to foot.
+* Turning. The walker always looks along x; a humanoid that turned away walks, but not there.
+* Waist, hips' other axes, arms. The humanoid's hold their angles only as well as their motors can, and give
+  way to gravity and to the legs' motion; here they are stiff.
+* Legs that hit each other.
+* Which part of a foot touches: both worlds have spheres for feet, but a humanoid that rolls lifts one of them
+  at joint angles at which the walker stands on both. Contacts that a step leads to come from the joints and
+  the torso here, others than those of a humanoid in that pose.
+* How the waist and the hips' other axes lower the feet. At the humanoid's height of the torso the walker's
+  would often be inside the floor, which would throw it into the air. So where it is set with its feet too
+  low, the floor is lower by that much, until it is set anew: in every step, where it is corrected or
+  `[plus] residual_noise` scatters it.
+* The memory of MuJoCo's solver from step to step.
+"""
+
+from copy import copy
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.rollout import Rollout
+from torch import Tensor
+
+from astra_data.core.cores import cores
+from astra_data.dataset.columns import ABSTRACT_STATE, Column
+from astra_data.worlds.free_states import FreeStates
+from astra_data.worlds.humanoid.abstraction import humanoid_to_walker2d
+from astra_data.worlds.humanoid.model import CONTACT_M, CONTROL_SUBSTEPS, STANDING, TIMESTEP_S, CommandRanges
+from astra_data.worlds.humanoid.walker import sole_clearance, walker_model
+
+_JOINTS = ("left_hip", "left_knee", "right_hip", "right_knee")
+_POSE = slice(0, 6)
+_MOTION = slice(0, 13)
+_CONTACTS = slice(13, 15)
+
+
+class HumanoidWalker2d(FreeStates):
+    """B walkers; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
+
+    Attributes:
+        state: (B, 15) float32, as `humanoid_to_walker2d` makes it.
+        memory: how much lower than at 0 the floors are, in m, (B, 1) float64.
+    """
+
+    action_size = 4
+    abstract_state = Column(
+        ABSTRACT_STATE,
+        size=15,
+        names=(
+            *("z", "pitch", *_JOINTS),
+            *("vx", "vz", "pitch_rate", *(f"{name}_rate" for name in _JOINTS)),
+            *("left_contact", "right_contact"),
+        ),
+        meaning="torso, legs and foot contacts of a planar walker",
+        astra={
+            "unit": ["m", *["rad"] * 5, "m/s", "m/s", *["rad/s"] * 5, "1", "1"],
+            "frame": ["heading"] * 2 + ["joint"] * 4 + ["heading"] * 3 + ["joint"] * 4 + ["world"] * 2,
+            "role": ["invariant"] * 15,
+        },
+    )
+    abstraction = staticmethod(humanoid_to_walker2d)
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        ranges: CommandRanges | None = None,
+        num_threads: int | None = None,
+        device: str = "cpu",
+    ) -> None:
+        """Stand B walkers up.
+
+        Args:
+            num_envs: B.
+            ranges: what commands stand for.
+            num_threads: physics threads, by default one per core.
+            device: torch device of states and actions; the physics runs on the CPU.
+        """
+        standing = humanoid_to_walker2d(torch.tensor(STANDING))
+        super().__init__(standing.repeat(num_envs, 1).to(device))
+        self.memory = self._sunk(self.state)
+        self.ranges = ranges or CommandRanges()
+        self._model = walker_model()
+        self._models = [self._model]
+        self._data = [mujoco.MjData(self._model) for _ in range(min(num_threads or cores(), num_envs))]
+        self._rollout = Rollout(nthread=len(self._data))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What a dataset paired with this simulator records about it."""
+        return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
+
+    def vary(self, friction: Tensor, timestep_scale: Tensor) -> None:
+        """Give each walker legs of its own, and a control step of its own.
+
+        Args:
+            friction: factors (B,) on the damping of the joints.
+            timestep_scale: factors (B,) on the control step: as many physics steps, each so much longer. At
+                5/3 that puts poses off by 0.3 % and rates by 1.2 % of what they change by in a step.
+        """
+        plain = self._model
+        if self._models[0] is plain:
+            self._models = [copy(plain) for _ in self.state]
+        for model, factor, scale in zip(
+            self._models, friction.tolist(), timestep_scale.tolist(), strict=True
+        ):
+            model.dof_damping[:] = factor * plain.dof_damping
+            model.opt.timestep = scale * plain.opt.timestep
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, 15), on floors that bear their feet."""
+        super().reset_to(state, rows)
+        sunk = self._sunk(state)
+        self.memory = sunk if rows is None else self.memory.index_copy(0, rows, sunk)
+
+    @staticmethod
+    def _sunk(state: Tensor) -> Tensor:
+        """Return how far feet are inside the floor, (B, 1) float64 in m."""
+        return (-sole_clearance(state[:, _POSE].double()).amin(-1, keepdim=True)).clamp_min(0.0)
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move to `landed` (B, 15), its contacts rounded to 1 or 0; return it."""
+        contacts = (landed[:, _CONTACTS] > 0.5).to(landed.dtype)
+        return super().settle(before, torch.cat([landed[:, _MOTION], contacts], dim=-1))
+
+    def step(self, action: Tensor) -> Tensor:
+        """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, 15)."""
+        model, count = self._model, len(self.state)
+        initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
+        motion, sunk = self.state[:, _MOTION].cpu().double(), self.memory[:, 0].cpu()
+        motion[:, 0] += sunk
+        # Behind the time, and x, where every step begins anew.
+        initial[:, 2 : 2 + _MOTION.stop] = motion.numpy()
+        targets = self.ranges.targets(action.cpu().double()).numpy()
+        control = np.repeat(targets[:, None], CONTROL_SUBSTEPS, axis=1)
+        states, _ = self._rollout.rollout(self._models, self._data, initial, control)
+        motion = torch.from_numpy(states[:, -1, 2 : 2 + _MOTION.stop].copy())
+        contacts = (sole_clearance(motion[:, _POSE]) < CONTACT_M).to(motion.dtype)
+        motion[:, 0] -= sunk
+        self.state = torch.cat([motion, contacts], dim=-1).float().to(self.state.device)
+        return self.state

@@ -1,0 +1,207 @@
+"""B walking NAOs: commanded velocities in, what the robots feel and where they truly are out."""
+
+from dataclasses import replace
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.cores import cores
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.ant.body import rotation_matrix
+from astra_data.worlds.nao.bodies import MOTORS, TICKS, BatchedBodies
+from astra_data.worlds.nao.body import TICK_S, nao_model
+from astra_data.worlds.nao.kinematics import TO_MOTORS, leg_angles
+from astra_data.worlds.nao.links import HIP_OFFSET_Z_M
+from astra_data.worlds.nao.robots import Robots, Senses
+from astra_data.worlds.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, put_rows
+from astra_data.worlds.nao.traits import Traits, Variation
+from astra_data.worlds.nao.walk import WalkEngine, WalkStyle
+from astra_data.worlds.plane.ball import BALL_RADIUS_M
+from astra_data.worlds.plane.mazes import Maze
+
+CONTROL_STEP_S = TICKS * TICK_S
+_BALL = 7 + MOTORS
+_MIDDLE_M = 0.03
+"""A ball that is less far aside is either foot's: from step to step the torso sways as far."""
+
+
+class BatchedNao(Robots):
+    """B NAOs, each on a floor of its own.
+
+    Attributes:
+        traits: what sets them apart.
+        bodies: their physics.
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        *,
+        seed: int,
+        maze: Maze | None = None,
+        ball: bool = False,
+        variation: Variation | None = None,
+        limits: WalkLimits | None = None,
+        style: WalkStyle | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        """Build B robots that stand at the origin.
+
+        Args:
+            num_robots: B.
+            seed: of the gyroscopes' noise and the first traits.
+            maze: walls, by default none.
+            ball: give each robot a ball.
+            variation: ranges of the traits.
+            limits: of the walk.
+            style: of the walk.
+            num_threads: by default one per core.
+        """
+        self.num_robots = num_robots
+        self.variation = variation or Variation()
+        self.has_ball = ball
+        self._limits, style = limits or WalkLimits(), style or WalkStyle()
+        self._seed, self._steps = seed, 0
+        rng = np.random.default_rng(seed)
+        self.traits = Traits.draw(self.variation, num_robots, rng)
+        self.gait = Gait.standing(num_robots, self._limits)
+        self._engine = WalkEngine(StepPlanner(self.traits.quality, self._limits), style)
+        self.bodies = BatchedBodies(
+            nao_model(maze, ball=ball),
+            self.traits,
+            longest_delay_ticks=self.variation.delay_ticks[1],
+            style=style,
+            num_threads=num_threads or cores(),
+        )
+        self.reset(np.arange(num_robots), np.zeros((num_robots, 3)), rng)
+
+    def reset(
+        self,
+        rows: NDArray[np.intp],
+        poses: Floats,
+        rng: np.random.Generator,
+        ball: Floats | None = None,
+    ) -> None:
+        """Stand robots up, with new traits.
+
+        Args:
+            rows: which robots, (n,).
+            poses: x, y in m and heading in rad, (n, 3).
+            rng: of the traits.
+            ball: positions (n, 2) of their balls in m, by default 1 m ahead of them.
+
+        Raises:
+            BadInputError: balls for robots that have none.
+        """
+        if ball is not None and not self.has_ball:
+            raise BadInputError("These robots have no balls to place; build BatchedNao with ball=True.")
+        put_rows(self.traits, rows, Traits.draw(self.variation, len(rows), rng))
+        standing = Gait.standing(len(rows), self._limits)
+        put_rows(self.gait, rows, standing)
+        angles = leg_angles(self._engine.feet(standing)).angles
+        x, y, yaw = poses.T
+        qpos = np.tile(self.bodies.model.qpos0, (len(rows), 1))
+        qpos[:, 0], qpos[:, 1] = x, y
+        qpos[:, 2] = self._engine.style.hip_height_m + HIP_OFFSET_Z_M
+        qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+        qpos[:, 7:_BALL] = angles[:, TO_MOTORS]
+        if self.has_ball:
+            ahead = np.stack([x + np.cos(yaw), y + np.sin(yaw)], axis=1)
+            qpos[:, _BALL : _BALL + 2] = ahead if ball is None else ball
+            qpos[:, _BALL + 2] = BALL_RADIUS_M
+        self.bodies.reset(rows, qpos, (angles + self.traits.joint_offset_rad[rows])[:, TO_MOTORS])
+
+    def step(self, command: Floats, active: Bools | None = None, kick: Bools | None = None) -> None:
+        """Walk for one control step of 0.192 s.
+
+        Args:
+            command: velocities forward and to the left in m/s, turn in rad/s, (B, 3).
+            active: which robots, (B,); all others, and those that have fallen, stay as they are.
+            kick: which are to kick with the foot on the ball's side when it next swings, (B,).
+
+        Raises:
+            BadInputError: `command` has another shape or is not finite.
+        """
+        if command.shape != (self.num_robots, 3) or not np.isfinite(command).all():
+            raise BadInputError(
+                f"Expected finite commands of shape ({self.num_robots}, 3); got {command.shape}"
+                f"{'' if np.isfinite(command).all() else ' with values that are not finite'}. "
+                "Give every robot forward m/s, sideways m/s, turn rad/s."
+            )
+        rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
+        targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))
+        noise = np.random.default_rng([self._seed, self._steps]).normal(
+            0.0, self.variation.gyro_noise_rad_s, (self.num_robots, TICKS, 3)
+        )
+        self._steps += 1
+        self.gait = targets.reached(self.bodies.step(rows, targets, noise))
+
+    def _kicking_feet(self, kick: Bools | None) -> Bools | None:
+        if kick is None or not self.has_ball:
+            return None
+        x, y = (self.ball - self.pose[:, :2]).T
+        yaw = self.pose[:, 2]
+        to_the_left = np.cos(yaw) * y - np.sin(yaw) * x
+        sides = np.stack([to_the_left > -_MIDDLE_M, to_the_left < _MIDDLE_M], axis=1)
+        return np.asarray(kick[:, None] & sides)
+
+    @property
+    @override
+    def fallen(self) -> Bools:
+        return self.bodies.fallen
+
+    @property
+    @override
+    def touching(self) -> Bools:
+        return self.bodies.touching
+
+    @property
+    @override
+    def pose(self) -> Floats:
+        rotation = rotation_matrix(self.bodies.qpos[:, 3:7])
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        return np.concatenate([self.bodies.qpos[:, :2], yaw[:, None]], axis=1)
+
+    @property
+    @override
+    def velocity(self) -> Floats:
+        turn = np.einsum(
+            "bi,bi->b", rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2], self.bodies.qvel[:, 3:6]
+        )
+        return np.concatenate([self.bodies.qvel[:, :2], turn[:, None]], axis=1)
+
+    @property
+    @override
+    def ball(self) -> Floats:
+        return self.bodies.qpos[:, _BALL : _BALL + 2]
+
+    @property
+    @override
+    def ball_velocity(self) -> Floats:
+        return self.bodies.qvel[:, _BALL - 1 : _BALL + 1]
+
+    @property
+    @override
+    def senses(self) -> Senses:
+        bodies, left_first = self.bodies, [7, *range(8, 13), *range(14, 19)]
+        return Senses(
+            angles=bodies.qpos[:, left_first] - self.traits.joint_offset_rad,
+            gyro=bodies.gyro.copy(),
+            tilt=self._tilt(),
+            pressure=bodies.pressure.reshape(-1, 2, 4).copy(),
+            phase=self.gait.phase.copy(),
+            left_swings=self.gait.left_swings.copy(),
+            planned=self.gait.velocity(),
+        )
+
+    def _tilt(self) -> Floats:
+        up = rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2]
+        return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
+
+    @override
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        bodies = self.bodies
+        parts = ("state", "sent", "held", "waited", "tilting", "gyro", "pressure", "fallen", "touching")
+        own = {name: getattr(bodies, name) for name in parts}
+        return own | vars(self.gait) | vars(self.traits)

@@ -1,0 +1,228 @@
+"""NAOs that follow planar velocity commands, in a maze or after a ball. They are simulated stand-ins."""
+
+import json
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.abstraction import NAO_STATE_SIZE
+from astra_data.worlds.batched import Step
+from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
+from astra_data.worlds.nao.robot import CONTROL_STEP_S, BatchedNao
+from astra_data.worlds.nao.surrogate import SurrogateNao
+from astra_data.worlds.objective import PlanarObjective
+from astra_data.worlds.plane.ball import asks_to_kick
+from astra_data.worlds.plane.geometry import wrapped
+
+Floats = NDArray[np.float64]
+
+SPEED_M_S = 0.25
+"""Of a command of 1, along each axis: the largest forward speed of B-Human's walk."""
+TURN_GAIN_PER_S = 2.0
+"""Rate per rad at which a robot turns to where it goes."""
+TURN_LIMIT_RAD_S = 1.0
+SEARCH_AFTER_S = 1.5
+"""A robot that has not seen its ball for longer looks around for it."""
+_STANDING = 0.05
+"""Shorter commands turn nobody."""
+_FOOT_LOAD_N = 50.0
+"""Scale of the pressures on the soles."""
+STATE_SIZE = NAO_STATE_SIZE
+"""Believed x, y, cos and sin of the heading, planned velocity x, y in the world, angles (11) of the legs'
+joints, gyroscope (3), tilt (2), load (2) of the feet, phase (2) of the step, planned velocity (3) in the
+body."""
+BALL_SIZE = 5
+"""What follows where there is a ball: its believed place (2) and velocity (2), since when it is unseen."""
+
+
+class NaoEnv:
+    """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
+
+    Where there is a ball, a third entry above 0.5 asks for a kick, however far the ball is: the robot steps
+    on the spot, and swings forward the foot on the ball's side, or either where it lies straight ahead. A
+    control step lasts 0.192 s. The robots turn by themselves to where they go, or to their ball. They act
+    on what they believe, which is also all that their state (B, S) holds; rewards, success and failure go by
+    the truth. Success, falling, and what the task counts as failure end an episode.
+
+    Attributes:
+        goal: (B, 2) float32. failed: (B,) bool, ended badly in the last step.
+        robots: the robots themselves.
+    """
+
+    def __init__(
+        self,
+        objective: PlanarObjective,
+        num_envs: int,
+        *,
+        seed: int,
+        level: Literal["mujoco", "surrogate"] = "mujoco",
+        ball: bool = False,
+        leg_scale: float = 1.0,
+        start_anywhere: bool = False,
+        errors: PerceptionErrors | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        """Build B robots.
+
+        Args:
+            objective: maze, goal and reward.
+            num_envs: B.
+            seed: of everything random.
+            level: walking bodies in MuJoCo, or steps without physics.
+            ball: whether there is a ball, which abstract states then end with.
+            leg_scale: 1; a NAO's legs are as they are.
+            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
+            errors: of what the robots believe.
+            num_threads: of the physics, by default one per core.
+
+        Raises:
+            BadInputError: another leg scale.
+        """
+        if leg_scale != 1.0:
+            raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
+        self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
+        self.has_ball, self.action_size = ball, objective.action_size
+        kind = BatchedNao if level == "mujoco" else SurrogateNao
+        self.robots = kind(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
+        errors = errors or PerceptionErrors()
+        self.localisation = Localisation(num_envs, errors, CONTROL_STEP_S)
+        self.sight = BallSight(num_envs, errors, CONTROL_STEP_S)
+        self.observation_size = STATE_SIZE + BALL_SIZE * ball + 2
+        self.goal = torch.zeros(num_envs, 2)
+        self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self.reseed(seed)
+
+    @property
+    def state(self) -> Tensor:
+        """What the robots believe and feel, (B, S) float32."""
+        pose, senses = self.localisation.pose, self.robots.senses
+        cos, sin = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
+        forward, left, _ = np.split(senses.planned, 3, axis=1)
+        swing = np.where(senses.left_swings, 1.0, -1.0)[:, None]
+        angle = np.pi * senses.phase[:, None]
+        parts = [
+            *(pose[:, :2], cos, sin, cos * forward - sin * left, sin * forward + cos * left),
+            *(senses.angles, senses.gyro, senses.tilt, senses.pressure.sum(-1) / _FOOT_LOAD_N),
+            *(swing * np.sin(angle), swing * np.cos(angle), senses.planned),
+        ]
+        if self.has_ball:
+            sight = self.sight
+            parts += [sight.position, sight.velocity, sight.unseen_s[:, None]]
+        return torch.from_numpy(np.concatenate(parts, axis=1)).float()
+
+    @property
+    def truth(self) -> Tensor:
+        """The true abstract states, (B, X) float32."""
+        robots = self.robots
+        parts = [robots.pose[:, :2], robots.velocity[:, :2]]
+        if self.has_ball:
+            parts += [robots.ball, robots.ball_velocity]
+        return torch.from_numpy(np.concatenate(parts, axis=1)).float()
+
+    @property
+    def position(self) -> Tensor:
+        """Where the robots really are, and their balls if they have any, (B, 2) or (B, 4) float32 in m."""
+        return self.objective.places(self.truth)
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Which robots touched a wall in their last step, (B,) bool."""
+        return torch.from_numpy(self.robots.touching.copy())
+
+    def reseed(self, seed: int) -> None:
+        """Draw later starts, goals, headings, traits and errors from `seed`."""
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Stand the robots in `mask` (B,) up at new starts with random headings, by default all."""
+        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
+        objective, rng = self.objective, self._rng
+        draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
+        start = draw(rng, len(rows))
+        self.goal[rows] = torch.from_numpy(objective.draw_goals(rng, len(rows))).float()
+        yaw = rng.uniform(-np.pi, np.pi, len(rows))
+        self._stand(rows, np.column_stack([start[:, :2], yaw]), start[:, 4:6] if self.has_ball else None)
+        return self._observe()
+
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
+        """Stand the robots `rows` (n,) up where `state` (n, S) believes them, and their balls likewise."""
+        yaw = np.arctan2(state[:, 3], state[:, 2])
+        ball = state[:, STATE_SIZE : STATE_SIZE + 2] if self.has_ball else None
+        self._stand(rows, np.column_stack([state[:, :2], yaw]), ball)
+
+    def _stand(self, rows: NDArray[np.intp], pose: Floats, ball: Floats | None) -> None:
+        self.robots.reset(rows, pose, self._rng, ball)
+        self.localisation.reset(rows, pose, self._rng)
+        if ball is not None:
+            self.sight.reset(rows, ball)
+        self.failed[rows] = False
+
+    def step(self, action: Tensor, active: Tensor | None = None) -> Step:
+        """Follow the commands `action` (B, A) for 0.192 s; rows outside `active` (B,) stand frozen."""
+        moving = np.ones(self.num_envs, dtype=bool) if active is None else active.numpy()
+        before = self.truth
+        kick = asks_to_kick(action).squeeze(-1).numpy() if self.has_ball else None
+        self.robots.step(self._body_command(action[:, :2], kick), moving, kick)
+        self.localisation.update(self.robots.pose, self._rng, moving)
+        if self.has_ball:
+            believed = self.localisation.pose
+            self.sight.update(self.robots.ball, self.robots.pose, believed, self._rng, moving)
+        after = self.truth
+        success = self.objective.reached(after, self.goal)
+        failed = torch.from_numpy(self.robots.fallen.copy()) | self.objective.missed(after, self.goal)
+        if self.objective.ends_at_walls:
+            failed |= self.wall_contact
+        self.failed = failed & ~success
+        return Step(
+            observation=self._observe(),
+            reward=self.objective.reward(before, after, self.goal, self.failed),
+            terminated=success | self.failed,
+            success=success,
+        )
+
+    def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
+        """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3), as believed.
+
+        Robots turn to where they go. With a ball they turn to it, and walk the slower the farther it is
+        aside, or not at all while they `kick` (B,); when it is lost they look around.
+        """
+        command = velocity.clamp(-1.0, 1.0).double().numpy()
+        x, y = (SPEED_M_S * command).T
+        heading = self.localisation.pose[:, 2]
+        cos, sin = np.cos(heading), np.sin(heading)
+        ahead = np.arctan2(y, x)
+        if kick is not None:
+            apart = self.sight.position - self.localisation.pose[:, :2]
+            ahead = np.arctan2(apart[:, 1], apart[:, 0])
+        astray = wrapped(ahead - heading)
+        turn = (TURN_GAIN_PER_S * astray).clip(-TURN_LIMIT_RAD_S, TURN_LIMIT_RAD_S)
+        called = np.linalg.norm(command, axis=1) > _STANDING
+        turn *= called if kick is None else called | kick
+        if kick is not None:
+            turn = np.where(self.sight.unseen_s > SEARCH_AFTER_S, TURN_LIMIT_RAD_S, turn)
+            facing = ~kick * np.cos(astray).clip(0.0) ** 2
+            x, y = facing * x, facing * y
+        return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a later `load_state_dict` needs to go on from here."""
+        arrays = {**self.robots.state_dict(), **self.localisation.arrays(), **self.sight.arrays()}
+        told = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        drawn = json.dumps(self._rng.bit_generator.state).encode()
+        return told | {"goal": self.goal.clone(), "drawn": torch.tensor(list(drawn), dtype=torch.uint8)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state`."""
+        arrays = {name: values.numpy() for name, values in state.items()}
+        self.robots.load_state_dict(arrays)
+        self.localisation.restore(arrays)
+        self.sight.restore(arrays)
+        self.goal = state["goal"].clone()
+        self._rng.bit_generator.state = json.loads(bytes(state["drawn"].tolist()))
+
+    def _observe(self) -> Tensor:
+        return torch.cat([self.state, self.goal], dim=-1)

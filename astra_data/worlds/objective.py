@@ -1,0 +1,105 @@
+"""What a task asks for, on abstract states: the same in every world, so that rewards compare."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS, Score
+
+
+@dataclass(frozen=True)
+class Objective(ABC):
+    """Starts, goals, what a policy is shown, and how steps are judged; states are abstract ones, (..., X).
+
+    Attributes:
+        horizon: steps until an episode is cut off.
+        success_reward: for reaching the goal. failure_reward: for ending badly.
+        is_lasting: whether success is to last to the horizon, not to reach something before.
+        action_size: A. goal_size: G, 0 where there is nothing to tell apart.
+    """
+
+    is_lasting: ClassVar[bool] = False
+    action_size: ClassVar[int]
+    goal_size: ClassVar[int]
+
+    horizon: int = field(kw_only=True)
+    success_reward: float = field(default=10.0, kw_only=True)
+    failure_reward: float = field(default=-10.0, kw_only=True)
+
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """What rows are compared by, as in the paper, the headline first."""
+        return (SURVIVED_STEPS, RETURN) if self.is_lasting else (SUCCESS,)
+
+    @abstractmethod
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X), at rest, where the task starts."""
+
+    @abstractmethod
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw goals (count, G)."""
+
+    @abstractmethod
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Assemble what a policy sees of states (..., X) and goals (..., G), each part about one long."""
+
+    def limit_command(self, action: Tensor, limit: float) -> Tensor:
+        """Clip actions (..., A) to ±1; a `limit` in m/s is for velocities alone, and without effect here."""
+        return action.clamp(-1.0, 1.0)
+
+    @abstractmethod
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of nothing, K = 0."""
+        return state[..., :0]
+
+    def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
+        """Tell which episodes (B,) succeed in their `step`, from 1 on, that `reached` or `failed` (B,)."""
+        return ~failed if self.is_lasting and step >= self.horizon else reached
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
+        return torch.zeros(len(state), dtype=torch.bool, device=state.device)
+
+    @abstractmethod
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states (B, X), which perhaps ended badly (B,)."""
+
+
+@dataclass(frozen=True)
+class PlanarObjective(Objective):
+    """An objective in a maze; states begin with x and y of the robot in m, actions with its velocity.
+
+    Attributes:
+        maze: where it happens.
+        ends_at_walls: whether touching a wall is a failure, which ends an episode.
+    """
+
+    action_size = 2
+    goal_size = 2
+
+    maze: Maze
+    ends_at_walls: bool = field(default=False, kw_only=True)
+
+    @abstractmethod
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
+
+    def limit_command(self, action: Tensor, limit: float) -> Tensor:
+        """Shorten the velocities that actions (..., A) begin with, ±1 per axis, to at most `limit`."""
+        command, rest = super().limit_command(action, limit).tensor_split([2], dim=-1)
+        speed = command.norm(dim=-1, keepdim=True)
+        shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
+        return torch.cat([command * shorten, rest], dim=-1)
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""
+        return state[..., :2]

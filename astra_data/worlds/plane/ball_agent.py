@@ -1,0 +1,96 @@
+"""The abstract simulator of kicking: a planar point mass that kicks a rolling ball, or walks into it."""
+
+import torch
+from torch import Tensor
+
+from astra_data.worlds.plane.ball import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.plane.states import PlanarStates
+
+_LIES_M_S = 0.15
+"""Corrected balls that a step leaves slower lie where they lay before it: they would roll on for 4 cm, and a
+robot's estimate is never quite zero."""
+
+
+class BallAgent(PlanarStates):
+    """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
+
+    A command is the velocity of the next step, in units of the top speed along each axis, and whether to
+    stand and kick. Walls stop the mass, not the ball. A ball within reach of the kick leaves at one speed
+    along the line between the centres, one that the mass walks into at another. Left out: legs, feet, where
+    they are and when they swing, and which way the robot looks.
+
+    Corrections move a ball only where it rolled or was touched before, and to no speed below which balls lie:
+    how probably it will be touched, they would turn into a ball that creeps, and policies wait for it.
+
+    Attributes:
+        parameters: what a dataset paired with this simulator records about it.
+    """
+
+    state_size = 8
+    action_size = 3
+
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        *,
+        timestep_s: float,
+        radius_m: float,
+        speed_m_s: float,
+        reach_m: float,
+        knock_m_s: float,
+        kick_reach_m: float,
+        kick_m_s: float,
+        device: str = "cpu",
+    ) -> None:
+        """Build B of them.
+
+        Args:
+            maze: walls around them.
+            num_envs: B.
+            timestep_s: control period.
+            radius_m: of the mass, at walls.
+            speed_m_s: top speed along each axis.
+            reach_m: the mass touches the ball when their centres are closer.
+            knock_m_s: speed of a ball that is walked into.
+            kick_reach_m: the mass can kick the ball when their centres are closer.
+            kick_m_s: speed of a ball that is kicked.
+            device: torch device.
+        """
+        super().__init__(maze, num_envs, self.state_size, radius_m=radius_m, device=device)
+        self.parameters = {
+            "timestep_s": timestep_s,
+            "radius_m": radius_m,
+            "speed_m_s": speed_m_s,
+            "reach_m": reach_m,
+            "knock_m_s": knock_m_s,
+            "kick_reach_m": kick_reach_m,
+            "kick_m_s": kick_m_s,
+        }
+        self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+
+    def step(self, action: Tensor) -> Tensor:
+        """Apply commands `action` (B, 3), clipped to ±1 per axis; return the new state (B, 8)."""
+        of, kicks = self.parameters, asks_to_kick(action)
+        position, _, ball, velocity = self.state.split(2, dim=-1)
+        way = ~kicks * action[:, :2].clamp(-1.0, 1.0) * of["speed_m_s"] * of["timestep_s"]
+        moved, self.blocked = self.free.slide(position, position + way)
+        ball, velocity = knock(
+            position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"]
+        )
+        velocity = kick_away(
+            moved, ball, velocity, kicks, reach_m=of["kick_reach_m"], speed_m_s=of["kick_m_s"]
+        )
+        self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
+        ball, velocity = roll(ball, velocity, of["timestep_s"], ROLLING_M_S2)
+        self.state = torch.cat([moved, (moved - position) / of["timestep_s"], ball, velocity], dim=-1)
+        return self.state
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Slide the masses as planar states do; a ball that lay untouched, or is slow, stays where it was."""
+        moved = super().settle(before, landed)
+        still = torch.cat([before[:, 4:6], torch.zeros_like(before[:, 6:])], dim=-1)
+        rolls = self._rolls & (moved[:, 6:].norm(dim=-1, keepdim=True) > _LIES_M_S)
+        self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, moved[:, 4:], still)], dim=-1))
+        return self.state

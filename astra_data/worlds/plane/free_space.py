@@ -1,0 +1,133 @@
+"""Where a point may be: an occupancy grid that positions slide along, and distances to a goal. Batched torch.
+
+Grids have square cells of the maze's `fine_m` and are indexed [y, x] from the maze's lower left corner.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_dilation, distance_transform_edt
+from torch import Tensor
+
+from astra_data.worlds.plane.mazes import Maze
+
+_EDGE_M = 1e-4
+"""How far from the face of a blocked cell a sliding point is stopped."""
+
+
+class FreeSpace:
+    """The cells in which the centre of a disc may be.
+
+    Attributes:
+        blocked: (height, width) bool, True where the centre may not be.
+        half_extent: half of the maze's width and height in m, (2,).
+        cell_m: side of a cell.
+    """
+
+    def __init__(self, blocked: Tensor, half_extent: Tensor, cell_m: float) -> None:
+        self.blocked = blocked
+        self.half_extent = half_extent
+        self.cell_m = cell_m
+        depth = torch.from_numpy(distance_transform_edt(blocked.cpu().numpy()))
+        # How far a blocked cell is from the free ones, in cells; 0 in free ones.
+        self._depth = depth.float().to(blocked.device)
+        self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
+
+    @classmethod
+    def of_maze(cls, maze: Maze, *, radius_m: float, device: str = "cpu") -> "FreeSpace":
+        """Return the free space of a disc of `radius_m`, a multiple of the grid's cell."""
+        reach = round(radius_m / maze.fine_m)
+        square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
+        blocked = binary_dilation(maze.fine_walls, square, border_value=1)
+        return cls(
+            torch.from_numpy(blocked).to(device),
+            torch.tensor(maze.half_extent, dtype=torch.float32, device=device),
+            maze.fine_m,
+        )
+
+    def cells(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the row and the column (...) of the fine grid's cell of each `position` (..., 2)."""
+        column, row = self._cells(position).unbind(-1)
+        return row, column
+
+    def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+        """Move points from `start` to `end`, both (B, 2) in m, stopping each axis at blocked cells.
+
+        A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
+
+        Returns:
+            where the points come to rest (B, 2), and which of them were stopped (B,).
+        """
+        here = self._cells(start)
+        there = self._cells(end)
+        depth = self._depth[here[:, 1], here[:, 0]]
+        depth_x = self._depth[here[:, 1], there[:, 0]]
+        stop_x = depth_x > depth
+        x = torch.where(stop_x, self._face(start[:, 0], here[:, 0], there[:, 0], 0), end[:, 0])
+        column = torch.where(stop_x, here[:, 0], there[:, 0])
+        stop_y = self._depth[there[:, 1], column] > torch.where(stop_x, depth, depth_x)
+        y = torch.where(stop_y, self._face(start[:, 1], here[:, 1], there[:, 1], 1), end[:, 1])
+        return torch.stack([x, y], dim=-1), stop_x | stop_y
+
+    def _cells(self, position: Tensor) -> Tensor:
+        cells = ((position + self.half_extent) / self.cell_m).floor().long()
+        return torch.minimum(cells.clamp_min(0), self._limits)
+
+    def _face(self, start: Tensor, here: Tensor, there: Tensor, axis: int) -> Tensor:
+        onward = there > here
+        face = (here + onward) * self.cell_m - self.half_extent[axis]
+        return torch.where(onward, face - _EDGE_M, face + _EDGE_M)
+
+
+@dataclass(frozen=True)
+class GoalDistance:
+    """Length of the shortest free path to a goal, for goals near a fixed one.
+
+    One distance field per point of a small lattice around the usual goal; a goal uses the nearest.
+
+    Attributes:
+        fields: (goals, height, width) in m.
+        lattice: the goals that the fields belong to, (goals, 2) in m.
+        half_extent: (2,) in m.
+        cell_m: side of a field's cell.
+    """
+
+    fields: Tensor
+    lattice: Tensor
+    half_extent: Tensor
+    cell_m: float
+
+    @classmethod
+    def of_maze(cls, maze: Maze, *, spacing_m: float, radius_m: float = 0.0) -> "GoalDistance":
+        """Compute a disc's fields for 7 x 7 goals, `spacing_m` apart, around the goal cell's middle."""
+        steps = np.arange(-3, 4) * spacing_m
+        centre = np.array(maze.cell_centre(*maze.goal))
+        lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + centre
+        fields = np.stack([maze.distance_field(goal, radius=radius_m) for goal in lattice])
+        return cls(
+            torch.from_numpy(fields).float(),
+            torch.from_numpy(lattice).float(),
+            torch.tensor(maze.half_extent, dtype=torch.float32),
+            maze.fine_m,
+        )
+
+    def to(self, device: str | torch.device) -> "GoalDistance":
+        """Return the same fields on `device`."""
+        fields, lattice, half_extent = (
+            values.to(device) for values in (self.fields, self.lattice, self.half_extent)
+        )
+        return GoalDistance(fields, lattice, half_extent, self.cell_m)
+
+    def __call__(self, position: Tensor, goal: Tensor) -> Tensor:
+        """Return the distance in m (B,) from `position` (B, 2) to `goal` (B, 2), bilinear in position."""
+        field = (goal[:, None] - self.lattice).square().sum(-1).argmin(dim=1)
+        _, height, width = self.fields.shape
+        # Cell centres carry the values.
+        grid = (position + self.half_extent) / self.cell_m - 0.5
+        grid = torch.stack([grid[:, 0].clamp(0, width - 1.001), grid[:, 1].clamp(0, height - 1.001)], dim=-1)
+        corner = grid.floor()
+        (fx, fy), (column, row) = (grid - corner).unbind(-1), corner.long().unbind(-1)
+        lower = self.fields[field, row, column] * (1 - fx) + self.fields[field, row, column + 1] * fx
+        upper = self.fields[field, row + 1, column] * (1 - fx) + self.fields[field, row + 1, column + 1] * fx
+        return lower * (1 - fy) + upper * fy

@@ -1,0 +1,99 @@
+"""The kicking task: knock the ball into the goal. The same in every world, so that rewards compare.
+
+The paper prints no reward. Ours: metres by which the ball comes closer to the goal, half of those by which
+the robot comes closer to the place behind the ball, +10 for a goal, -10 for a ball that leaves the field
+elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League at small distances.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.worlds.objective import PlanarObjective
+
+_NEAR_M = (0.18, 0.5)
+"""From the ball, where recorded episodes begin: from where a foot reaches it on."""
+
+
+@dataclass(frozen=True)
+class Kicking(PlanarObjective):
+    """Knock the ball through the goal at the right end of `maze`, an empty field, within `horizon` steps.
+
+    Abstract states begin with robot position and velocity, ball position and velocity, (..., 8). The goal
+    (..., 2) is the middle of the goal line. Actions (..., 3) end with whether to kick.
+
+    Attributes:
+        goal_line_m: x of the goal line. goal_half_width_m: of the goal on it.
+        side_line_m: |y| of the side lines. back_line_m: x of the line behind.
+        ball_x_m, ball_y_m: where balls lie at the start.
+        distance_m: of the robot from the ball at the start.
+        behind_m: distance from the ball of the place behind it, which the shaping reward leads to.
+    """
+
+    action_size = 3
+
+    goal_line_m: float = 1.5
+    goal_half_width_m: float = 0.75
+    side_line_m: float = 2.0
+    back_line_m: float = -2.0
+    ball_x_m: tuple[float, float] = (-0.5, 0.0)
+    ball_y_m: tuple[float, float] = (-0.6, 0.6)
+    distance_m: tuple[float, float] = (0.4, 1.0)
+    behind_m: float = 0.2
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, 8) at rest: the ball in front of the goal, the robot around it."""
+        ball = np.stack([rng.uniform(*self.ball_x_m, count), rng.uniform(*self.ball_y_m, count)], axis=1)
+        angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*self.distance_m, count)
+        robot = ball + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        rest = np.zeros_like(robot)
+        return np.concatenate([robot, rest, ball, rest], axis=1)
+
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, 8) at rest with the robot near its ball: from afar it rarely meets it."""
+        return replace(self, distance_m=_NEAR_M).draw_starts(rng, count)
+
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Return the middle of the goal line, (count, 2)."""
+        return np.tile([self.goal_line_m, 0.0], (count, 1))
+
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return where robot, ball and goal are, and what moves how, (..., 14)."""
+        robot, velocity, ball, rolling = state.split(2, dim=-1)
+        behind = self._behind(ball, goal) - robot
+        places = [robot / 2, ball / 2, (goal - ball) / 2]
+        return torch.cat([*places, 4 * velocity, rolling, 4 * (ball - robot), 4 * behind], dim=-1)
+
+    def _behind(self, ball: Tensor, goal: Tensor) -> Tensor:
+        to_goal = goal - ball
+        back: Tensor = self.behind_m * to_goal / to_goal.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        return ball - back
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return where robot and ball are in states (..., 8), (..., 4)."""
+        return state[..., [0, 1, 4, 5]]
+
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell which balls (B,) of states (B, 8) are in the goal."""
+        ball = state[:, 4:6]
+        return (ball[:, 0] >= self.goal_line_m) & (ball[:, 1].abs() <= self.goal_half_width_m)
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell which balls (B,) of states (B, 8) left the field beside the goal."""
+        x, y = state[:, 4:6].unbind(-1)
+        out = (x >= self.goal_line_m) | (x < self.back_line_m) | (y.abs() > self.side_line_m)
+        return out & ~self.reached(state, goal)
+
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states (B, 8), which perhaps ended badly (B,)."""
+        gained = self._potential(after, goal) - self._potential(before, goal)
+        return gained + self.success_reward * self.reached(after, goal) + self.failure_reward * failed
+
+    def _potential(self, state: Tensor, goal: Tensor) -> Tensor:
+        robot, _, ball, _ = state[:, :8].split(2, dim=-1)
+        ball_left: Tensor = (goal - ball).norm(dim=-1)
+        robot_left: Tensor = (self._behind(ball, goal) - robot).norm(dim=-1)
+        return -ball_left - 0.5 * robot_left

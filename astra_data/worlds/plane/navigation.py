@@ -1,0 +1,116 @@
+"""The navigation task: reach a goal in a maze. The same in every world, so that rewards compare.
+
+The paper prints no reward. Ours: progress along the shortest free path to the goal, +10 for reaching it, and
+less for ending badly; sparse and Euclidean-dense forms are options.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.worlds.objective import PlanarObjective
+from astra_data.worlds.plane.free_space import GoalDistance
+
+RewardKind = Literal["geodesic", "euclidean", "sparse"]
+
+
+@dataclass(frozen=True)
+class Navigation(PlanarObjective):
+    """Reach the goal of `maze` within `horizon` steps.
+
+    Attributes:
+        reward_kind: "geodesic" (progress along the corridors), "euclidean" (along the straight line) or
+            "sparse" (none), each plus the bonuses of success and failure.
+        metre_reward: for a metre of progress.
+        path_clearance_m: distance from the walls kept by the shortest free path.
+        success_radius_m: closer to the goal than this is success and ends the episode.
+        position_waves: policies also see the sines and cosines of the position, along each axis: one wave
+            across the maze, and so many in all, each half as long as the one before.
+        spread_m: standard deviation of start and goal around their cells' centres, per axis.
+        start_clearance_m: distance from the walls kept by starts drawn anywhere.
+        start_offsets_m: of the usual starts from the centre of the start's cell; each is as likely.
+    """
+
+    reward_kind: RewardKind = "geodesic"
+    metre_reward: float = 1.0
+    path_clearance_m: float = 0.0
+    position_waves: int = 0
+    success_radius_m: float = 0.45
+    spread_m: float = 0.2
+    start_clearance_m: float = 0.8
+    start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+
+    @cached_property
+    def goal_distance(self) -> GoalDistance:
+        """Path lengths to goals near the maze's goal cell."""
+        return GoalDistance.of_maze(self.maze, spacing_m=self.spread_m, radius_m=self.path_clearance_m)
+
+    @cached_property
+    def _goal_distances(self) -> dict[torch.device, GoalDistance]:
+        return {}
+
+    def _goal_distance_on(self, device: torch.device) -> GoalDistance:
+        # Kept, for the fields are too large to be moved to an accelerator in every step.
+        if device not in self._goal_distances:
+            self._goal_distances[device] = self.goal_distance.to(device)
+        return self._goal_distances[device]
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states [x, y, vx, vy] (count, 4) at rest around the usual starts."""
+        position = self._around(self.maze.start, rng, count)
+        if len(self.start_offsets_m) > 1:
+            position += np.array(self.start_offsets_m)[rng.integers(len(self.start_offsets_m), size=count)]
+        return _at_rest(position)
+
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw goals (count, 2) in m around the maze's goal cell."""
+        return self._around(self.maze.goal, rng, count)
+
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls."""
+        rows, columns = np.nonzero(self.maze.clearance_field > self.start_clearance_m)
+        chosen = rng.integers(len(rows), size=count)
+        cell = self.maze.half_extent * 2 / self.maze.fine_walls.shape[::-1]
+        within = rng.random((count, 2))
+        corner = np.stack([columns[chosen], rows[chosen]], axis=-1)
+        return _at_rest((corner + within) * cell - self.maze.half_extent)
+
+    def _around(self, cell: tuple[int, int], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        noise = rng.normal(0.0, self.spread_m, (count, 2)).clip(-3 * self.spread_m, 3 * self.spread_m)
+        return np.asarray(np.array(self.maze.cell_centre(*cell)) + noise)
+
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return position, velocity, goal and the way to it, (..., 8), and waves of the position."""
+        half = torch.tensor(self.maze.half_extent, dtype=state.dtype, device=state.device)
+        position, velocity = state[..., :2], state[..., 2:]
+        waves = [torch.pi * 2**octave * position / half for octave in range(self.position_waves)]
+        seen = [position / half, velocity, goal / half, (goal - position) / half]
+        return torch.cat([*seen, *map(torch.sin, waves), *map(torch.cos, waves)], dim=-1)
+
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Tell which of `state` (B, 2 or more), which begin with the position, are at their `goal` (B, 2)."""
+        return (state[:, :2] - goal).square().sum(-1).le(self.success_radius_m**2)
+
+    def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
+        """Return the metres gained toward `goal` (B, 2) from `before` to `after`, (B, 2 or more); (B,)."""
+        before, after = before[:, :2], after[:, :2]
+        if self.reward_kind == "geodesic":
+            distance = self._goal_distance_on(goal.device)
+            return distance(before, goal) - distance(after, goal)
+        if self.reward_kind == "euclidean":
+            return torch.pairwise_distance(before, goal, eps=0) - torch.pairwise_distance(after, goal, eps=0)
+        return torch.zeros(len(goal), device=goal.device)
+
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states that begin with the position, (B, 2 or more)."""
+        bonus = self.success_reward * self.reached(after, goal) + self.failure_reward * failed
+        return self.metre_reward * self.progress(before, after, goal) + bonus
+
+
+def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([position, np.zeros_like(position)], axis=1)

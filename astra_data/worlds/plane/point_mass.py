@@ -1,0 +1,43 @@
+"""The abstract simulator of navigation: a planar point mass that follows velocity commands perfectly."""
+
+import torch
+from torch import Tensor
+
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.plane.states import PlanarStates
+
+
+class PointMass(PlanarStates):
+    """B point masses [x, y, vx, vy] in a maze, in m and m/s.
+
+    A command is the velocity of the next step, in units of the top speed along each axis; walls stop it,
+    each axis by itself. The velocity in the state is the motion that really happened. Left out: everything
+    that has legs.
+
+    Attributes:
+        parameters: what a dataset paired with this simulator records about it.
+    """
+
+    state_size = 4
+    action_size = 2
+
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        *,
+        timestep_s: float,
+        radius_m: float = 0.1,
+        speed_m_s: float = 1.0,
+        device: str = "cpu",
+    ) -> None:
+        super().__init__(maze, num_envs, self.state_size, radius_m=radius_m, device=device)
+        self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
+
+    def step(self, action: Tensor) -> Tensor:
+        """Apply commands `action` (B, 2), clipped to ±1 per axis; return the new state (B, 4)."""
+        timestep_s, position = self.parameters["timestep_s"], self.state[:, :2]
+        way = action.clamp(-1.0, 1.0) * self.parameters["speed_m_s"] * timestep_s
+        moved, self.blocked = self.free.slide(position, position + way)
+        self.state = torch.cat([moved, (moved - position) / timestep_s], dim=-1)
+        return self.state

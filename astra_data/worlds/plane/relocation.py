@@ -1,0 +1,131 @@
+"""Where else in its maze a stretch of an episode could have happened, and how the task judges it there."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Episode,
+)
+from astra_data.worlds.objective import Objective
+from astra_data.worlds.plane.geometry import PlanarMap
+from astra_data.worlds.task import Task
+
+Rotations = Literal["quarter", "any", "none"]
+
+_SHIFTS = 64
+"""Places that are tried for each turn."""
+_ROUNDING = 1e-6
+"""How far a turned command may exceed the limit."""
+
+
+def positions(task: Task, states: Array) -> Array:
+    """Return where the robot is, (T, 2) in m, for target states `states` (T, S)."""
+    group = next(group for role, group in task.abstract_state.roles if role == "position")
+    return np.ascontiguousarray(task.abstraction(states)[:, group])
+
+
+@dataclass(frozen=True)
+class Relocation:
+    """How stretches of episodes may be moved within the maze of `task`.
+
+    Attributes:
+        rotations: by multiples of 90 degrees, by any angle, or none.
+        translations: to anywhere; otherwise a stretch starts where it did.
+        reflections: mirror every second one, at random.
+        margin_m: clearance from the walls, kept by every step before and after it is moved.
+        min_steps: shortest stretch.
+        tries: turns that are drawn, with 64 places for each, before a stretch is given up.
+    """
+
+    task: Task
+    rotations: Rotations
+    translations: bool
+    reflections: bool
+    margin_m: float
+    min_steps: int
+    tries: int
+
+    def stretches(self, episode: Episode) -> list[tuple[int, int]]:
+        """Return first step and end of the stretches of `episode` that may be moved."""
+        free = np.ones(len(episode), dtype=bool)
+        for name in (STATE, NEXT_STATE):
+            free &= self._is_free(positions(self.task, episode.columns[name]))
+        edges = np.flatnonzero(np.diff(free, prepend=False, append=False)).reshape(-1, 2)
+        return [(int(first), int(end)) for first, end in edges if end - first >= self.min_steps]
+
+    def draw(self, episode: Episode, rng: np.random.Generator) -> tuple[PlanarMap, slice] | None:
+        """Draw a stretch of `episode`, which must have one, and where to put it.
+
+        The longer a stretch, the more often it is drawn. None where no place was found.
+        """
+        stretches = self.stretches(episode)
+        lengths = np.array([end - first for first, end in stretches])
+        for _ in range(self.tries):
+            steps = slice(*stretches[rng.choice(len(stretches), p=lengths / lengths.sum())])
+            turn = self._draw_turn(rng)
+            if not self._is_commanded(turn, episode.columns[ACTION][steps]):
+                continue
+            ends = [positions(self.task, episode.columns[name][steps]) for name in (STATE, NEXT_STATE)]
+            path = turn.positions(np.concatenate(ends).astype(np.float64))
+            shifts = self._draw_shifts(ends[0][0], path, rng)
+            # Rounded as they are stored.
+            fits = self._is_free((path + shifts[:, None]).astype(np.float32)).all(axis=1)
+            if fits.any():
+                x, y = shifts[fits.argmax()]
+                return PlanarMap(turn.rotation_rad, (float(x), float(y)), turn.reflected), steps
+        return None
+
+    def _is_free(self, points: Array) -> Array:
+        return self.task.maze.clearance(points) > self.margin_m
+
+    def _is_commanded(self, turn: PlanarMap, action: Array) -> bool:
+        command = next(column for column in self.task.state_columns if column.name == ACTION)
+        turned = turn.of_column(command, action)
+        return bool(np.abs(turned).max() <= self.task.action_limit + _ROUNDING)
+
+    def _draw_turn(self, rng: np.random.Generator) -> PlanarMap:
+        angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}
+        reflected = self.reflections and bool(rng.integers(2))
+        return PlanarMap(float(angle[self.rotations]), reflected=reflected)
+
+    def _draw_shifts(self, start: Array, path: Array, rng: np.random.Generator) -> Array:
+        """Draw shifts (n, 2) that keep `path` (T, 2) inside the maze, as far as it fits there."""
+        if not self.translations:
+            return np.asarray(start - path[0])[None]
+        room = self.task.maze.half_extent
+        low, high = -room - path.min(axis=0), room - path.max(axis=0)
+        return rng.uniform(low, np.maximum(low, high), (_SHIFTS, 2))
+
+
+def outcomes(
+    objective: Objective, before: Array, after: Array, goal: Array, toppled: Array
+) -> dict[str, Array]:
+    """Judge an episode that moves from `before` to `after`, both (T, 2) in m, perhaps toppling (T,).
+
+    `goal` is (2,). Returns the outcome columns up to where the task ends, (T',) with T' <= T.
+    """
+    start, end = torch.from_numpy(before), torch.from_numpy(after)
+    goals, fallen = torch.from_numpy(goal).expand(len(start), 2), torch.from_numpy(toppled)
+    success = objective.reached(end, goals)
+    terminated = (success | fallen).numpy()
+    length = int(terminated.argmax()) + 1 if terminated.any() else len(terminated)
+    done = np.arange(length) == length - 1
+    return {
+        REWARD: objective.reward(start, end, goals, fallen).numpy()[:length],
+        TERMINATED: terminated[:length],
+        TRUNCATED: done & ~terminated[:length],
+        DONE: done,
+        SUCCESS: success.numpy()[:length],
+    }

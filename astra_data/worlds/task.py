@@ -1,0 +1,174 @@
+"""What a task is: a target environment, an abstract simulator, the map between them, and what to achieve."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Column
+from astra_data.worlds.batched import TargetEnv
+from astra_data.worlds.objective import Objective, PlanarObjective
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.protocols import PairedSimulator
+from astra_data.worlds.variation import Variation, VariedSimulator
+
+
+class MakeSimulator(Protocol):
+    """Builds B abstract simulators."""
+
+    def __call__(self, num_envs: int, *, device: str) -> PairedSimulator:
+        """Build `num_envs` simulators."""
+        ...
+
+
+class MakeVariedSimulator(Protocol):
+    """Builds B abstract simulators whose parameters vary."""
+
+    def __call__(self, num_envs: int, variation: Variation, *, device: str) -> VariedSimulator:
+        """Build `num_envs` simulators."""
+        ...
+
+
+@dataclass(frozen=True)
+class Varied:
+    """How the parameters of an abstract simulator vary from episode to episode.
+
+    Attributes:
+        make_simulator: builds simulators whose parameters vary.
+        randomized: what domain randomization varies, in which ranges.
+        wide: what COMPASS varies or identifies, and RMA adapts to; its kind is that of all parameters that
+            the simulator has.
+    """
+
+    make_simulator: MakeVariedSimulator
+    randomized: Variation
+    wide: Variation
+
+
+@dataclass(frozen=True)
+class Plane:
+    """What is known of a robot in a plane, among the walls of a maze.
+
+    Attributes:
+        wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
+        is_mirrorable: whether the robot, its controller included, is its own mirror image.
+    """
+
+    wall_reach_m: float
+    is_mirrorable: bool
+
+
+@dataclass(frozen=True)
+class Task:
+    """A problem of abstract sim2real.
+
+    Attributes:
+        name: in recipes. instruction: what LeRobot calls the task.
+        objective: horizon, reward and success; the maze, if there is one.
+        make_target, make_simulator: the worlds.
+        abstraction: φ, target states (..., S) to abstract states (..., X).
+        beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., R).
+        state_columns: the columns that hold states, goal and action, with units, frames and roles.
+        abstract_state: the column of abstract states, likewise.
+        timestep_s: the control period.
+        action_limit: largest action along each axis; both worlds cut off what is beyond.
+        quantities: of abstract states that the gap report tells of, named with their unit: their indices.
+        facts: what datasets record about the target environment.
+        simulator_id: names the abstract simulator in datasets.
+        varied: the same simulator with parameters that vary.
+        plane: what only a task in a maze has; None for others.
+        photograph: pictures (K, height, width, 3) of target states (K, S), where they are worth seeing.
+        target_id: what the target is called where several tasks have it, so that episodes of one serve all.
+    """
+
+    name: str
+    instruction: str
+    objective: Objective
+    make_target: Callable[..., TargetEnv]
+    make_simulator: MakeSimulator
+    abstraction: Callable[[Any], Any]
+    beyond: Callable[[Tensor], Tensor]
+    state_columns: tuple[Column, ...]
+    abstract_state: Column
+    timestep_s: float
+    action_limit: float
+    quantities: Mapping[str, tuple[int, ...]]
+    simulator_id: str
+    facts: Mapping[str, str | float]
+    varied: Varied
+    plane: Plane | None = None
+    photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
+    target_id: str | None = None
+
+    def shares_target(self, other: "Task") -> bool:
+        """Tell whether both tasks have the same target, and differ in what is simulated of it."""
+        return self.target_id is not None and self.target_id == other.target_id
+
+    @property
+    def planar(self) -> Plane:
+        """What only a task in a maze has.
+
+        Raises:
+            BadInputError: this one has no maze.
+        """
+        if self.plane is None:
+            raise self.without_maze()
+        return self.plane
+
+    @property
+    def maze(self) -> Maze:
+        """The maze.
+
+        Raises:
+            BadInputError: there is none.
+        """
+        if not isinstance(self.objective, PlanarObjective):
+            raise self.without_maze()
+        return self.objective.maze
+
+    def without_maze(self) -> BadInputError:
+        """Return the error of who asks for something planar though there is no maze."""
+        return BadInputError(
+            f"expected a task in a maze, got '{self.name}', which has neither walls nor places: leave out "
+            "what needs them (augment, follower, support_penalty, command_limit_m_s, "
+            "clearance_m, start 'anywhere')"
+        )
+
+    @property
+    def ball_index(self) -> int | None:
+        """Where in abstract states the position of a ball begins; None where there is none."""
+        ball = self.quantities.get("ball_position_m")
+        return ball[0] if ball else None
+
+    @property
+    def fps(self) -> int:
+        """Control steps per second, rounded: LeRobot's are whole numbers."""
+        return round(1.0 / self.timestep_s)
+
+    def target(self, num_envs: int, **options: Any) -> TargetEnv:  # noqa: ANN401 - handed on
+        """Build `num_envs` target environments; `options` are the environment's own."""
+        return self.make_target(self.objective, num_envs, **options)
+
+    def simulator(self, num_envs: int, device: str = "cpu") -> PairedSimulator:
+        """Build `num_envs` abstract simulators."""
+        return self.make_simulator(num_envs, device=device)
+
+    def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedSimulator:
+        """Build `num_envs` abstract simulators whose parameters vary."""
+        return self.varied.make_simulator(num_envs, variation, device=device)
+
+
+def roles(
+    names: tuple[str, ...],
+    units: list[str],
+    frames: list[str],
+    entries: list[str],
+    mirror: list[str] | None = None,
+) -> dict[str, Any]:
+    """Return what a `Column` is told of its entries: names, units, frames, roles and mirror images."""
+    astra = {"unit": units, "frame": frames, "role": entries}
+    return {"names": names, "astra": astra if mirror is None else {**astra, "mirror": mirror}}

@@ -1,0 +1,223 @@
+"""Variation: how the parameters of simulators differ from episode to episode."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar, Protocol, Self, runtime_checkable
+
+import torch
+from pydantic import AfterValidator
+from torch import Tensor
+
+from astra_data.core.config import Config
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.plane.geometry import turned
+from astra_data.worlds.protocols import PlacedSimulator
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"expected the lower end first, got {list(ends)}")
+    return ends
+
+
+def _above_zero(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] <= 0:
+        raise ValueError(f"expected a range above 0, got {list(ends)}")
+    return ends
+
+
+def _not_below_zero(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] < 0:
+        raise ValueError(f"expected a range from 0 up, got {list(ends)}")
+    return ends
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+FactorRange = Annotated[Range, AfterValidator(_above_zero)]
+NoiseRange = Annotated[Range, AfterValidator(_not_below_zero)]
+
+
+class Variation(Config):
+    """Ranges of the P parameters of an episode, drawn uniformly; by default all are the plain simulator's.
+
+    Attributes:
+        steering: those that replays of recordings tell. They tell no noise: with it none comes closer to a
+            recording, however noisy the target is.
+        sensing: scales of sensors, plain in replays. These begin at states as they were recorded, so a scale
+            could only bring them closer by hiding errors of the motion, and drowns all else.
+    """
+
+    steering: ClassVar[tuple[str, ...]] = ()
+    sensing: ClassVar[tuple[str, ...]] = ()
+
+    @staticmethod
+    def of_json(ranges: Mapping[str, Sequence[float]]) -> "Variation":
+        """Return what `model_dump` gave, after a way through JSON."""
+        kinds = (BallVariation, JointVariation)
+        kind = next((kind for kind in kinds if kind.model_fields.keys() == ranges.keys()), PlanarVariation)
+        return kind(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters, in the order of their columns."""
+        return tuple(type(self).model_fields)
+
+    def noiseless(self) -> "Variation":
+        """Return the same ranges, with noise and sensors as in the plain simulator."""
+        return type(self)(**{name: getattr(self, name) for name in self.steering})
+
+    def replayed(self) -> Self:
+        """Return the same ranges, with scales of sensors as in the plain simulator."""
+        return self.model_copy(update={name: getattr(type(self)(), name) for name in self.sensing})
+
+    def ranges(self) -> Tensor:
+        """Return lower and upper end of every parameter, (P, 2), in the order of `names`."""
+        return torch.tensor([getattr(self, name) for name in self.names])
+
+    def by_name(self, parameters: Tensor) -> dict[str, Tensor]:
+        """Return the columns (B,) of `parameters` (B, P) by their names."""
+        return dict(zip(self.names, parameters.unbind(-1), strict=True))
+
+    def draw(self, count: int, device: torch.device | str = "cpu") -> Tensor:
+        """Draw the parameters (count, P) of as many episodes, from torch's global generator."""
+        low, high = self.ranges().to(device).unbind(-1)
+        return low + (high - low) * torch.rand(count, len(low), device=device)
+
+    def redraw(self, parameters: Tensor, rows: Tensor) -> Tensor:
+        """Return `parameters` (B, P) with new ones in the rows `rows` (n,)."""
+        return parameters.index_copy(0, rows, self.draw(len(rows), parameters.device))
+
+    def normal(self, parameters: Tensor) -> Tensor:
+        """Map parameters (..., P) to -1 at the lower and 1 at the upper end of their ranges, (..., P)."""
+        low, high = self.ranges().to(parameters.device).unbind(-1)
+        middle, half = (low + high) / 2, (high - low) / 2
+        # A parameter that does not vary tells nothing: it is 0.
+        return torch.where(half > 0, (parameters - middle) / half.clamp_min(1e-9), 0.0)
+
+
+class PlanarVariation(Variation):
+    """Of a robot in a plane.
+
+    In this simulator friction, action scale and timestep all lengthen or shorten the way of a command, so
+    positions tell their product only; velocities, that of the first two.
+    """
+
+    steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
+
+    friction: FactorRange = (1.0, 1.0)
+    """Factor on the speed that a command gives."""
+    action_scale: Range = (0.0, 0.0)
+    """Share by which commands are too long."""
+    action_noise: NoiseRange = (0.0, 0.0)
+    """Standard deviation of Gaussian noise on commands, in m/s."""
+    position_noise_m: NoiseRange = (0.0, 0.0)
+    """Half width of the uniform noise on shown positions."""
+    velocity_noise_m_s: NoiseRange = (0.0, 0.0)
+    """Half width of the uniform noise on shown velocities."""
+    heading_bias_deg: Range = (0.0, 0.0)
+    """Commands are turned by this angle."""
+    timestep_scale: FactorRange = (1.0, 1.0)
+    """Factor on the control period."""
+
+
+class BallVariation(PlanarVariation):
+    """Of a robot in a plane, with a ball."""
+
+    steering: ClassVar[tuple[str, ...]] = (
+        *PlanarVariation.steering,
+        "ball_friction",
+        "contact_direction_deg",
+    )
+
+    ball_friction: FactorRange = (1.0, 1.0)
+    """Factor on the deceleration of the rolling ball."""
+    ball_position_noise_m: NoiseRange = (0.0, 0.0)
+    """Half width of the uniform noise on shown positions of the ball."""
+    ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)
+    """Half width of the uniform noise on shown velocities of the ball."""
+    contact_direction_deg: Range = (0.0, 0.0)
+    """The ball leaves a contact or a kick turned by this angle."""
+
+
+class JointVariation(Variation):
+    """Of joints under position control.
+
+    Friction and timestep both lengthen or shorten a joint's way to its target: where nothing else moves the
+    joint, angles tell little but their quotient; rates, the first alone.
+    """
+
+    steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "timestep_scale")
+    sensing: ClassVar[tuple[str, ...]] = ("observation_scale",)
+
+    friction: FactorRange = (1.0, 1.0)
+    """Factor on the joints' own damping, beside which that of the position control stays."""
+    action_scale: Range = (0.0, 0.0)
+    """Share by which commands are too long."""
+    action_noise: NoiseRange = (0.0, 0.0)
+    """Standard deviation of Gaussian noise on commands, which are ±1."""
+    observation_scale: FactorRange = (1.0, 1.0)
+    """Factor on all that is shown of the state."""
+    timestep_scale: FactorRange = (1.0, 1.0)
+    """Factor on the control period."""
+
+
+class AnyVariation(BallVariation, JointVariation):
+    """Of any simulator, as recipes give them: parameters that it does not have stay plain."""
+
+    def of_kind[V: Variation](self, kind: type[V]) -> V:
+        """Return the ranges of the parameters that `kind` has.
+
+        Raises:
+            BadInputError: another one is not plain.
+        """
+        plain = AnyVariation()
+        others = [name for name in plain.names if name not in kind.model_fields]
+        foreign = [name for name in others if getattr(self, name) != getattr(plain, name)]
+        if foreign:
+            known = ", ".join(kind.model_fields)
+            raise BadInputError(f"expected ranges of {known}, got one of {', '.join(foreign)}")
+        return kind(**{name: getattr(self, name) for name in kind.model_fields})
+
+
+@runtime_checkable
+class VariedSimulator(PlacedSimulator, Protocol):
+    """B abstract states whose simulator's parameters differ from row to row.
+
+    Attributes:
+        variation: the ranges of the parameters. parameters: (B, P), in the order of its `names`.
+        true_state: what is so, (B, X) float32; `state` is what is shown of it.
+    """
+
+    variation: Variation
+    parameters: Tensor
+    true_state: Tensor
+
+
+RANDOMIZED_ACTIONS = PlanarVariation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
+"""Of domain randomization in navigation, as printed (Section V-A)."""
+
+WIDE_RANGES = PlanarVariation(
+    friction=(0.8, 1.2),
+    action_scale=(-0.1, 0.1),
+    action_noise=(0.05, 0.05),
+    position_noise_m=(0.03, 0.03),
+    velocity_noise_m_s=(0.0, 0.02),
+    heading_bias_deg=(-5.0, 5.0),
+    timestep_scale=(0.75, 1.25),
+)
+"""Of COMPASS in navigation, as printed (Section V-A): a control period of 0.015 to 0.025 s is read as shares
+of one of 0.02 s."""
+
+
+def noisy_command(of: Mapping[str, Tensor], action: Tensor) -> Tensor:
+    """Return commands (B, A) with noise by the parameters `of` (B,) each, cut off at ±1.
+
+    Noise is drawn from torch's global generator.
+    """
+    noise = of["action_noise"].unsqueeze(-1) * torch.randn_like(action)
+    return (action + noise).clamp(-1.0, 1.0)
+
+
+def planar_command(of: Mapping[str, Tensor], action: Tensor) -> Tensor:
+    """Return what becomes of planar commands (B, 2): noisy, turned, scaled, by the parameters `of` (B,)."""
+    steered = turned(noisy_command(of, action), torch.deg2rad(of["heading_bias_deg"]))
+    return (of["friction"] * (1.0 + of["action_scale"])).unsqueeze(-1) * steered

@@ -1,0 +1,85 @@
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import AstraDataError
+from astra_data.dataset import Dataset, StagedWriter
+from astra_data.dataset.columns import Episode
+from astra_data.dataset.versions import open_dataset
+
+SMALL = ["--episodes", "2", "--max-steps", "3"]
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+def call(*arguments: str) -> Result:
+    return CliRunner().invoke(cli.app, arguments)
+
+
+def test_a_dataset_is_collected_and_paired_without_a_recipe(home: Path) -> None:
+    collected = call("collect", "antmaze-umaze", *SMALL, "--seed", "3")
+    folder = home / "antmaze-umaze-random-seed3/data-1.0.0"
+    assert collected.output.splitlines()[-1] == f"finished: {folder}"
+    assert "target steps/s" in collected.output
+    dataset = Dataset.open(folder)
+    assert (len(dataset), dataset.lengths.tolist()) == (2, [3, 3])
+    paired = call("pair", "antmaze-umaze-random-seed3", "--simulator", "antmaze-umaze")
+    assert paired.output.splitlines()[-1] == f"finished: {folder.with_name('data-2.0.0')}"
+    newest = open_dataset("antmaze-umaze-random-seed3")
+    assert newest.description["parents"] == [dataset.identity]
+
+
+def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
+    assert (
+        call("collect", "antmaze-long", *SMALL, "--out", str(tmp_path / "a"), "--name", "walks").exit_code
+        == 0
+    )
+    assert Dataset.open(tmp_path / "a").reference == "walks@data-1.0.0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["collect", "recipe.toml", "--episodes", "3"], r"in \[collect\]: leave out --episodes"),
+        (["collect", "recipe.toml", "--resume"], r"leave out --resume"),
+        (["collect", "antmaze-umaze", "--seed", "1", "--seed", "2"], r"takes one --seed"),
+        (["collect", "antmaze-umaze", "--behavior", "wild"], r"behavior: expected 'random', .*got 'wild'"),
+        (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),
+        (["pair", "recipe.toml", "--simulator", "antmaze-umaze"], r"in \[pair\]: leave out --simulator"),
+        (["pair", "walks", "--jobs", "2", "--simulator", "antmaze-umaze"], r"neither --seed nor --jobs"),
+        (["pair", "walks"], r"expected --simulator"),
+        (["pair", "walks", "--simulator", "antmaze-umaze"], r"no dataset 'walks'"),
+    ],
+)
+def test_what_does_not_fit_is_told(home: Path, arguments: list[str], told: str) -> None:
+    error = call(*arguments).exception
+    assert isinstance(error, AstraDataError)
+    with pytest.raises(AstraDataError, match=told):
+        raise error
+    assert not home.exists()
+
+
+def test_datasets_at_home_are_listed(home: Path) -> None:
+    call("collect", "antmaze-umaze", *SMALL, "--name", "walks")
+    call("pair", "walks", "--simulator", "antmaze-umaze", "--name", "pairs")
+    told = call("list").output
+    assert [line.split()[1] for line in told.splitlines() if "@" in line] == [
+        "pairs@data-1.0.0",
+        "walks@data-1.0.0",
+    ]
+
+
+def test_stopping_a_recording_says_how_to_go_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(StagedWriter, "add", stop)
+    stopped = call("collect", "antmaze-umaze", *SMALL)
+    assert stopped.exit_code == 130
+    assert stopped.output.splitlines()[-1] == "stopped: the same command with --resume goes on from here"

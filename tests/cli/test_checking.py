@@ -1,0 +1,48 @@
+import sys
+from pathlib import Path
+
+import pytest
+from fake_dataset import write_fake
+
+from astra_data.cli import app as cli
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["astra-data", *map(str, arguments)])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    return int(left.value.code or 0)
+
+
+def test_validate_and_repair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    assert run(monkeypatch, "validate", root) == 0
+    assert capsys.readouterr().out == f"{root} is whole: 5 episodes, 55 steps\n"
+    (root / "meta/tasks.parquet").unlink()
+    (root / "meta/stats.json").write_text("{}")
+    assert run(monkeypatch, "validate", root) == 1
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {root} has ")
+    assert "meta/tasks.parquet is missing" in told
+    assert "meta/stats.json: min of observation.state is None" in told
+    assert told.endswith(f"astra-data repair {root} --out DIR\n")
+    assert run(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 0
+    assert "finished: " in capsys.readouterr().out
+    assert run(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
+    assert "exists already" in capsys.readouterr().err
+    assert run(monkeypatch, "validate", tmp_path / "saved") == 0
+
+
+def test_validate_counts_all_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    (root / "data/0.txt").touch()
+    run(monkeypatch, "validate", root)
+    assert "has 1 fault:" in capsys.readouterr().err
+    for number in range(30):
+        (root / f"data/{number}.txt").touch()
+    run(monkeypatch, "validate", root)
+    assert "has 30 faults:" in capsys.readouterr().err

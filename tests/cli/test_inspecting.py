@@ -1,0 +1,39 @@
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+from fake_dataset import COLUMNS, write_fake
+from typer.testing import CliRunner, Result
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import BadInputError
+
+
+def call(*arguments: str) -> Result:
+    return CliRunner().invoke(cli.app, arguments)
+
+
+def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:
+    write_fake(tmp_path / "fake")
+    result = call("inspect", str(tmp_path / "fake"), "--plot", str(tmp_path / "plots"))
+    assert "fake@data-1.0.0: 5 episodes" in result.output
+    assert result.output.splitlines()[-1] == f"written: {tmp_path / 'plots/position_coverage.png'}"
+    # Its roles tell positions but no velocities.
+    (picture,) = (tmp_path / "plots").iterdir()
+    assert matplotlib.image.imread(picture).std() > 0.05
+
+
+def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    write_fake(tmp_path / "fake")
+    write_fake(tmp_path / "mute", columns=[replace(column, astra=None) for column in COLUMNS])
+    for arguments, told in (
+        ([str(tmp_path / "none")], "no such folder"),
+        ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "roles of its state tell no position"),
+        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "expected a folder to write to"),
+    ):
+        error = call("inspect", *arguments).exception
+        assert isinstance(error, BadInputError)
+        with pytest.raises(BadInputError, match=told):
+            raise error

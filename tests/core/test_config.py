@@ -1,0 +1,103 @@
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from pydantic import Field, ValidationError
+
+from astra_data.core.config import Config, did_you_mean, load_recipe
+from astra_data.core.errors import RecipeError
+
+
+class Training(Config):
+    env_steps: int = Field(default=10, gt=0)
+    learning_rate: float = 1e-3
+    """Of Adam."""
+    hidden_sizes: tuple[int, ...] = (4, 4)
+    learner: Literal["ppo", "sac"] = "ppo"
+
+
+class Experiment(Config):
+    task: str
+    seeds: tuple[int, ...] = (0,)
+    train: Training = Training()
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "recipe.toml"
+    path.write_text(text)
+    return path
+
+
+def fault(folder: Path, text: str) -> str:
+    path = write(folder, text)
+    with pytest.raises(RecipeError) as caught:
+        load_recipe(path, Experiment)
+    return str(caught.value).replace(str(path), "FILE")
+
+
+def test_a_recipe_is_read_into_its_model(tmp_path: Path) -> None:
+    text = 'task = "maze"\nseeds = [3, 4]\n[train]\nlearning_rate = 1\nhidden_sizes = [8]\n'
+    recipe = load_recipe(write(tmp_path, text), Experiment)
+    training = Training(learning_rate=1.0, hidden_sizes=(8,))
+    assert recipe == Experiment(task="maze", seeds=(3, 4), train=training)
+    assert isinstance(recipe.train.learning_rate, float)
+
+
+def test_configs_are_frozen_and_described_by_the_strings_under_their_fields() -> None:
+    with pytest.raises(ValidationError):
+        Training().env_steps = 3
+    assert Training.model_fields["learning_rate"].description == "Of Adam."
+
+
+def test_all_faults_come_in_one_message(tmp_path: Path) -> None:
+    text = 'seeds = [0, "one"]\n[train]\nlearning_rate = true\nlearner = "dqn"\nenvsteps = 1\n'
+    assert fault(tmp_path, text).splitlines() == [
+        "FILE has 5 faults:",
+        "  task: expected a value, but the key is missing",
+        "  seeds.1: expected a whole number, got 'one'",
+        "  train.learning_rate: expected a number, got True",
+        "  train.learner: expected 'ppo' or 'sac', got 'dqn'",
+        "  train.envsteps: unknown key: did you mean 'env_steps'?",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('tsk = "maze"', "tsk: unknown key: did you mean 'task'?"),
+        ("learning_rates = 1.0", "learning_rates: unknown key: did you mean 'train.learning_rate'?"),
+        ("[trian]", "trian: unknown key: did you mean 'train'?"),
+        ("[train]\ncolour = 1", "train.colour: unknown key; known: env_steps, learning_rate, hidden_sizes,"),
+        ("[train]\nenv_steps = 1.5", "train.env_steps: expected a whole number, got 1.5"),
+        ("train = 3", "train: expected a table, got 3"),
+        ("seeds = 3", "seeds: expected an array, got 3"),
+        ("[train]\nenv_steps = 0", "train.env_steps: expected greater than 0, got 0"),
+        ("[train]\nlearning_rate = nan", "train.learning_rate: expected a finite number, got nan"),
+        ('[train]\nenv_steps = "10"', "train.env_steps: expected a whole number, got '10'"),
+    ],
+)
+def test_a_fault_names_its_key_and_what_was_expected(tmp_path: Path, text: str, expected: str) -> None:
+    task = "" if "tsk" in text else 'task = "maze"\n'
+    assert expected in fault(tmp_path, task + text)
+
+
+def test_a_single_fault_is_a_single_line(tmp_path: Path) -> None:
+    assert fault(tmp_path, "task = 3") == "FILE: task: expected a string in quotes, got 3"
+
+
+def test_a_syntax_error_names_its_line(tmp_path: Path) -> None:
+    assert fault(tmp_path, 'task = "maze"\nseeds = [1,\nx').startswith("FILE, line 3: not valid TOML: ")
+    assert fault(tmp_path, "task =").startswith("FILE, line 1: not valid TOML: ")
+
+
+def test_a_missing_or_unreadable_recipe_is_one_line(tmp_path: Path) -> None:
+    write(tmp_path, "")
+    with pytest.raises(RecipeError, match=r"recipes\.toml does not exist: did you mean '.*recipe\.toml'\?$"):
+        load_recipe(tmp_path / "recipes.toml", Experiment)
+    with pytest.raises(RecipeError, match="cannot be read as a text file"):
+        load_recipe(tmp_path, Experiment)
+
+
+def test_names_without_a_close_match_are_all_listed() -> None:
+    assert did_you_mean("nass", ("nas", "astra")) == ": did you mean 'nas'?"
+    assert did_you_mean("x", ("nas", "astra")) == "; known: nas, astra"

@@ -1,0 +1,27 @@
+import threading
+from pathlib import Path
+
+from astra_data.core.lock import held
+
+
+def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
+    with held(tmp_path) as first, held(tmp_path) as second, held(tmp_path / "..") as other:
+        assert (first, second, other) == (True, False, True)
+    with held(tmp_path) as again:
+        assert again
+
+
+def test_who_waits_gets_the_lock_when_it_is_free(tmp_path: Path) -> None:
+    got = threading.Event()
+
+    def wait() -> None:
+        with held(tmp_path, wait=True) as ours:
+            assert ours
+            got.set()
+
+    waiting = threading.Thread(target=wait)
+    with held(tmp_path):
+        waiting.start()
+        assert not got.wait(0.1)
+    waiting.join()
+    assert got.is_set()

@@ -1,0 +1,59 @@
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from astra_data.core import provenance
+from astra_data.core.provenance import git_commit, origin
+
+GIT = ("git", "-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Return a checkout with one committed file of code."""
+    (tmp_path / "astra_data").mkdir()
+    for name in ("astra_data/code.py", "pyproject.toml", "uv.lock"):
+        (tmp_path / name).write_text("1")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-q", "-m", "one")
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+    git_commit.cache_clear()
+    yield tmp_path
+    git_commit.cache_clear()
+
+
+def git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run([*GIT, "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_the_commit_is_the_one_that_the_process_began_with(checkout: Path) -> None:
+    first = git(checkout, "rev-parse", "HEAD")
+    assert git_commit() == first
+    git(checkout, "commit", "-q", "--allow-empty", "-m", "two")
+    assert git_commit() == first
+
+
+@pytest.mark.parametrize(
+    ("changed", "ending"), [("astra_data/new.py", "-dirty"), ("uv.lock", "-dirty"), ("notes.md", "")]
+)
+def test_only_changed_code_makes_it_dirty(checkout: Path, changed: str, ending: str) -> None:
+    (checkout / changed).write_text("2")
+    assert git_commit() == git(checkout, "rev-parse", "HEAD") + ending
+
+
+def test_without_a_checkout_there_is_no_commit(checkout: Path) -> None:
+    shutil.rmtree(checkout / ".git")
+    assert git_commit() is None
+
+
+def test_a_gpu_is_named_where_the_networks_are_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device}")
+    assert origin("cuda:1")["machine"]["gpu"] == "GPU cuda:1"
+    assert origin()["machine"]["gpu"] is None
+    assert origin()["machine"]["cores"] >= 1

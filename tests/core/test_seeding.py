@@ -1,0 +1,19 @@
+import numpy as np
+
+from astra_data.core.seeding import derive, generator
+
+
+def test_streams_are_the_same_on_every_machine() -> None:
+    assert derive(0, "collect") == 8832000878795479372
+    assert list(generator(0, "collect").integers(0, 100, 5)) == [26, 26, 5, 6, 67]
+
+
+def test_seeds_and_purposes_give_different_streams() -> None:
+    seeds = {derive(seed, purpose) for seed in range(100) for purpose in ("a", "b", "1", "11")}
+    assert len(seeds) == 400
+    assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+def test_streams_of_two_purposes_are_uncorrelated() -> None:
+    one, two = (generator(0, purpose).standard_normal(10_000) for purpose in ("one", "two"))
+    assert abs(np.corrcoef(one, two)[0, 1]) < 0.05

@@ -1,0 +1,235 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from fake_dataset import fake_columns, write_fake, writer
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Episode
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.findings import MOST
+
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+def alter(name: str, column: str, row: int, value: object) -> Callable[[Path], None]:
+    """Change one value of a parquet file."""
+
+    def change(root: Path) -> None:
+        table = pq.read_table(root / name)
+        values = table.column(column).to_pylist()
+        values[row] = value
+        at = table.column_names.index(column)
+        field = table.schema.field(column)
+        changed = table.set_column(at, field, pa.array(values, field.type))
+        pq.write_table(changed, root / name, row_group_size=10)
+
+    return change
+
+
+def edit(name: str, **changes: object) -> Callable[[Path], None]:
+    def change(root: Path) -> None:
+        path = root / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return change
+
+
+def drop(name: str) -> Callable[[Path], None]:
+    return lambda root: (root / name).unlink()
+
+
+def truncate(name: str) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-20])
+
+
+def write(name: str, content: bytes) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes(content)
+
+
+def change_statistics(root: Path) -> None:
+    stats = json.loads((root / "meta/stats.json").read_text())
+    stats["action"]["q99"][1] += 0.1
+    (root / "meta/stats.json").write_text(json.dumps(stats))
+
+
+def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
+    report = check(write_fake(tmp_path / "set").root)
+    assert (report.faults, report.notes) == ([], [])
+    assert (report.episodes, report.frames) == (5, 55)
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (alter(DATA, "frame_index", 9, 7), ["frame_index is 7 in episode 2 frame 1, expected 1"]),
+        (alter(DATA, "index", 8, 70), ["index is 70 in episode 2 frame 0, expected 8"]),
+        (alter(DATA, "episode_index", 30, 9), ["episode_index is 9 in episode 3 frame 10, expected 3"]),
+        (alter(DATA, "timestamp", 10, 0.2), ["timestamp is 0.2", "in episode 2 frame 2, expected 0.1"]),
+        (alter(DATA, "task_index", 8, 3), ["episode 2 has the unknown tasks [3]"]),
+        (alter(DATA, "episode_uid", 9, 5), ["episode_uid is 5 in episode 2 frame 1"]),
+        (
+            alter(DATA, "next.done", 9, True),
+            [
+                "next.done is True in episode 2 frame 1, before the last frame 11",
+                "next.done is True in episode 2 frame 1, expected False: terminated or truncated",
+            ],
+        ),
+        (alter(DATA, "next.truncated", 9, True), ["next.truncated is True in episode 2 frame 1, before"]),
+        (
+            alter(DATA, "observation.state", 10, [0, np.nan, 0]),
+            ["observation.state is nan in episode 2 frame 2 index 1, expected a finite number"],
+        ),
+        (alter(DATA, "action", 10, [0, 0]), ["mean of action in episode 2 is", "the content hash is"]),
+        (alter(EPISODES, "length", 1, 2), ["length of episode 1 is 2, expected 1"]),
+        (alter(EPISODES, "dataset_to_index", 1, 9), ["dataset_to_index of episode 1 is 9, expected 8"]),
+        (alter(EPISODES, "data/file_index", 1, 4), ["said to be in data/chunk-000/file-004.parquet"]),
+        (alter(EPISODES, "tasks", 0, ["walk"]), ["tasks of episode 0 are ['walk'], expected {'run'}"]),
+        (alter(EPISODES, "stats/mode/max", 2, [5.0]), ["max of mode in episode 2 is [5.0]"]),
+        (change_statistics, ["meta/stats.json: q99 of action is"]),
+        (write("meta/stats.json", b'{"action": 1}'), ["meta/stats.json has no JSON object for action"]),
+        (write("meta/stats.json", b"[]"), ["meta/stats.json is no JSON object but list"]),
+        (drop("meta/stats.json"), ["meta/stats.json is missing"]),
+        (
+            drop("meta/tasks.parquet"),
+            ["meta/tasks.parquet is missing", "episode 0 has the unknown tasks [0]"],
+        ),
+        (alter("meta/tasks.parquet", "task", 0, None), ["expected one text per task_index"]),
+        (drop("meta/astra/subsets.json"), ["meta/astra/subsets.json is missing"]),
+        (drop(DATA), ["data has no parquet file"]),
+        (drop(EPISODES), ["meta/episodes has no parquet file"]),
+        (truncate(DATA), ["file-000.parquet is truncated or no parquet file"]),
+        (truncate("meta/info.json"), ["meta/info.json is no JSON object"]),
+        (write("data/chunk-000/left.tmp", b""), ["data/chunk-000/left.tmp does not belong to it"]),
+        (edit("meta/astra/subsets.json", uids=[13, 4]), ["not in the order of their seed"]),
+        (edit("meta/astra/dataset.json", content_hash="0"), ["the content hash is", "expected 0"]),
+        (
+            edit("meta/info.json", total_frames=1, total_episodes=2, total_tasks=3, codebase_version="v2.1"),
+            [
+                "is v2.1, expected v3.0",
+                "total_frames is 1, expected 55",
+                "total_episodes is 2",
+                "total_tasks is 3",
+            ],
+        ),
+        (
+            edit("meta/astra/dataset.json", parents=[{"name": "x"}], stage=""),
+            ["dataset.json has 3 faults: parents.0.version: expected a value", "parents.0.hash", "stage: "],
+        ),
+        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 11 faults: name: expected a value"]),
+        (edit("meta/astra/subsets.json", seed="0"), ["subsets.json: seed: expected a whole number"]),
+        (edit("meta/info.json", data_path="/etc/file.parquet"), ["expected a path inside the folder"]),
+        (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
+        (edit("meta/info.json", data_path="{file_index:99999999d}"), ["expected a path inside the folder"]),
+        (edit("meta/info.json", fps="20"), ["fps is '20', expected a positive number"]),
+        (edit("meta/info.json", features=[]), ["features is [], expected an object"]),
+        (alter("meta/astra/episodes.parquet", "length", 3, 4), ["(6, 4) as uid and length of episode 3"]),
+    ],
+)
+def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
+    root = write_fake(tmp_path / "set").root
+    damage(root)
+    faults = "\n".join(check(root).faults)
+    for part in parts:
+        assert part in faults
+
+
+def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for uid in range(12):
+            open_writer.add(Episode(uid, fake_columns(3, seed=uid)))
+    root = tmp_path / "set"
+    table = pq.read_table(root / DATA)
+    for name in ("timestamp", "frame_index"):
+        at, field = table.column_names.index(name), table.schema.field(name)
+        doubled = [2 * value for value in table.column(name).to_pylist()]
+        table = table.set_column(at, field, pa.array(doubled, field.type))
+    pq.write_table(table, root / DATA)
+    faults = check(root).faults
+    assert sum(fault.startswith("frame_index is 2 in episode") for fault in faults) == MOST
+    assert "frame_index: and 7 more of this kind" in faults
+    assert "timestamp: and 7 more of this kind" in faults
+
+
+def test_notes_are_counted_apart_from_faults(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for number in range(8):
+        (root / f"meta/{number}.txt").touch()
+    (root / "data/one.txt").touch()
+    report = check(root)
+    assert report.faults == ["data/one.txt does not belong to it"]
+    assert report.fault_count == 1
+    assert report.notes[-1] == "files: and 3 more of this kind"
+
+
+def test_an_unreadable_file_stops_the_check_of_values_also_after_many_faults(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for number in range(8):
+        (root / f"data/{number}.txt").touch()
+    truncate(DATA)(root)
+    report = check(root)
+    assert report.notes == ["values were not checked, because not all files could be read as declared"]
+    assert (len(report.faults), report.fault_count) == (MOST + 1, 9)
+
+
+def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / DATA)
+    table = table.drop_columns(["action"]).append_column("extra", table.column("mode"))
+    at = table.column_names.index("next.reward")
+    pq.write_table(table.set_column(at, "next.reward", table.column("mode")), root / DATA)
+    faults = "\n".join(check(root).faults)
+    for part in ("lacks column action", "unknown column extra", "has next.reward as int64, expected float"):
+        assert part in faults
+
+
+def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for path in (root / "meta/astra").iterdir():
+        path.unlink()
+    (root / "meta/other.json").write_text("{}")
+    report = check(root)
+    assert report.faults == []
+    assert "a plain LeRobot dataset" in report.notes[0]
+    assert "meta/other.json does not belong to it" in report.notes
+    alter(DATA, "next.done", 9, True)(root)
+    report = check(root)
+    assert not [fault for fault in report.faults if "next.done" in fault]
+    assert "next.done is True in episode 2 frame 1, before the last frame 11" in report.notes
+    alter(DATA, "index", 8, 70)(root)
+    assert "index is 70 in episode 2 frame 0, expected 8" in check(root).faults
+
+
+def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / DATA)
+    at = table.column_names.index("next.reward")
+    wide = table.column("next.reward").cast(pa.float64())
+    pq.write_table(table.set_column(at, "next.reward", wide), root / DATA)
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["next.reward"]["dtype"] = "float64"
+    edit("meta/info.json", features=features)(root)
+    assert "dtype 'float64' is not one of float32, int64, bool" in "\n".join(check(root).faults)
+
+
+def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    for path in (root / "meta/astra").iterdir():
+        path.unlink()
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["next.reward"]["dtype"] = None
+    features["action"]["shape"] = ["2"]
+    edit("meta/info.json", features=features)(root)
+    report = check(root)
+    assert report.faults == []
+    assert "not checked, for they are not rows of numbers: action, next.reward" in report.notes
+
+
+def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no dataset there"):
+        check(tmp_path)

@@ -1,0 +1,284 @@
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import killed_lerobot
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from fake_dataset import fake_episodes, write_fake
+
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
+from astra_data.dataset import Dataset
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
+from astra_data.dataset.format import DATASET_PATH, POLICY_PATH
+
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folders that `killed_lerobot` leaves behind."""
+    folder = tmp_path_factory.mktemp("killed")
+    settings = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, killed_lerobot.__file__, str(folder)]
+    subprocess.run(command, env=os.environ | settings, check=True, capture_output=True)
+    return folder
+
+
+def assert_saved(root: Path, episodes: int) -> None:
+    saved = Dataset.open(root)
+    assert saved.verify() == []
+    assert check(root).faults == []
+    assert saved.uids.tolist() == list(range(episodes))
+    for number, episode in enumerate(saved.episodes()):
+        assert episode.metadata["task"] == killed_lerobot.task(number)
+        expected = killed_lerobot.values(number)
+        assert episode.columns.keys() == expected.keys()
+        for name, values in expected.items():
+            kept = values.astype(np.float32) if values.dtype == np.float64 else values
+            np.testing.assert_array_equal(episode.columns[name], kept)
+
+
+@pytest.mark.parametrize(
+    ("case", "episodes", "faults"),
+    [
+        ("whole", 8, []),
+        ("saved", 25, [f"{DATA} is truncated", f"{EPISODES} is truncated"]),
+        ("buffered", 3, [f"{DATA} is truncated", "meta/episodes has no parquet file"]),
+        ("resumed", 8, ["data/chunk-000/file-001.parquet is truncated"]),
+    ],
+)
+def test_every_saved_episode_of_a_killed_writer_is_recovered(
+    killed: Path, tmp_path: Path, case: str, episodes: int, faults: list[str]
+) -> None:
+    report = check(killed / case)
+    found = "\n".join(report.faults)
+    assert all(fault in found for fault in faults)
+    assert bool(found) == bool(faults)
+    before = {path: path.read_bytes() for path in (killed / case).rglob("*") if path.is_file()}
+    repaired = repair(killed / case, out=tmp_path / "saved")
+    assert (repaired.episodes, repaired.frames) == (
+        episodes,
+        sum(map(killed_lerobot.length, range(episodes))),
+    )
+    assert "force was float64 and is now float32" in repaired.notes
+    assert not [note for note in repaired.notes if "lost" in note]
+    assert_saved(tmp_path / "saved", episodes)
+    assert before == {path: path.read_bytes() for path in (killed / case).rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.62, 0.99])
+def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(
+    killed: Path, tmp_path: Path, share: float
+) -> None:
+    root = tmp_path / "cut"
+    shutil.copytree(killed / "saved", root)
+    size = (root / DATA).stat().st_size
+    with (root / DATA).open("r+b") as file:
+        file.truncate(int(size * share))
+    try:
+        repaired = repair(root, out=tmp_path / "saved")
+    except CorruptDatasetError as error:
+        assert share == 0.05
+        assert "no whole row group" in str(error)
+        return
+    assert abs(repaired.episodes - 25 * share) < 3
+    assert (
+        f"{25 - repaired.episodes} of the 25 episodes that meta/info.json counts are lost" in repaired.notes
+    )
+    assert_saved(tmp_path / "saved", repaired.episodes)
+
+
+def alter(root: Path, column: str, changes: dict[int, object]) -> None:
+    """Change rows of the data."""
+    table = pq.read_table(root / DATA)
+    values = table.column(column).to_pylist()
+    for row, value in changes.items():
+        values[row] = value
+    at, field = table.column_names.index(column), table.schema.field(column)
+    pq.write_table(table.set_column(at, field, pa.array(values, field.type)), root / DATA)
+
+
+def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(root, "next.reward", {25: float("nan")})
+    alter(root, "next.done", {3: True})
+    (root / EPISODES).unlink()
+    (root / "meta/stats.json").unlink()
+    repaired = repair(root, out=tmp_path / "saved")
+    assert repaired.episodes == 3
+    told = "\n".join(repaired.notes)
+    assert "meta/episodes was missing" in told
+    assert "left out episode 0: next.done is True in episode 0 frame 3, before the last frame 6" in told
+    assert "left out episode 3: next.reward is nan in episode 3 frame 5" in told
+    assert "2 of the 5 episodes" in told
+    saved = Dataset.open(tmp_path / "saved")
+    assert (saved.reference, saved.description["stage"]) == ("fake@data-1.1.0", "repair")
+    assert saved.verify() == []
+    assert check(saved.root).faults == []
+    whole = [episode for number, episode in enumerate(fake_episodes()) if number not in (0, 3)]
+    for found, expected in zip(saved.episodes(), whole, strict=True):
+        assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
+        for name, values in expected.columns.items():
+            np.testing.assert_array_equal(found.columns[name], values)
+
+
+def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(root, "episode_uid", dict.fromkeys(range(8, 20), 4))
+    repaired = repair(root, out=tmp_path / "saved")
+    assert "left out episode 2: its uid 4 is taken or negative" in repaired.notes
+    assert Dataset.open(tmp_path / "saved").uids.tolist() == [13, 4, 6, 0]
+
+
+def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(root, "frame_index", {9: 7})
+    repaired = repair(root, out=tmp_path / "saved")
+    assert repaired.episodes == 2
+    assert "stopped before episode 2: frame_index is 7 in episode 2 frame 1, expected 1" in repaired.notes
+
+
+def test_episodes_without_a_uid_keep_their_number(killed: Path, tmp_path: Path) -> None:
+    shutil.copytree(killed / "whole", tmp_path / "set")
+    alter(tmp_path / "set", "next.reward", {0: float("nan")})
+    repair(tmp_path / "set", out=tmp_path / "saved")
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.uids.tolist() == list(range(1, 8))
+    assert saved.metadata["task"] == [killed_lerobot.task(number) for number in range(1, 8)]
+
+
+def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(killed / "whole", root)
+    indices = pq.read_table(root / DATA).column("task_index").to_pylist()
+    alter(root, "task_index", {row: index + 1 for row, index in enumerate(indices)})
+    table = pa.table({"task_index": [1, 2], "task": ["walk", "run"]})
+    pq.write_table(table, root / "meta/tasks.parquet")
+    (root / EPISODES).unlink()
+    repair(root, out=tmp_path / "saved")
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.metadata["task"] == [killed_lerobot.task(number) for number in range(8)]
+    assert saved.task == "walk / run"
+
+
+def test_missing_episodes_are_told_beside_other_notes(killed: Path, tmp_path: Path) -> None:
+    shutil.copytree(killed / "whole", tmp_path / "set")
+    (tmp_path / "set" / EPISODES).unlink()
+    notes = repair(tmp_path / "set", out=tmp_path / "saved").notes
+    assert "meta/episodes was missing and was made anew from the data" in notes
+    assert len(notes) > 1
+
+
+def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / DATA)
+    pq.write_table(table, root / DATA, row_group_size=20)
+    size = (root / DATA).stat().st_size
+    with (root / DATA).open("r+b") as file:
+        file.truncate(size - 5)
+    (root / EPISODES).unlink()
+    repaired = repair(root, out=tmp_path / "saved")
+    assert repaired.episodes == 4
+    assert any("the last 5 frames in file-000.parquet may be part" in note for note in repaired.notes)
+
+
+def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
+    original = write_fake(tmp_path / "original")
+    edited = tmp_path / "edited"
+    shutil.copytree(original.root, edited)
+    shutil.rmtree(edited / "meta/astra")
+    repair(edited, out=tmp_path / "alone")
+    assert Dataset.open(tmp_path / "alone").metadata == {}
+    repair(edited, out=tmp_path / "joined", like=original)
+    joined = Dataset.open(tmp_path / "joined")
+    assert joined.metadata == original.metadata
+    assert joined.description["environment"] == {"id": "Fake-v0"}
+    assert joined.description["parents"] == [original.identity]
+    assert joined.reference == "fake@data-1.1.0"
+
+
+def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set", subset_seed=7).root
+    table = pq.read_table(root / DATA)
+    at = table.column_names.index("action")
+    lists = table.column("action").to_pylist()
+    pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
+    shutil.rmtree(root / "meta/astra")
+    assert check(root).faults == []
+    repair(root, out=tmp_path / "saved")
+    assert Dataset.open(tmp_path / "saved").content_hash == write_fake(tmp_path / "again").content_hash
+    lists[9] = [1.0, 2.0, 3.0]
+    lists[10] = [1.0]
+    pq.write_table(table.set_column(at, "action", pa.array(lists, pa.list_(pa.float32()))), root / DATA)
+    assert check(root).faults == ["action: expected 2 values in every row"]
+
+
+def test_the_policy_that_acted_is_kept(tmp_path: Path) -> None:
+    broken = write_fake(tmp_path / "broken").root
+    (broken / POLICY_PATH).write_bytes(b"weights")
+    repair(broken, out=tmp_path / "whole")
+    assert (tmp_path / "whole" / POLICY_PATH).read_bytes() == b"weights"
+
+
+def test_the_order_of_nested_subsets_is_kept(tmp_path: Path) -> None:
+    whole = write_fake(tmp_path / "set", subset_seed=7)
+    repair(whole.root, out=tmp_path / "saved")
+    assert Dataset.open(tmp_path / "saved").order == whole.order
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_damage_never_ends_in_a_traceback(killed: Path, tmp_path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    root = tmp_path / "set"
+    if seed % 2:
+        write_fake(root)
+    else:
+        shutil.copytree(killed / rng.choice(["whole", "saved", "resumed"]), root)
+    path = rng.choice(sorted(path for path in root.rglob("*") if path.is_file()))
+    content = bytearray(path.read_bytes())
+    if seed % 3 == 0:
+        del content[rng.randrange(len(content)) :]
+    for _ in range(min(len(content), rng.choice([1, 20]))):
+        content[rng.randrange(len(content))] = rng.randrange(256)
+    path.write_bytes(content)
+    check(root)
+    try:
+        repair(root, out=tmp_path / "saved")
+    except AstraDataError:
+        assert not (tmp_path / "saved").exists()
+    else:
+        assert check(tmp_path / "saved").faults == []
+
+
+def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    with pytest.raises(BadInputError, match="exists already"):
+        repair(root, out=root)
+    (root / DATA).write_bytes(b"PAR1 rubbish" * 50)
+    with pytest.raises(CorruptDatasetError, match=r"not one whole episode; .*no whole row group"):
+        repair(root, out=tmp_path / "saved")
+    (root / "meta/info.json").write_text('{"fps": 20, "features": {}}')
+    with pytest.raises(CorruptDatasetError, match="lacks the columns episode_index, frame_index"):
+        repair(root, out=tmp_path / "saved")
+    (root / "meta/info.json").unlink()
+    with pytest.raises(CorruptDatasetError, match=r"meta/info\.json is missing; without it"):
+        repair(root, out=tmp_path / "saved")
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+def test_an_altered_value_is_told_though_it_cannot_be_found(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    path = root / DATASET_PATH
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"content_hash": "0" * 64}))
+    result = repair(root, out=tmp_path / "out")
+    assert [note for note in result.notes if "a value was altered after it was written" in note]
+    assert Dataset.open(tmp_path / "out").description["repaired"] == result.notes

@@ -1,0 +1,123 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_dataset import COLUMNS, fake_columns
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, REWARD, STATE, Array, Column, Episode
+
+
+def test_a_column_survives_the_way_through_features() -> None:
+    assert [Column.from_feature(column.name, column.feature()) for column in COLUMNS] == list(COLUMNS)
+
+
+def test_a_feature_carries_what_each_index_means() -> None:
+    assert COLUMNS[0].feature() == {
+        "dtype": "float32",
+        "shape": [3],
+        "names": ["x", "y", "yaw"],
+        "astra": {
+            "meaning": "pose",
+            "unit": ["m", "m", "rad"],
+            "role": ["position", "position", "heading"],
+        },
+    }
+
+
+def test_a_column_that_contradicts_itself_is_refused_with_every_fault() -> None:
+    with pytest.raises(BadInputError) as caught:
+        Column("a/b", "float16", 2, names=("x",), astra={"unit": ["m"], "role": ["pos", "heading"], "x": []})
+    message = str(caught.value)
+    for part in ("'/'", "float16", "1 names for 2", "1 words in astra's unit", "unknown role pos", "has 'x'"):
+        assert part in message
+
+
+def test_an_episode_shows_its_shapes() -> None:
+    episode = Episode(
+        3, {STATE: np.zeros((4, 2), np.float32), REWARD: np.zeros(4, np.float32)}, {"return": 1.0}
+    )
+    assert len(episode) == 4
+    assert repr(episode) == (
+        "Episode(uid=3, observation.state (4, 2) float32, next.reward (4,) float32, metadata={'return': 1.0})"
+    )
+
+
+def test_an_episode_makes_its_columns_contiguous_and_its_metadata_plain() -> None:
+    batch = np.zeros((5, 8, 3), np.float32)
+    metadata: dict[str, Any] = {"success": np.bool_(True), "return": np.float32(0.5)}
+    episode = Episode(0, {STATE: batch[:, 2]}, metadata)
+    assert episode.columns[STATE].flags.c_contiguous
+    assert episode.metadata == {"success": True, "return": 0.5}
+    assert {type(value) for value in episode.metadata.values()} == {bool, float}
+
+
+def test_every_fault_of_an_episode_is_reported_at_once() -> None:
+    columns = fake_columns(6, seed=1)
+    columns[STATE][4, 1] = np.nan
+    columns[STATE][5, 0] = np.inf
+    columns[ACTION] = columns[ACTION].astype(np.float64)
+    columns[REWARD] = columns[REWARD][:5, None]
+    columns["episode_uid"] = np.zeros(6, np.int64)
+    with pytest.raises(BadInputError) as caught:
+        Episode(-1, columns, {"return": float("nan"), "seeds": [1]})  # type: ignore[dict-item]
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in (
+        "uid -1",
+        "observation.state: 2 values are not finite, the first in frame 4 index 1",
+        "action: dtype float64",
+        "next.reward: shape (5, 1), expected (T,)",
+        "next.reward 5",
+        "episode_uid: is filled in by the writer",
+        "metadata return: nan",
+        "metadata seeds: list",
+    ):
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("columns", "part"),
+    [
+        ({}, "no columns"),
+        ({STATE: np.zeros((0, 2), np.float32)}, "no steps"),
+        ({STATE: np.float32(1)}, "shape ()"),
+    ],
+)
+def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        Episode(0, columns)
+    assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("astra", "told"),
+    [
+        ({"role": ["position", "vector", "vector"]}, "role position at index 0, expected 2 indices"),
+        ({"role": ["heading", "heading", "position"]}, "role position at index 2, expected 2 indices"),
+        ({"role": ["invariant"] * 3, "mirror": ["b", "-a", "c"]}, "mirror 'b' of a, expected a value whose"),
+        ({"role": ["invariant"] * 3, "mirror": ["a", "b", "d"]}, "mirror 'd' of c, expected a value whose"),
+        ({"role": ["invariant", "heading", "heading"], "mirror": ["a", "-b", ""]}, "'-b' of a heading"),
+        ({"role": ["heading"] * 3, "mirror": [""] * 3}, "without names and roles of invariant values"),
+        ({"mirror": ["a", "b", "c"]}, "without names and roles of invariant values"),
+    ],
+)
+def test_roles_and_mirror_images_must_make_sense(astra: dict[str, list[str]], told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        Column("pose", size=3, names=("a", "b", "c"), astra=astra)
+
+
+def test_a_mirror_image_is_a_swap_with_signs() -> None:
+    role = ["heading", "invariant", "invariant"]
+    told = Column("pose", size=3, names=("a", "b", "c"), astra={"role": role, "mirror": ["", "-c", "-b"]})
+    assert told.mirror == ([0, 2, 1], [1, -1, -1])
+    assert Column("pose", size=3, astra={"role": role}).mirror is None
+    assert Column("pose", size=3, astra={"role": ["heading"] * 3}).mirror == ([0, 1, 2], [1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    "change", [{"astra": {"unit": 5}}, {"names": 3}, {"shape": []}, {"astra": "m"}, {"shape": "x"}]
+)
+def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
+    with pytest.raises(BadInputError, match="Column 'x'"):
+        Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)

@@ -1,0 +1,191 @@
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from recordings import MAPPING, imported, rows
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+
+
+def d4rl(path: Path, *, next_observations: bool) -> dict[str, Array]:
+    """Write two episodes of 7 and 5 steps, the first ends by a terminal, the second by a timeout."""
+    rng = np.random.default_rng(1)
+    fields: dict[str, Array] = {
+        "observations": rng.normal(size=(12, 4)).astype(np.float32),
+        "actions": rng.uniform(-1, 1, size=(12, 2)).astype(np.float32),
+        "rewards": rng.normal(size=12).astype(np.float32),
+        "terminals": np.arange(12) == 6,
+        "timeouts": np.arange(12) == 11,
+        "infos/goal": rng.normal(size=(12, 2)).astype(np.float32),
+    }
+    if next_observations:
+        fields["next_observations"] = rng.normal(size=(12, 4)).astype(np.float32)
+    with h5py.File(path, "w") as file:
+        for name, values in fields.items():
+            file.create_dataset(name, data=values, compression="gzip")
+        file["metadata/policy"] = "random"
+    return fields
+
+
+def test_d4rl_needs_no_mapping(tmp_path: Path) -> None:
+    fields = d4rl(tmp_path / "ant.hdf5", next_observations=True)
+    dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
+    assert dataset.lengths.tolist() == [7, 5]
+    got = dataset.columns([STATE, ACTION, REWARD, TERMINATED, TRUNCATED, NEXT_STATE, GOAL])
+    for name, field in zip(got, [*list(fields)[:5], "next_observations", "infos/goal"], strict=True):
+        np.testing.assert_array_equal(got[name], fields[field], err_msg=name)
+    assert report.tally.split_points == {"end": 1}
+    assert dataset.info["fps"] == 20
+
+
+def test_without_next_observations_a_terminal_step_is_kept_and_others_lose_their_last_row(
+    tmp_path: Path,
+) -> None:
+    fields = d4rl(tmp_path / "ant.hdf5", next_observations=False)
+    dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
+    assert dataset.lengths.tolist() == [7, 4]
+    assert report.tally.last_rows == 1
+    assert report.tally.last_reward == fields["rewards"][11]
+    state, got = fields["observations"], dataset.columns([NEXT_STATE, TERMINATED, TRUNCATED, REWARD])
+    np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], state[6], *state[8:]])
+    np.testing.assert_array_equal(got[TERMINATED], fields["terminals"][:11])
+    np.testing.assert_array_equal(got[TRUNCATED], np.arange(11) == 10)
+    np.testing.assert_array_equal(got[REWARD], fields["rewards"][:11])
+    assert (
+        "where an episode terminates, not recorded"
+        in dataset.info["features"][NEXT_STATE]["astra"]["meaning"]
+    )
+
+
+def test_d4rl_needs_a_name_and_fps(tmp_path: Path) -> None:
+    d4rl(tmp_path / "ant.hdf5", next_observations=True)
+    with pytest.raises(BadInputError, match="pass --name and --fps"):
+        imported(tmp_path, tmp_path / "ant.hdf5", None)
+
+
+def test_robomimic_needs_no_mapping(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    demos = {}
+    with h5py.File(tmp_path / "lift.hdf5", "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps({"env_name": "Lift", "env_kwargs": {"control_freq": 20}})
+        for name, length in (("demo_0", 4), ("demo_10", 6), ("demo_2", 5)):
+            demos[name] = {
+                "obs/eef_pos": rng.normal(size=(length, 3)),
+                "obs/gripper": rng.normal(size=length),
+                "obs/image": np.zeros((length, 2, 2, 3), np.uint8),
+                "next_obs/eef_pos": rng.normal(size=(length, 3)),
+                "next_obs/gripper": rng.normal(size=length),
+                "actions": rng.normal(size=(length, 7)),
+                "rewards": np.arange(length, dtype=float),
+                "dones": (np.arange(length) == length - 1).astype(np.int64),
+            }
+            for field, values in demos[name].items():
+                data[f"{name}/{field}"] = values
+        file["mask/train"] = [b"demo_0"]
+    dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", task="lift the cube")
+    assert dataset.lengths.tolist() == [4, 5, 6]
+    assert dataset.info["fps"] == 20
+    assert report.tally.split_points == {"source": 2}
+    for episode, demo in zip(dataset.episodes(), ("demo_0", "demo_2", "demo_10"), strict=True):
+        fields = demos[demo]
+        state = np.column_stack([fields["obs/eef_pos"], fields["obs/gripper"]]).astype(np.float32)
+        next_state = np.column_stack([fields["next_obs/eef_pos"], fields["next_obs/gripper"]])
+        np.testing.assert_array_equal(episode.columns[STATE], state)
+        np.testing.assert_array_equal(episode.columns[NEXT_STATE], next_state.astype(np.float32))
+        np.testing.assert_array_equal(episode.columns[ACTION], fields["actions"].astype(np.float32))
+        np.testing.assert_array_equal(episode.columns[TERMINATED], fields["dones"] == 1)
+        assert episode.metadata["source"] == f"lift.hdf5/data/{demo}"
+
+
+def test_other_layouts_need_a_mapping(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["x"] = np.zeros(3)
+    with pytest.raises(BadInputError, match=r"neither D4RL's layout .* pass --mapping"):
+        imported(tmp_path, tmp_path / "log.h5", None, name="log", fps=10)
+
+
+def test_transposed_files_are_those_of_matlab(tmp_path: Path) -> None:
+    joints = np.random.default_rng(3).normal(size=(5, 40))
+    with h5py.File(tmp_path / "walking.mat", "w") as file:
+        file["estimator/joints"] = joints
+        file["names"] = h5py.Empty("f8")
+    mapping = """
+name = "icub"
+task = "walk"
+fps = 100
+transposed = true
+[columns."observation.state"]
+fields = ["estimator/joints"]
+take = [4, 0]
+"""
+    dataset, _ = imported(tmp_path, tmp_path / "walking.mat", mapping)
+    np.testing.assert_array_equal(dataset.columns([STATE])[STATE], joints[[4, 0], :-1].T.astype(np.float32))
+
+
+def test_groups_that_do_not_exist_are_told(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["runs/x"] = np.zeros(3)
+    with pytest.raises(BadInputError, match="no groups 'demos/\\*'; it has runs"):
+        imported(tmp_path, tmp_path / "log.h5", 'episodes = "demos/*"\n' + MAPPING)
+
+
+def test_dones_that_stay_set_end_an_episode_once(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "lift.hdf5", "w") as file:
+        for demo in ("demo_0", "demo_1"):
+            for field in ("obs/x", "next_obs/x", "actions"):
+                file[f"data/{demo}/{field}"] = np.zeros((5, 2))
+            file[f"data/{demo}/dones"] = np.array([0, 0, 1, 1, 1])
+    dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", fps=20)
+    assert dataset.lengths.tolist() == [3, 3]
+    assert report.tally.short_rows == 4
+
+
+@pytest.mark.parametrize("link", [h5py.ExternalLink("secret.h5", "/"), h5py.SoftLink("/kept")])
+@pytest.mark.parametrize("place", ["runs/two", "runs"])
+def test_groups_that_are_links_are_refused(tmp_path: Path, link: object, place: str) -> None:
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        for name, values in rows().items():
+            secret[name] = secret[f"one/{name}"] = values
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in rows().items():
+            file[f"kept/{name}"] = file[f"kept/one/{name}"] = values
+            if place == "runs/two":
+                file[f"runs/one/{name}"] = values
+        file[place] = link
+    with pytest.raises(BadInputError, match=f"log.h5/{place} is a link; copy what it names into its place"):
+        imported(tmp_path, tmp_path / "log.h5", 'episodes = "runs/*"\n' + MAPPING)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["link", "virtual", "external"])
+def test_values_in_other_files_are_not_read(tmp_path: Path, kind: str) -> None:
+    fields = rows()
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        secret["x"] = fields["x"]
+    (tmp_path / "raw").write_bytes(fields["x"].tobytes())
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in fields.items():
+            if name != "x":
+                file[name] = values
+        if kind == "link":
+            file["x"] = h5py.ExternalLink("secret.h5", "/x")
+        elif kind == "virtual":
+            virtual = h5py.VirtualLayout(shape=(20,), dtype=float)
+            virtual[:] = h5py.VirtualSource(tmp_path / "secret.h5", "x", shape=(20,))
+            file.create_virtual_dataset("x", virtual)
+        else:
+            file.create_dataset("x", (20,), float, external=[(str(tmp_path / "raw"), 0, 160)])
+    with pytest.raises(BadInputError, match=r"no field 'x'|lies in another file"):
+        imported(tmp_path, tmp_path / "log.h5")
+
+
+def test_a_shape_that_the_file_does_not_hold_is_told(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name in rows():
+            file.create_dataset(name, (2**50,), float, chunks=(2**10,))
+    with pytest.raises(BadInputError, match=r"field 'x' claims the shape .*; field 'y' claims"):
+        imported(tmp_path, tmp_path / "log.h5")

@@ -1,0 +1,69 @@
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from minari_recordings import LENGTHS, episodes, write_minari
+from recordings import MAPPING, imported
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+def test_every_value_of_a_goal_dataset_arrives(tmp_path: Path, data_format: str) -> None:
+    made = episodes(is_dict=True)
+    path = write_minari(tmp_path / "minari", made, data_format=data_format)
+    dataset, report = imported(tmp_path, path, None, name="ant", fps=10)
+    assert dataset.lengths.tolist() == list(LENGTHS)
+    assert report.tally.split_points == {"source": 1}
+    for got, episode in zip(dataset.episodes(), made, strict=True):
+        parts = episode["observations"]
+        state = np.concatenate([parts["achieved_goal"], parts["observation"]], axis=1).astype(np.float32)
+        expected: dict[str, Array] = {
+            STATE: state[:-1],
+            NEXT_STATE: state[1:],
+            GOAL: parts["desired_goal"][:-1].astype(np.float32),
+            ACTION: episode["actions"].astype(np.float32),
+            REWARD: np.array(episode["rewards"], np.float32),
+            TERMINATED: np.array(episode["terminations"]),
+            TRUNCATED: np.array(episode["truncations"]),
+        }
+        for name, values in expected.items():
+            np.testing.assert_array_equal(got.columns[name], values, err_msg=name)
+
+
+def test_a_mapping_chooses_other_fields(tmp_path: Path) -> None:
+    made = episodes(is_dict=True)
+    path = write_minari(tmp_path / "minari", made)
+    mapping = """
+name = "ant"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["observations/achieved_goal"]
+"""
+    dataset, _ = imported(tmp_path, path, mapping)
+    assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
+    np.testing.assert_array_equal(
+        next(dataset.episodes()).columns[STATE],
+        made[0]["observations"]["achieved_goal"][:3].astype(np.float32),
+    )
+
+
+def test_fields_that_are_missing_are_told(tmp_path: Path) -> None:
+    path = write_minari(tmp_path / "minari", episodes(is_dict=False))
+    with pytest.raises(BadInputError, match=r"no field 'x'; known: .*observations"):
+        imported(tmp_path, path, MAPPING)
+
+
+def test_a_folder_without_a_dataset_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="expected the folder of a Minari dataset"):
+        imported(tmp_path, tmp_path, None, name="ant", fps=10, file_format="minari")
+
+
+def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_minari(tmp_path / "minari", episodes(is_dict=False))
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(BadInputError, match=r'pip install "astra-data\[minari\]"'):
+        imported(tmp_path, path, None, name="ant", fps=10)

@@ -1,0 +1,130 @@
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_dataset import COLUMNS, DESCRIPTION, concatenated, fake_episodes, write_fake, writer
+from huggingface_hub import DatasetCard
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import ACTION, STATE, Column, Episode
+from astra_data.exchange.sharing.card import render_card, write_card
+from astra_data.exchange.sharing.notes import Notes
+
+NOTES = Notes(
+    license="mit", summary="A sum.", behavior="It walks.", intended_use="For tests.", limits="Nothing real."
+)
+
+
+def test_the_front_matter_says_what_the_hub_reads(fake: Dataset, tmp_path: Path) -> None:
+    write_card(fake, tmp_path / "it.md", NOTES)
+    data = DatasetCard.load(tmp_path / "it.md").data.to_dict()
+    assert data["license"] == "mit"
+    assert data["task_categories"] == ["robotics"]
+    assert "LeRobot" in data["tags"]
+    assert data["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+    assert data["size_categories"] == ["n<1K"]
+
+
+def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
+    parent = {"name": "mother", "version": "2.1.0", "hash": "ab" * 32}
+    simulator = {"id": "point_mass", "radius_m": 0.1}
+    description = {**DESCRIPTION, "parents": [parent], "simulator": simulator}
+    dataset = write_fake(tmp_path / "fake", description=description)
+    text = render_card(dataset, NOTES)
+    told = [
+        *("# fake\n", "A sum.", "It walks.", "For tests.", "Nothing real.", "“run”", "20 Hz", "5 episodes"),
+        *("mother@data-2.1.0", "ab" * 32, '"noise_m": 0.1', '"collect": 0', "Fake-v0", "point_mass"),
+        *(dataset.content_hash, "| made by stage | collect |", dataset.description["packages"]["mujoco"]),
+        *(
+            "2 of 5 episodes (40.0%)",
+            "1 to 30 steps; quartiles 5, 7, 12",
+            "| steps | 55 |",
+            "Deng",
+            "x, y, yaw",
+        ),
+        f"| `{STATE}` | float32 | (3,) | m (2), rad | pose: x, y, yaw |",
+    ]
+    assert [words for words in told if words not in text] == []
+    assert [name for name in dataset.features if f"`{name}`" not in text] == []
+    assert str(dataset.description["git_commit"]) in text
+
+
+def test_the_card_says_that_a_robot_is_a_stand_in(fake: Dataset, tmp_path: Path) -> None:
+    assert "stand-in" not in render_card(fake, NOTES)
+    description = {**DESCRIPTION, "environment": {"id": "nao", "stand_in": "surrogate"}}
+    dataset = write_fake(tmp_path / "fake", description=description)
+    assert "The robot is a simulated stand-in (`surrogate`) for a physical one." in render_card(
+        dataset, NOTES
+    )
+
+
+def test_without_notes_their_sections_are_left_out(fake: Dataset) -> None:
+    text = render_card(fake, Notes())
+    assert "license: unknown" in text
+    assert re.findall(r"^## (.*)", text, re.MULTILINE) == [
+        *("Contents", "Columns", "Provenance", "Loading", "Citation")
+    ]
+
+
+def test_words_cannot_break_a_table(tmp_path: Path) -> None:
+    meaning = "left | right,\nor none"
+    with writer(tmp_path / "odd", columns=[Column("odd", meaning=meaning)]) as out:
+        out.add(Episode(0, {"odd": np.zeros(1, dtype=np.float32)}))
+    assert "| left \\| right, or none |" in render_card(Dataset.open(tmp_path / "odd"), Notes())
+
+
+def test_the_figure_is_shown(fake: Dataset, tmp_path: Path) -> None:
+    card, figure = write_card(fake, tmp_path / "it.md", Notes())
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert f"]({figure.name})" in card.read_text()
+
+
+def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:
+    with writer(tmp_path / "plain", columns=[COLUMNS[1]]) as out:
+        out.add(Episode(0, {ACTION: fake_episodes()[0].columns[ACTION]}))
+    assert write_card(Dataset.open(tmp_path / "plain"), tmp_path / "it.md", Notes()) == [tmp_path / "it.md"]
+    assert "![" not in (tmp_path / "it.md").read_text()
+
+
+def test_the_code_that_it_shows_runs(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_fake(tmp_path / "datasets/fake/data-1.0.0")
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "datasets"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
+    ours, _, theirs = python_blocks(render_card(Dataset.open(tmp_path / "datasets/fake/data-1.0.0"), Notes()))
+    found: dict[str, Any] = {}
+    exec(ours, found)
+    np.testing.assert_array_equal(found["values"][STATE], concatenated(STATE))
+    exec(theirs, found)
+    np.testing.assert_array_equal(np.array(found["rows"][STATE], dtype=np.float32), concatenated(STATE))
+
+
+def test_a_shared_dataset_is_loaded_from_where_it_is(fake: Dataset) -> None:
+    on_hub = render_card(fake, Notes(), source="hf://datasets/me/it")
+    assert "astra-data pull hf://datasets/me/it --version 1.0.0" in on_hub
+    assert 'LeRobotDataset("me/it", revision="data-1.0.0")' in on_hub
+    assert 'load_dataset("me/it", revision="data-1.0.0", split="train")' in on_hub
+    elsewhere = render_card(fake, Notes(), source="s3://bucket/fake")
+    assert "astra-data pull s3://bucket/fake --version 1.0.0" in elsewhere
+    for text in (on_hub, elsewhere):
+        for block in python_blocks(text):
+            compile(block, "card", "exec")
+
+
+def python_blocks(text: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def test_notes_with_faults_are_told(tmp_path: Path) -> None:
+    (tmp_path / "notes.toml").write_text('limit = "none"\nlicense = 3\n')
+    with pytest.raises(RecipeError, match=r"(?s)2 faults.*did you mean 'limits'"):
+        load_recipe(tmp_path / "notes.toml", Notes)
+
+
+def test_a_card_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="cannot be written"):
+        write_card(fake, tmp_path / "none/it.md", Notes())

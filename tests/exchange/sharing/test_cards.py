@@ -1,0 +1,34 @@
+from pathlib import Path
+
+import pytest
+from huggingface_hub import DatasetCard
+
+from astra_data.core.config import load_recipe
+from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE
+from astra_data.exchange.sharing.notes import Notes
+from astra_data.worlds.registry import TASKS
+
+CARDS = sorted((Path(__file__).parents[3] / "dataset_cards").glob("*.md"))
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_a_card_says_what_the_hub_reads_and_names_every_column(path: Path) -> None:
+    card = DatasetCard.load(path)
+    assert card.data.license == "apache-2.0"
+    assert "LeRobot" in card.data.tags
+    assert f"# {path.stem}\n" in card.text
+    task = TASKS.get(path.stem.removesuffix("-random-seed0"))
+    names = [STATE, ACTION, NEXT_STATE]
+    if task is not None:
+        names = [column.name for column in (*task.state_columns, *OUTCOME_COLUMNS)]
+    assert [name for name in names if f"`{name}`" not in card.text] == []
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
+    notes = load_recipe(path.with_suffix(".toml"), Notes)
+    text = path.read_text(encoding="utf-8")
+    assert [words for words in notes.model_dump().values() if words.strip() not in text] == []
+    figure = path.with_name(f"{path.stem}-coverage.png")
+    assert f"]({figure.name})" in text
+    assert figure.read_bytes().startswith(b"\x89PNG")

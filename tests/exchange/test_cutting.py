@@ -1,0 +1,223 @@
+"""What the cutter makes of rows whose outcome is known."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.exchange.cutting import Cutter
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Block
+
+
+def cutter(**changes: Any) -> Cutter:  # noqa: ANN401
+    settings: dict[str, Any] = {
+        "name": "log",
+        "task": "walk",
+        "fps": 10,
+        "columns": {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}},
+    }
+    return Cutter(ImportMapping.model_validate(settings | changes))
+
+
+def cut(cutter: Cutter, block_rows: int = 1000, **fields: ArrayLike) -> list[dict[str, Array]]:
+    """Cut one file with an `x` and an `a` that tells the row, in blocks of `block_rows`."""
+    arrays = {name: np.asarray(values) for name, values in fields.items()}
+    n = len(arrays["x"])
+    arrays.setdefault("a", np.arange(n))
+    episodes = []
+    for first in range(0, n, block_rows):
+        values = {name: array[first : first + block_rows] for name, array in arrays.items()}
+        block = Block(values, "log")
+        episodes += [columns for columns, _ in cutter.feed(block, first, is_apart=first == 0)]
+    return episodes + [columns for columns, _ in cutter.finish()]
+
+
+def rows(episodes: list[dict[str, Array]]) -> list[list[int]]:
+    return [episode[ACTION].astype(int).tolist() for episode in episodes]
+
+
+BLOCKS = pytest.mark.parametrize("block_rows", [1, 2, 3, 1000])
+
+
+@BLOCKS
+def test_the_next_state_is_the_next_row(block_rows: int) -> None:
+    (episode,) = cut(cutter(), block_rows, x=[0.0, 1, 4, 9])
+    assert episode[STATE].tolist() == [0, 1, 4]
+    assert episode[NEXT_STATE].tolist() == [1, 4, 9]
+    assert episode[ACTION].tolist() == [0, 1, 2]
+    assert episode[TRUNCATED].tolist() == episode[DONE].tolist() == [False, False, True]
+    assert not episode[TERMINATED].any()
+
+
+@BLOCKS
+def test_a_flag_ends_an_episode(block_rows: int) -> None:
+    cutting = cutter(split={"ends": ("end",)})
+    episodes = cut(cutting, block_rows, x=np.zeros(9), end=[0, 0, 0, 1, 0, 0, 1, 1, 0])
+    assert rows(episodes) == [[0, 1, 2], [4, 5]]
+    assert cutting.tally.split_points == {"end": 3}
+    # Row 7 and row 8 are alone: without a next state nothing is left of them.
+    assert cutting.tally.last_rows == 4
+
+
+@BLOCKS
+def test_columns_that_are_flags_end_episodes_too(block_rows: int) -> None:
+    fell = {"fields": ("alive",), "scale": (-1,), "offset": (1,)}
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | {TERMINATED: fell, TRUNCATED: {"fields": ("late",)}})
+    episodes = cut(
+        cutting, block_rows, x=np.arange(8) * 2, alive=[1, 1, 0, 1, 1, 1, 1, 1], late=[0, 0, 0, 0, 0, 1, 0, 0]
+    )
+    # Of row 2 the next state is its own, since it is terminal; of rows 5 and 7 nobody recorded one.
+    assert rows(episodes) == [[0, 1, 2], [3, 4], [6]]
+    assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4, 4], [8, 10], [14]]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [
+        [False, False, True],
+        [False] * 2,
+        [False],
+    ]
+    assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False] * 3, [False, True], [True]]
+    assert cutting.tally.split_points == {"end": 2}
+    assert (cutting.tally.last_rows, cutting.tally.last_reward) == (2, 12)
+
+
+@BLOCKS
+def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
+    cutting = cutter(time="t", split={"gap_s": 0.5})
+    episodes = cut(cutting, block_rows, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])
+    assert rows(episodes) == [[0, 1], [3], [5, 6]]
+    assert cutting.tally.split_points == {"gap": 2}
+    cutting.check_rate()
+
+
+@BLOCKS
+def test_no_gap_hides_behind_a_time_that_is_not_finite(block_rows: int) -> None:
+    cutting = cutter(time="t", split={"gap_s": 0.5}, not_finite="drop")
+    episodes = cut(cutting, block_rows, x=np.zeros(7), t=[0, 0.1, np.nan, 0.3, np.nan, 3.0, 3.1])
+    assert rows(episodes) == [[0, 1], [5]]
+    assert cutting.tally.split_points == {"gap": 1}
+
+
+def test_a_rate_that_is_not_fps_is_told() -> None:
+    cutting = cutter(time="t", time_scale=0.001)
+    cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)
+    with pytest.raises(BadInputError, match="'t' tells 50 rows per second, fps says 10"):
+        cutting.check_rate()
+
+
+@BLOCKS
+def test_jumps_are_longer_than_their_bound(block_rows: int) -> None:
+    position = {"fields": ("x",), "scale": (0.001,)}
+    cutting = cutter(
+        columns={STATE: position, ACTION: {"fields": ("a",)}},
+        split={"jump": {"column": STATE, "values": (0, 1), "above": 0.5}},
+    )
+    # 0.499 m, then 0.51 m in both directions together, and 10 in a value that does not count.
+    x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [660, 760, 9], [660, 760, 1e4]])
+    assert rows(cut(cutting, block_rows, x=x)) == [[0, 1], [3]]
+    assert cutting.tally.split_points == {"jump": 1}
+
+
+@BLOCKS
+@pytest.mark.parametrize(
+    ("not_finite", "expected", "points"),
+    [("drop", [[0, 3, 4]], {}), ("split", [[3, 4]], {"rejected": 1})],
+)
+def test_rejected_rows(
+    block_rows: int, not_finite: str, expected: list[list[int]], points: dict[str, int]
+) -> None:
+    cutting = cutter(not_finite=not_finite)
+    episodes = cut(cutting, block_rows, x=[0, np.nan, np.inf, 3, 4, 5, 1e300])
+    assert rows(episodes) == expected
+    assert cutting.tally.rejected_rows == 3
+    assert cutting.tally.rejected_first == "log row 1"
+    assert cutting.tally.split_points == points
+
+
+@BLOCKS
+def test_a_rejected_row_still_ends_its_episode(block_rows: int) -> None:
+    cutting = cutter(not_finite="drop", split={"ends": ("end",)})
+    episodes = cut(cutting, block_rows, x=[0, 0, np.nan, 0, 0], end=[0, 0, 1, 0, 0])
+    assert rows(episodes) == [[0], [3]]
+    assert cutting.tally.split_points == {"end": 1}
+
+
+def test_what_is_not_finite_is_not_clipped_into_range() -> None:
+    cutting = cutter(columns={ACTION: {"fields": ("x",), "clip": (-1, 1)}}, not_finite="drop")
+    (episode,) = cut(cutting, x=[5, np.inf, -5, 0.5])
+    assert episode[ACTION].tolist() == [1, -1, 0.5]
+
+
+def test_short_episodes_are_left_out_and_counted() -> None:
+    cutting = cutter(split={"field": "k"}, min_steps=2)
+    assert rows(cut(cutting, x=np.zeros(6), k=[0, 0, 1, 1, 1, 1])) == [[2, 3, 4]]
+    assert cutting.tally.short_rows == 1
+
+
+def test_scale_offset_take_and_types() -> None:
+    columns = {
+        STATE: {"fields": ("x",), "take": (1,), "scale": (2.0,), "offset": (1.0,)},
+        NEXT_STATE: {"fields": ("x",), "take": (0,)},
+        "id": {"fields": ("id",), "dtype": "int64"},
+    }
+    (episode,) = cut(cutter(columns=columns), x=[[1, 10], [2, 20]], id=[2**60 + 1, -1])
+    assert episode[STATE].tolist() == [21, 41]
+    assert episode[NEXT_STATE].tolist() == [1, 2]
+    assert episode["id"].tolist() == [2**60 + 1, -1]
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint64", "int64", "float16", "bool"])
+def test_whole_numbers_of_any_kind_arrive(dtype: str) -> None:
+    columns = {"id": {"fields": ("x",), "dtype": "int64"}, "value": {"fields": ("x",)}}
+    (episode,) = cut(cutter(columns=columns), x=np.array([0, 1], dtype))
+    assert episode["id"].tolist() == episode["value"].tolist() == [0, 1]
+
+
+def test_the_largest_whole_number_is_the_largest_of_its_kind() -> None:
+    cutting = cutter(columns={"id": {"fields": ("x",), "dtype": "int64"}})
+    (episode,) = cut(cutting, x=[2**63 - 1, -(2**63)])
+    assert episode["id"].tolist() == [2**63 - 1, -(2**63)]
+    with pytest.raises(BadInputError, match=r"id: expected whole numbers below 2\^63"):
+        cut(cutting, x=np.array([2**63], np.uint64))
+
+
+@pytest.mark.parametrize(
+    ("spec", "told"),
+    [
+        ({"take": (2,)}, r"take \[2\]: x hold 2 values"),
+        ({"scale": (1.0, 1.0, 1.0)}, "scale has 3 numbers for 2 values"),
+        ({"names": ("x",)}, "1 names for 2 values"),
+        ({"unit": ("m", "m", "m")}, "3 words in astra's unit for 2 values"),
+        ({"dtype": "bool"}, "expected true and false"),
+        ({"dtype": "int64", "scale": (0.5,)}, "expected whole numbers"),
+    ],
+)
+def test_columns_that_do_not_fit_are_told(spec: dict[str, Any], told: str) -> None:
+    columns = {"pose": {"fields": ("x",)} | spec, ACTION: {"fields": ("a",), "take": (7,)}}
+    with pytest.raises(BadInputError, match=f"log: .*{told}.*; take"):
+        cut(cutter(columns=columns), x=[[1, 3], [5, 7]])
+
+
+def test_sizes_that_the_contract_does_not_know_are_told() -> None:
+    two = {"fields": ("x",)}
+    columns = {STATE: two, NEXT_STATE: {"fields": ("a",)}, TERMINATED: two, REWARD: two}
+    told = "next.observation.state has 1 values, observation.state 2; next.reward: 2 values, expected 1; "
+    with pytest.raises(BadInputError, match=re.escape(f"log: {told}next.terminated: 2 values, expected 1")):
+        cut(cutter(columns=columns), x=[[0, 1], [1, 1]])
+
+
+def test_a_jump_in_a_value_that_is_not_there_is_told() -> None:
+    cutting = cutter(split={"jump": {"column": STATE, "values": (0, 1), "above": 1.0}})
+    with pytest.raises(BadInputError, match=r"values \[0, 1\]: observation\.state has 1 values"):
+        cut(cutting, x=[0, 1])
+
+
+def test_fields_that_change_in_size_are_told() -> None:
+    cutting = cutter()
+    list(cutting.feed(Block({"x": np.zeros(2), "a": np.zeros(2)}, "1"), 0, is_apart=True))
+    with pytest.raises(BadInputError, match="2 values, before there were 1"):
+        list(cutting.feed(Block({"x": np.zeros((2, 2)), "a": np.zeros(2)}, "2"), 0, is_apart=True))

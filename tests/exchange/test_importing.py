@@ -1,0 +1,144 @@
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
+from typer.testing import CliRunner
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import REWARD, STATE, TERMINATED
+from astra_data.exchange.importing import FORMATS
+
+PER_FILE = MAPPING.replace('field = "trial"', "")
+ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
+
+
+def parts(folder: Path) -> list[Path]:
+    """Write the trials to files of their own."""
+    fields = rows()
+    return [
+        write_table(
+            folder / f"part_{8 + trial}.csv",
+            {name: v[fields["trial"] == trial] for name, v in fields.items()},
+        )
+        for trial in range(len(LENGTHS))
+    ]
+
+
+def test_each_file_is_an_episode(tmp_path: Path) -> None:
+    dataset, report = imported(tmp_path, parts(tmp_path / "logs"), PER_FILE)
+    assert dataset.lengths.tolist() == list(STEPS)
+    assert report.tally.split_points == {"file": 2}
+    assert dataset.metadata["source"] == ["part_8.csv", "part_9.csv", "part_10.csv"]
+
+
+def test_the_files_of_a_folder_or_archive_continue_one_another(tmp_path: Path) -> None:
+    folder = parts(tmp_path / "logs")[0].parent
+    with tarfile.open(tmp_path / "logs.tar.gz", "w:gz") as archive:
+        archive.add(folder, "logs")
+    state = rows()
+    expected = np.stack([state["x"], state["y"]], axis=1)[:-1] * 0.001
+    for recording in (folder, tmp_path / "logs.tar.gz"):
+        dataset, _ = imported(tmp_path / f"from{recording.suffix}", recording, ONE_LOG)
+        np.testing.assert_array_equal(dataset.columns([STATE])[STATE], expected.astype(np.float32))
+        assert len(dataset) == 1
+    both, report = imported(tmp_path / "both", [folder, tmp_path / "logs.tar.gz"], ONE_LOG)
+    assert len(both) == 2
+    assert report.tally.split_points == {"file": 1}
+
+
+def test_a_first_file_without_rows_changes_nothing(tmp_path: Path) -> None:
+    folder = parts(tmp_path / "logs")[0].parent
+    write_table(folder / "part_0.csv", {name: values[:0] for name, values in rows().items()})
+    dataset, report = imported(tmp_path, folder, MAPPING + "files = false\n")
+    assert dataset.lengths.tolist() == list(STEPS)
+    assert report.tally.split_points == {"field": 2}
+
+
+def test_options_override_the_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    path = write_table(tmp_path / "log.data.csv", rows()).rename(tmp_path / "log.data")
+    (tmp_path / "mapping.toml").write_text(MAPPING)
+    arguments = ["import", str(path), "--mapping", str(tmp_path / "mapping.toml"), "--format", "csv"]
+    result = CliRunner().invoke(cli.app, [*arguments, "--name", "renamed", "--fps", "5", "--task", "run"])
+    assert result.exit_code == 0, result.output
+    dataset = Dataset.open(tmp_path / "home/renamed/data-1.0.0")
+    assert "3 episodes, 18 frames from 20 rows" in result.output
+    assert "split points: field 2" in result.output
+    assert dataset.info["fps"] == 5
+    assert dataset.description["stage"] == "import"
+    assert dataset.description["config"]["recordings"][0]["name"] == "log.data"
+
+
+def test_rejected_rows_refuse_the_import(tmp_path: Path) -> None:
+    fields = rows()
+    fields["command"][[3, 5]] = np.nan
+    path = write_table(tmp_path / "log.npz", fields)
+    with pytest.raises(BadInputError, match=r"2 of 20 rows .* the first is log\.npz row 3; set not_finite"):
+        imported(tmp_path, path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_rate_that_is_not_fps_refuses_the_import(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.npz", rows() | {"unused": np.arange(20) / 30})
+    with pytest.raises(BadInputError, match="tells 30 rows per second, fps says 10"):
+        imported(tmp_path, path, 'time = "unused"\n' + MAPPING)
+    assert list(tmp_path.glob("*out*")) == []
+
+
+def test_recordings_that_do_not_fit_are_all_told(tmp_path: Path) -> None:
+    csv, npz = (write_table(tmp_path / name, rows()) for name in ("a.csv", "b.npz"))
+    with pytest.raises(BadInputError) as caught:
+        imported(tmp_path, [tmp_path / "none.csv", csv, npz, tmp_path / "mapping.toml"])
+    for told in ("none.csv does not exist", "of one format, got", "mapping.toml: its name does not tell"):
+        assert told in str(caught.value)
+
+
+def test_a_format_that_does_not_exist_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "a.csv", rows())
+    with pytest.raises(BadInputError, match="no format 'hdf': did you mean 'hdf5'"):
+        imported(tmp_path, path, file_format="hdf")
+
+
+def test_tables_need_a_mapping(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="csv has no standard fields; pass --mapping"):
+        imported(tmp_path, write_table(tmp_path / "a.csv", rows()), None, name="a", fps=10)
+
+
+def test_formats_that_need_seeking_are_not_read_from_archives(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "a.npz", rows())
+    with tarfile.open(tmp_path / "a.tar", "w") as archive:
+        archive.add(path, "a.npz")
+    with pytest.raises(BadInputError, match="npz cannot be read from an archive, unpack it"):
+        imported(tmp_path, tmp_path / "a.tar")
+
+
+def test_the_help_names_every_format() -> None:
+    told = CliRunner().invoke(cli.app, ["import", "--help"], env={"COLUMNS": "200"}).output
+    assert ", ".join(list(FORMATS)[:-1]) + f" or {list(FORMATS)[-1]}." in told
+
+
+def test_a_mapping_with_a_format_that_does_not_exist_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "a.csv", rows())
+    with pytest.raises(BadInputError, match="no format 'cvs': did you mean 'csv'"):
+        imported(tmp_path, path, 'format = "cvs"\n' + MAPPING)
+
+
+def test_mapped_flags_split_a_log_of_many_episodes(tmp_path: Path) -> None:
+    done = np.isin(np.arange(20), (4, 9, 14, 18))
+    path = write_table(tmp_path / "log.csv", rows() | {"fell": done})
+    dataset, report = imported(tmp_path, path, PER_FILE)
+    assert dataset.lengths.tolist() == [5, 5, 5, 4]
+    assert report.tally.split_points == {"end": 4}
+    np.testing.assert_array_equal(dataset.columns([TERMINATED])[TERMINATED], done[:19])
+
+
+def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
+    reward = np.zeros(20)
+    reward[[5, 14, 19]] = (1, 1, 0.5)
+    dataset, report = imported(tmp_path, write_table(tmp_path / "log.csv", rows() | {"reward": reward}))
+    assert dataset.columns([REWARD])[REWARD].sum() == 1
+    assert "last rows without a next state: 2 (with them a reward of 1.5 in sum); rows" in str(report)

@@ -1,0 +1,172 @@
+"""The other side runs on our datasets: lerobot's command lines, its training, HF datasets.
+
+lerobot takes seconds to start, so all its commands run once, some of them side by side, before the tests.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from fake_dataset import COLUMNS, fake_episodes, writer
+
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import GOAL, STATE, Column, Episode
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
+
+BIN = Path(sys.executable).parent
+TRAINING_STEPS = 2
+
+
+class Runs(NamedTuple):
+    """The dataset, the folder of everything that was made from it, and each command's (exit code, output)."""
+
+    dataset: Dataset
+    folder: Path
+    results: dict[str, tuple[int, str]]
+
+
+def write_with_goal(root: Path) -> Dataset:
+    goal = Column(GOAL, size=2, names=("x", "y"), meaning="where to go")
+    with writer(root, columns=[*COLUMNS, goal]) as open_writer:
+        for episode in fake_episodes():
+            goals = np.ones((len(episode), 2), np.float32) * [episode.uid % 7, 1]
+            columns = {**episode.columns, GOAL: goals.astype(np.float32)}
+            open_writer.add(Episode(episode.uid, columns, episode.metadata))
+    return Dataset.open(root)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    folder = tmp_path_factory.mktemp("lerobot")
+    dataset = write_with_goal(folder / "set")
+    at = [f"--root={dataset.root}"]
+    edit = ["lerobot-edit-dataset", "--repo_id=a/b", *at]
+    commands = {
+        "info": [*edit, "--operation.type=info"],
+        "delete": [
+            *edit,
+            "--operation.type=delete_episodes",
+            "--operation.episode_indices=[1,3]",
+            "--new_repo_id=a/c",
+            f"--new_root={folder / 'deleted'}",
+        ],
+        "split": [
+            *edit,
+            "--operation.type=split",
+            '--operation.splits={"one": [0, 1], "two": [2, 3, 4]}',
+            "--new_repo_id=a/d",
+            f"--new_root={folder / 'split'}",
+        ],
+        "viz": [
+            *["lerobot-dataset-viz", "--repo-id=a/b", *at, "--episode-index=3", "--save=1"],
+            *[f"--output-dir={folder / 'viz'}", "--num-workers=0"],
+        ],
+        "train": [
+            *["lerobot-train", "--dataset.repo_id=a/b", f"--dataset.root={dataset.root}"],
+            *[
+                "--policy.type=act",
+                "--policy.device=cpu",
+                "--policy.push_to_hub=false",
+                "--wandb.enable=false",
+            ],
+            *["--policy.dim_model=16", "--policy.n_heads=2", "--policy.dim_feedforward=16"],
+            *["--policy.chunk_size=4", "--policy.n_action_steps=4", "--policy.use_vae=false"],
+            *["--num_workers=0", "--batch_size=4", f"--steps={TRAINING_STEPS}", "--log_freq=1"],
+            *["--save_checkpoint=false", f"--output_dir={folder / 'training'}"],
+        ],
+        "validate": ["astra-data", "validate", str(dataset.root), "--with-lerobot"],
+        "datasets": [
+            *["python", "-c"],
+            "import sys, datasets; rows = datasets.load_dataset('parquet', data_files=sys.argv[1])['train']; "
+            "print(len(rows), rows[9]['observation.state'], rows[9]['episode_uid'])",
+            str(dataset.root / "data/*/*.parquet"),
+        ],
+    }
+    settings = {
+        "HF_HUB_OFFLINE": "1",
+        "HF_DATASETS_OFFLINE": "1",
+        "HF_HOME": str(folder / "home"),
+        "OMP_NUM_THREADS": "1",
+        "PYTHONWARNINGS": "ignore",
+    }
+
+    def run(command: list[str]) -> tuple[int, str]:
+        name, *arguments = command
+        done = subprocess.run(
+            [str(BIN / name), *arguments],
+            env=os.environ | settings,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        results = dict(zip(commands, pool.map(run, commands.values()), strict=True))
+    return Runs(dataset, folder, results)
+
+
+def assert_succeeded(runs: Runs, name: str) -> str:
+    code, output = runs.results[name]
+    assert code == 0, output
+    return output
+
+
+def test_lerobots_editor_reads_it(runs: Runs) -> None:
+    output = assert_succeeded(runs, "info")
+    assert "Total episode: 5" in output
+    assert "Actual Count): 55(55)" in output
+
+
+def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs, tmp_path: Path) -> None:
+    assert_succeeded(runs, "delete")
+    edited = runs.folder / "deleted"
+    assert check(edited).faults == []
+    result = repair(edited, out=tmp_path / "set", like=runs.dataset)
+    assert result.episodes == 3
+    joined = Dataset.open(tmp_path / "set")
+    assert joined.verify() == []
+    kept = [episode for number, episode in enumerate(runs.dataset.episodes()) if number not in (1, 3)]
+    for found, expected in zip(joined.episodes(), kept, strict=True):
+        assert (found.uid, found.metadata) == (expected.uid, expected.metadata)
+        for name, values in expected.columns.items():
+            np.testing.assert_array_equal(found.columns[name], values)
+    assert joined.schema == runs.dataset.schema
+    assert joined.description["parents"] == [runs.dataset.identity]
+
+
+def test_lerobot_splits_it(runs: Runs) -> None:
+    assert_succeeded(runs, "split")
+    counts = {
+        path.parents[1].name: json.loads(path.read_text())["total_episodes"]
+        for path in runs.folder.glob("split*/**/meta/info.json")
+    }
+    assert sorted(counts.values()) == [2, 3]
+
+
+def test_lerobot_shows_it(runs: Runs) -> None:
+    assert_succeeded(runs, "viz")
+    [recording] = (runs.folder / "viz").glob("*.rrd")
+    assert recording.stat().st_size > 1000
+
+
+def test_lerobot_trains_act_on_it(runs: Runs) -> None:
+    output = assert_succeeded(runs, "train")
+    assert f"step:{TRAINING_STEPS}" in output.replace(" ", "")
+
+
+def test_lerobots_loader_cuts_the_same_windows(runs: Runs) -> None:
+    assert "is whole: 5 episodes, 55 steps" in assert_succeeded(runs, "validate")
+
+
+def test_hf_datasets_reads_the_parquet_files(runs: Runs) -> None:
+    output = assert_succeeded(runs, "datasets").splitlines()
+    state = runs.dataset.columns([STATE])[STATE][9].tolist()
+    assert f"55 {state} {2**53 + 1}" in output

@@ -1,0 +1,60 @@
+import re
+from pathlib import Path
+
+import pytest
+from recordings import MAPPING
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import RecipeError
+from astra_data.exchange.mapping import ColumnMapping, ImportMapping, Jump, Split
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("fps", "fpx"), "fpx: unknown key: did you mean 'fps'"),
+        (("fps = 10", "fps = 0"), "fps: expected"),
+        (("clip", "clop"), "clop: unknown key"),
+        (("clip = [-1, 1]", "clip = [1, -1]"), "expected the lower bound first"),
+        (('role = ["position"]', 'role = ["place"]'), "unknown role place, expected position"),
+        (("columns.gait", "columns.index"), "column index is filled in"),
+        (('columns."next.terminated"', 'columns."next.done"'), "column next.done is filled in"),
+        (('columns."next.reward"', 'columns."next/reward"'), "expected a name without '/'"),
+        (('fields = ["reward"]', "fields = []"), "columns.next.reward.fields: "),
+        (('field = "trial"', 'jump = {column = "pose", values = [0], above = 1}'), "jump.column 'pose'"),
+        (
+            ('fields = ["fell"]', 'fields = ["fell"]\ndtype = "int64"'),
+            "terminated has dtype int64, expected bool",
+        ),
+        (('"int64"', '"float64"'), "gait.dtype: expected 'float32', 'int64' or 'bool'"),
+    ],
+)
+def test_faults_are_told(tmp_path: Path, change: tuple[str, str], told: str) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace(*change))
+    with pytest.raises(RecipeError) as caught:
+        load_recipe(path, ImportMapping)
+    assert told in str(caught.value)
+
+
+def test_each_field_is_asked_for_once(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text('time = "x"\n' + MAPPING + 'ends = ["fell"]')
+    mapping = load_recipe(path, ImportMapping)
+    assert mapping.fields == ["x", "y", "command", "reward", "fell", "gait"]
+    assert mapping.all_fields == [*mapping.fields, "trial"]
+
+
+def test_the_example_is_a_mapping_and_shows_every_key() -> None:
+    path = Path(__file__).parents[2] / "recipes/imports/example.toml"
+    load_recipe(path, ImportMapping)
+    keys = {key for model in (ImportMapping, ColumnMapping, Split, Jump) for key in model.model_fields}
+    words = set(re.findall(r"\w+", path.read_text()))
+    assert keys - words == set()
+
+
+def test_a_slip_in_a_columns_name_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace("[columns.action]", "[columns.actions]"))
+    with pytest.raises(RecipeError, match="column actions: did you mean 'action'"):
+        load_recipe(path, ImportMapping)

@@ -1,0 +1,91 @@
+import io
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.recording import find_sources
+
+
+def archive(path: Path, *members: tarfile.TarInfo, content: bytes = b"{}") -> Path:
+    with tarfile.open(path, "w:gz") as opened:
+        for member in members:
+            if member.isreg():
+                member.size = len(content)
+            opened.addfile(member, io.BytesIO(content))
+    return path
+
+
+def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.TarInfo:
+    info = tarfile.TarInfo(name)
+    info.type, info.linkname = kind, link
+    return info
+
+
+HIDDEN = (".log_3.csv", "._log_1.csv", ".ipynb_checkpoints/log_1-checkpoint.csv", "__MACOSX/log_1.csv")
+
+
+def test_files_come_in_the_order_of_their_numbers_without_those_that_are_hidden(tmp_path: Path) -> None:
+    names = ("log_10.csv", "log_2.csv", "log_1.csv", "notes.txt", *HIDDEN)
+    for name in names:
+        (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "logs" / name).write_text("")
+    found = find_sources(tmp_path / "logs", [".csv"])
+    assert [str(source) for source in found] == ["log_1.csv", "log_2.csv", "log_10.csv"]
+    path = archive(tmp_path / "logs.tar.gz", *(member(f"logs/{name}") for name in names))
+    in_archive = find_sources(path, [".csv"])
+    assert [source.member.name for source in in_archive if source.member] == [
+        "logs/log_1.csv",
+        "logs/log_2.csv",
+        "logs/log_10.csv",
+    ]
+
+
+def test_members_are_read_without_unpacking(tmp_path: Path) -> None:
+    path = archive(tmp_path / "logs.tgz", member("a/1.json"), member("a/2.json"), content=b'{"x": [1]}')
+    before = sorted(tmp_path.rglob("*"))
+    for source in find_sources(path, [".json"]):
+        with source.open() as stream:
+            assert stream.read() == b'{"x": [1]}'
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("hostile", "told"),
+    [
+        (member("/etc/log.json"), "/etc/log.json lies outside"),
+        (member("a/../../log.json"), "a/../../log.json lies outside"),
+        (member("log.json", tarfile.SYMTYPE, "/etc/passwd"), "log.json is a link"),
+        (member("log.json", tarfile.LNKTYPE, "../secret"), "log.json is a link"),
+        (member("log.json", tarfile.CHRTYPE), "log.json is a link, a device"),
+        (member("log.json", tarfile.GNUTYPE_SPARSE), "log.json is a link, a device or sparse"),
+        (member("log.json", tarfile.FIFOTYPE), "log.json is a link, a device"),
+    ],
+)
+def test_hostile_members_are_refused(tmp_path: Path, hostile: tarfile.TarInfo, told: str) -> None:
+    path = archive(tmp_path / "logs.tar.gz", member("fine.json"), hostile)
+    with pytest.raises(BadInputError, match=told):
+        find_sources(path, [".json"])
+
+
+def test_a_member_that_claims_to_be_huge_is_refused(tmp_path: Path) -> None:
+    info = member("log.json")
+    info.size = 2**40
+    (tmp_path / "logs.tar").write_bytes(info.tobuf(tarfile.GNU_FORMAT) + b"{}".ljust(512, b"\0"))
+    with pytest.raises(BadInputError, match="cannot be read as an archive"):
+        find_sources(tmp_path / "logs.tar", [".json"])
+
+
+def test_a_truncated_archive_is_refused(tmp_path: Path) -> None:
+    path = archive(tmp_path / "logs.tar.gz", member("log.json"), content=bytes(range(256)) * 400)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(BadInputError, match="cannot be read as an archive"):
+        find_sources(path, [".json"])
+
+
+def test_what_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="does not exist"):
+        find_sources(tmp_path / "none", [".csv"])
+    with pytest.raises(BadInputError, match=r"files that end with \.csv or \.tsv, found none"):
+        find_sources(tmp_path, [".csv", ".tsv"])

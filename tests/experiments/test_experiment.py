@@ -1,0 +1,285 @@
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import fake_stages
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.run import check, run, run_stage
+from astra_data.worlds.registry import TASKS
+
+pytestmark = pytest.mark.usefixtures("fake_recipe")
+
+BASE = 'task = "maze"\nmethods = ["astra", "astra_plus", "follower"]\nseeds = [0, 1]\n[evaluate]\nsteps = 3\n'
+LONGER = 'based_on = "base"\n[evaluate]\nrate = 2.0\n'
+
+
+@pytest.fixture
+def base(tmp_path: Path) -> Path:
+    path = tmp_path / "base.toml"
+    path.write_text(BASE)
+    return path
+
+
+@pytest.fixture
+def longer(base: Path) -> Path:
+    path = base.with_name("longer.toml")
+    path.write_text(LONGER)
+    return path
+
+
+def asked(folder: Path) -> dict[str, object]:
+    content: dict[str, object] = json.loads((folder / "asked.json").read_text())
+    return content
+
+
+def attempts(folder: Path) -> int:
+    return sum(len(path.read_text()) for path in folder.rglob("attempts"))
+
+
+def test_what_only_some_rows_read_leaves_the_others_alone(base: Path, tmp_path: Path) -> None:
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(BASE + "[plus]\nrate = 2.0\n")
+    with pytest.raises(RecipeError) as caught:
+        run(base, root=tmp_path)
+    rows = [folder / stage / "astra_plus" for stage in ("evaluate", "train")]
+    assert str(caught.value) == (
+        f"plus changed in the recipe since {folder} was made: give the recipe another name, or remove "
+        f"{rows[0]} {rows[1]}"
+    )
+    made = attempts(folder)
+    for row in rows:
+        shutil.rmtree(row)
+    run(base, root=tmp_path, jobs=2)
+    assert attempts(folder) == made
+
+
+def test_the_base_has_published_what_is_borrowed_of_it(base: Path, longer: Path) -> None:
+    part = base.with_name("part.toml")
+    part.write_text('based_on = "base"\nmethods = ["astra"]\n')
+    for path, expected in ((base, "base"), (longer, "longer"), (part, "base")):
+        assert load_experiment(path, base.parent).published_in == base.parent / f"results/{expected}.json"
+
+
+@pytest.mark.parametrize(
+    ("text", "borrowed"),
+    [
+        ("", ["collect", "pair", "ground", "train", "align", "evaluate"]),
+        ("seeds = [1]\nmethods = ['follower']\n[report]\nsteps = 2\n[evaluate]\nsteps = 3\n", None),
+        ("[evaluate]\nrate = 2.0\n", ["collect", "pair", "ground", "train", "align"]),
+        ("[plus]\nrate = 2.0\n", ["collect", "pair", "ground", "align"]),
+        ("[target]\nnum_envs = 3\n", ["collect", "pair", "ground", "align"]),
+        ("[align]\nrate = 2.0\n", ["collect", "pair", "ground", "train"]),
+        ("[ground]\nrate = 2.0\n", ["collect", "pair"]),
+        ("[collect]\nrate = 2.0\n", []),
+    ],
+)
+def test_what_differs_and_what_reads_it_is_made_anew(
+    base: Path, text: str, borrowed: list[str] | None
+) -> None:
+    path = base.with_name("other.toml")
+    path.write_text(f'based_on = "base"\n{text}')
+    experiment = load_experiment(path, base.parent)
+    every = {"collect", "pair", "ground", "train", "align", "evaluate"}
+    assert experiment.borrowed == (every if borrowed is None else set(borrowed))
+    assert experiment.recipe.task == "maze"
+    assert experiment.place("pair/seed_0").parts[-3] == ("other" if borrowed == [] else "base")
+
+
+def sketch(base: Path, monkeypatch: pytest.MonkeyPatch, *targets: str | None) -> Path:
+    """Write a recipe based on `base` of another task; both have these targets."""
+    maze = TASKS["antmaze-umaze"]
+    for name, target in zip(("maze", "sketch"), targets, strict=True):
+        monkeypatch.setitem(fake_stages.TASKS, name, replace(maze, name=name, target_id=target))
+    path = base.with_name("other.toml")
+    path.write_text('based_on = "base"\ntask = "sketch"\nmethods = ["follower"]\nseeds = [1]\n')
+    return path
+
+
+def test_a_task_of_the_same_target_shares_the_episodes(
+    base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = sketch(base, monkeypatch, "ant", "ant")
+    assert load_experiment(path, base.parent).borrowed == {"collect"}
+    command = f"astra-data collect {base} --root {tmp_path}"
+    with pytest.raises(MissingStageError, match=f"run `{re.escape(command)}` first"):
+        run(path, root=tmp_path)
+    run_stage(base, "collect", root=tmp_path)
+    folder = run(path, root=tmp_path, jobs=1)
+    assert asked(folder / "collect/seed_1")["task"] == "maze"
+    assert asked(folder / "pair/seed_1")["task"] == "sketch"
+    assert attempts(tmp_path / "base") == 2
+
+
+@pytest.mark.parametrize("other", [("ant", "other ant"), (None, None)])
+def test_a_task_of_another_target_does_not_fit(
+    base: Path, other: tuple[str | None, str | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = sketch(base, monkeypatch, *other)
+    with pytest.raises(RecipeError, match=r"'maze', or one with the same target, got 'sketch'$"):
+        load_experiment(path, base.parent)
+
+
+def test_tables_lie_over_those_of_the_base(base: Path, longer: Path) -> None:
+    recipe = load_experiment(longer, base.parent).recipe
+    assert recipe.evaluate.model_dump() == fake_stages.FakeConfig(steps=3, rate=2.0).model_dump()
+    assert recipe.methods == ("astra", "astra_plus", "follower")
+    assert recipe.based_on == "base"
+
+
+def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
+    base: Path, longer: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(MissingStageError) as caught:
+        run(longer, root=tmp_path)
+    assert str(caught.value) == (
+        f"{tmp_path / 'base/train/astra/seed_0'} is missing: "
+        f"run `astra-data run {base} --root {tmp_path}` first"
+    )
+    run(base, root=tmp_path, jobs=2)
+    made = attempts(tmp_path / "base")
+    finished = check(longer, root=tmp_path)
+    assert finished["train/astra_plus/seed_1"] and not finished["evaluate/astra_plus/seed_1"]
+    assert not (tmp_path / "longer/train").exists()
+
+    folder = run(longer, root=tmp_path, jobs=2)
+    assert sorted(path.name for path in folder.iterdir() if path.is_symlink()) == sorted(
+        ["collect", "pair", "ground", "train", "align"]
+    )
+    assert (folder / "train").resolve() == (tmp_path / "base/train").resolve()
+    assert attempts(tmp_path / "base") == made
+    told = asked(folder / "evaluate/astra_plus/seed_1")
+    assert told["policy"] == str(folder / "train/astra_plus/seed_1")
+    assert told["steps"] == 3 and Path(str(told["policy"])).is_dir()
+    assert json.loads((folder / "recipe.json").read_text())["evaluate"]["rate"] == 2.0
+    assert all(is_made for key, is_made in check(longer, root=tmp_path).items() if key != "report")
+    run(longer, root=tmp_path, jobs=1)
+    assert (folder / "evaluate/astra/seed_0/attempts").read_text() == "."
+    # Links and all, the runs may be moved.
+    shutil.move(tmp_path / "base", tmp_path / "moved/base")
+    shutil.move(tmp_path / "longer", tmp_path / "moved/longer")
+    assert (tmp_path / "moved/longer/train/astra/seed_0").is_dir()
+
+
+def test_a_stage_of_the_base_is_not_run_here(base: Path, longer: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError) as caught:
+        run_stage(longer, "train", root=tmp_path)
+    assert str(caught.value) == (f"{longer} uses the train of {base}: run `astra-data train {base}` for that")
+    with pytest.raises(
+        MissingStageError, match=r"base/train/astra/seed_0 is missing: run `astra-data run .*base"
+    ):
+        run_stage(longer, "evaluate", root=tmp_path)
+    result = CliRunner().invoke(cli.app, ["check", str(longer), "--root", str(tmp_path)])
+    assert "  to do     train/astra/seed_0\n" in result.output
+
+
+def test_changes_are_told_in_the_base_and_here(base: Path, longer: Path, tmp_path: Path) -> None:
+    run(base, root=tmp_path, jobs=2)
+    folder = run(longer, root=tmp_path, jobs=2)
+    base.write_text(BASE + "[train]\nsteps = 9\n")
+    for action in (check, run):
+        with pytest.raises(
+            RecipeError, match=rf"^plus and train changed in the recipe since {tmp_path}/base was"
+        ):
+            action(longer, root=tmp_path)
+    base.write_text(BASE)
+    longer.write_text(LONGER.replace("2.0", "3.0"))
+    with pytest.raises(RecipeError) as caught:
+        check(longer, root=tmp_path)
+    assert str(caught.value) == (
+        f"evaluate changed in the recipe since {folder} was made: give the recipe another name, or remove "
+        f"{folder / 'evaluate'}"
+    )
+
+
+def test_a_stage_that_is_borrowed_no_more_is_made_here(base: Path, longer: Path, tmp_path: Path) -> None:
+    run(base, root=tmp_path, jobs=2)
+    folder = run(longer, root=tmp_path, jobs=2)
+    shutil.rmtree(folder / "evaluate")
+    longer.write_text(LONGER + "[train]\nsteps = 9\n")
+    made = attempts(tmp_path / "base")
+    assert not check(longer, root=tmp_path)["train/astra/seed_0"]
+    run(longer, root=tmp_path, jobs=2)
+    assert asked(folder / "train/astra/seed_0")["steps"] == 9
+    assert not (folder / "train").is_symlink() and (folder / "ground").is_symlink()
+    assert attempts(tmp_path / "base") == made
+    longer.write_text(LONGER)
+    shutil.rmtree(folder / "evaluate")
+    (folder / "recipe.json").unlink()
+    with pytest.raises(RecipeError) as caught:
+        run(longer, root=tmp_path)
+    assert str(caught.value) == (
+        f"{folder / 'train'} is in the way: {longer} is based on base, whose train it uses; "
+        f"give the recipe another name, or remove {folder / 'train'}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('based_on = "bse"', ": based_on: unknown recipe 'bse': did you mean 'base'?"),
+        ("based_on = 3", ": based_on: unknown recipe '3'; known: base"),
+        ('based_on = "longer"', ": based_on: unknown recipe 'longer'; known: base"),
+        ('based_on = "base"\ntask = "moon"', ": task: unknown task 'moon'; known: maze"),
+        (
+            'based_on = "base"\nmethods = ["nas", "astra"]\nseeds = [0, 5]',
+            " does not fit what it is based on: methods: base has no 'nas', it has ['astra', 'astra_plus', "
+            "'follower']; seeds: base has no '5', it has [0, 1]",
+        ),
+        ('based_on = "base"\nevaluate = 3', ": evaluate: expected a table, got 3"),
+        (LONGER + "step = 3", ": evaluate.step: unknown key: did you mean 'steps'?"),
+    ],
+)
+def test_faults_are_told(longer: Path, text: str, expected: str) -> None:
+    longer.write_text(text)
+    with pytest.raises(RecipeError) as caught:
+        load_experiment(longer, longer.parent)
+    assert str(caught.value) == f"{longer}{expected}"
+
+
+def test_there_is_no_chain(longer: Path) -> None:
+    third = longer.with_name("third.toml")
+    third.write_text('based_on = "longer"')
+    with pytest.raises(RecipeError, match=r"expected a recipe that is based on none itself, got 'longer'$"):
+        load_experiment(third, longer.parent)
+
+
+def test_a_table_that_the_folder_s_recipe_did_not_have_is_no_change(base: Path, tmp_path: Path) -> None:
+    folder = run(base, root=tmp_path, jobs=2)
+    record = folder / "recipe.json"
+    kept = json.loads(record.read_text())
+    del kept["target"]
+    record.write_text(json.dumps(kept))
+    assert check(base, root=tmp_path)["train/astra/seed_0"]
+    kept["collect"].pop("episodes")
+    record.write_text(json.dumps(kept))
+    assert check(base, root=tmp_path)["train/astra/seed_0"]
+
+
+def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_path: Path) -> None:
+    base.write_text(BASE.replace('"follower"', '"full_obs"'))
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(base.read_text() + "[target]\nnum_envs = 3\n")
+    with pytest.raises(RecipeError) as caught:
+        check(base, root=tmp_path)
+    stale = f"{folder / 'evaluate/full_obs'} {folder / 'train/full_obs'}"
+    assert str(caught.value).endswith(f"or remove {stale}")
+    base.write_text(BASE + "[target]\nnum_envs = 3\n[iql]\ndiscount = 0.9\n")
+    for stage in ("train", "evaluate"):
+        shutil.rmtree(folder / stage / "full_obs")
+    assert check(base, root=tmp_path)["train/astra/seed_0"]
+
+
+def test_recipes_are_read_without_what_only_trainings_and_tables_need() -> None:
+    code = (
+        "import sys, astra_data.experiments.experiment; assert not {'torchrl', 'rliable'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,127 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+from fake_items import Record, crash, fail, hang, kill_itself, rendezvous, touch
+
+from astra_data.core.errors import AstraDataError, MissingStageError
+from astra_data.core.lock import held
+from astra_data.experiments.local_executor import Item, execute
+
+PATIENCE_S = 120
+"""Enough for a process to start on a machine that is busy with other work."""
+
+
+def test_an_item_starts_when_its_inputs_are_finished(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    items = [
+        Item("b/second", ("a/first",), partial(touch, second, (first,))),
+        Item("a/first", ("not/planned",), partial(touch, first, ())),
+    ]
+    record = Record()
+    execute(items, jobs=2, logs=tmp_path / "logs", watch=record)
+    assert record.events == [
+        (event, key) for key in ("a/first", "b/second") for event in ("started", "0.5 half", "finished")
+    ]
+    assert not [path for path in (tmp_path / "logs").rglob("*") if path.is_file()]
+
+
+def test_independent_items_run_at_the_same_time(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    items = [Item("one", (), partial(rendezvous, one, two)), Item("two", (), partial(rendezvous, two, one))]
+    execute(items, jobs=2, logs=tmp_path / "logs", watch=Record())
+
+
+def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
+    with pytest.raises(MissingStageError, match=r"^a/b: nothing to eat$"):
+        execute([Item("a/b", (), fail)], jobs=1, logs=tmp_path, watch=Record())
+
+
+def test_a_crash_tells_its_last_line_and_where_its_traceback_is(tmp_path: Path) -> None:
+    with pytest.raises(AstraDataError, match=r"^a/b crashed: ValueError: a bug \(traceback: .*b\.txt\)$"):
+        execute([Item("a/b", (), crash)], jobs=1, logs=tmp_path, watch=Record())
+    log = (tmp_path / "a/b.txt").read_text()
+    assert "about to crash" in log
+    assert "Traceback" in log
+
+
+def test_a_killed_process_is_noticed(tmp_path: Path) -> None:
+    with pytest.raises(AstraDataError, match=r"^a was stopped by SIGKILL, often for want of memory$"):
+        execute([Item("a", (), kill_itself)], jobs=1, logs=tmp_path, watch=Record())
+
+
+def test_a_failure_stops_the_others(tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    items = [
+        Item("hang", (), partial(hang, pid_file)),
+        Item("wait", (), partial(rendezvous, tmp_path / "mine", pid_file)),
+        Item("fail", ("wait",), fail),
+    ]
+    with pytest.raises(MissingStageError):
+        execute(items, jobs=2, logs=tmp_path / "logs", watch=Record())
+    assert _is_gone(int(pid_file.read_text()))
+
+
+def test_items_that_wait_for_each_other_are_a_bug() -> None:
+    items = [Item("a", ("b",), fail), Item("b", ("a",), fail)]
+    with pytest.raises(ValueError, match="items wait for each other: a, b"):
+        execute(items, jobs=1, logs=Path("unused"), watch=Record())
+
+
+def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
+    parent = _hanging_run(tmp_path)
+    # As in a terminal, Ctrl-C reaches the whole process group.
+    os.killpg(parent.pid, signal.SIGINT)
+    _, errors = parent.communicate(timeout=PATIENCE_S)
+    assert errors.count(b"KeyboardInterrupt") == 1
+    assert _is_gone(int((tmp_path / "pid").read_text()))
+
+
+def test_no_process_outlives_a_killed_run(tmp_path: Path) -> None:
+    parent = _hanging_run(tmp_path)
+    parent.kill()
+    parent.communicate(timeout=PATIENCE_S)
+    until = time.monotonic() + PATIENCE_S
+    ours = False
+    while not ours:
+        assert time.monotonic() < until, "the item still holds its lock"
+        time.sleep(0.02)
+        with held(tmp_path) as ours:
+            pass
+
+
+def _hanging_run(folder: Path) -> subprocess.Popen[bytes]:
+    """Start a process whose one item hangs, holding the lock of `folder`."""
+    pid_file, script = folder / "pid", folder / "script.py"
+    script.write_text(
+        "import signal\nimport sys\nfrom functools import partial\nfrom pathlib import Path\n"
+        # Who starts these tests in the background may have it ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
+        "from fake_items import Record, hang\n"
+        "from astra_data.experiments.local_executor import Item, execute\n"
+        "if __name__ == '__main__':\n"
+        f"    here = Path({str(folder)!r})\n"
+        "    execute([Item('a', (), partial(hang, here / 'pid'))], jobs=1, logs=here, watch=Record())\n"
+    )
+    parent = subprocess.Popen([sys.executable, script], stderr=subprocess.PIPE, start_new_session=True)
+    until = time.monotonic() + PATIENCE_S
+    while not (pid_file.exists() and pid_file.read_text()):
+        if time.monotonic() > until:
+            parent.kill()
+            pytest.fail("the item did not start")
+        time.sleep(0.02)
+    return parent
+
+
+def _is_gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False

@@ -1,0 +1,154 @@
+from functools import partial
+from pathlib import Path
+
+import pytest
+from fake_stages import FakeConfig
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import RecipeError
+from astra_data.experiments.plan import plan
+from astra_data.experiments.points import Part
+from astra_data.experiments.recipe import Recipe
+
+HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
+
+
+def load(folder: Path, model: type[Recipe], text: str) -> Recipe:
+    path = folder / "r.toml"
+    path.write_text(text)
+    return load_recipe(path, model)
+
+
+def test_rows_read_what_their_method_needs(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD)
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    assert len(items) == 2 * (1 + 1 + 1 + 3 + 1 + 4) + 1
+    assert items["ground/astra/seed_7"].inputs == ("pair/seed_7",)
+    assert items["train/direct_transfer/seed_0"].inputs == ("pair/seed_0",)
+    assert items["train/astra_plus/seed_0"].inputs == ("pair/seed_0", "ground/astra/seed_0")
+    assert items["evaluate/follower/seed_0"].inputs == ()
+    assert items["evaluate/astra_plus/seed_0"].inputs == (
+        "train/astra_plus/seed_0",
+        "ground/astra/seed_0",
+        "align/astra/seed_0",
+    )
+    assert len(items["report"].inputs) == 8
+
+
+def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = HEAD.replace('"astra_plus"', '"nas_plus"')
+    items = {
+        item.key: item for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
+    }
+    assert items["evaluate/follower/seed_7"].inputs == ("ground/nas/seed_7",)
+    assert items["evaluate/nas_plus/seed_7"].inputs == ("train/nas_plus/seed_7", "ground/nas/seed_7")
+    assert items["evaluate/astra/seed_7"].inputs[-1] == "ground/nas/seed_7"
+
+
+def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = 'task = "maze"\nmethods = ["astra_again", "fine_tuned"]\nseeds = [0]\n'
+    items = {
+        item.key: item for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
+    }
+    assert {"ground/astra/seed_0", "align/astra/seed_0", "train/direct_transfer/seed_0"} <= items.keys()
+    assert "ground/astra_again/seed_0" not in items and "evaluate/direct_transfer/seed_0" not in items
+    assert items["train/fine_tuned/seed_0"].inputs == ("pair/seed_0", "train/direct_transfer/seed_0")
+    assert items["evaluate/astra_again/seed_0"].inputs == (
+        "train/astra_again/seed_0",
+        "ground/astra/seed_0",
+        "align/astra/seed_0",
+    )
+
+
+def test_a_recipe_may_augment_what_it_collects(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[collect]\nepisodes = 50\n[augment]\nsteps = 4\n")
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    assert items["augment/seed_7"].inputs == ("collect/seed_7",)
+    assert items["pair/seed_7"].inputs == ("augment/seed_7",)
+    call = items["augment/seed_7"].call
+    assert isinstance(call, partial)
+    assert call.keywords["seed"] == 7
+    assert call.keywords["dataset"] == tmp_path / "collect/seed_7"
+    plain = plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path)
+    assert not [item for item in plain if item.key.startswith("augment")]
+
+
+def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    assert len(items) == 2 * (1 + 1 + 2 * (1 + 1 + 3 + 1 + 4)) + 1
+    assert items["collect/seed_7"].call.args[1].episodes == 300  # type: ignore[attr-defined]
+    assert items["subset/percent_050/seed_7"].inputs == ("pair/seed_7",)
+    assert items["ground/astra/percent_150/seed_0"].inputs == ("subset/percent_150/seed_0",)
+    assert items["evaluate/astra_plus/percent_050/seed_0"].inputs == (
+        "train/astra_plus/percent_050/seed_0",
+        "ground/astra/percent_050/seed_0",
+        "align/astra/percent_050/seed_0",
+    )
+    report = items["report"].call
+    assert report.args[0].percents == (50, 150)  # type: ignore[attr-defined]
+    assert report.keywords["command"] == f"astra-data sweep {tmp_path / 'r.toml'}"  # type: ignore[attr-defined]
+
+
+def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
+    part = Part.of(recipe, methods=["astra"], seeds=[7], percents=[50])
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
+    assert list(items) == [
+        "collect/seed_7",
+        "pair/seed_7",
+        "subset/percent_050/seed_7",
+        "ground/astra/percent_050/seed_7",
+        "train/astra/percent_050/seed_7",
+        "align/astra/percent_050/seed_7",
+        "evaluate/astra/percent_050/seed_7",
+        "report",
+    ]
+    assert items["collect/seed_7"].call.args[1].episodes == 300  # type: ignore[attr-defined]
+    options = "--method astra --seed 7 --percent 50"
+    assert items["report"].call.keywords["command"].endswith(f"r.toml {options}")  # type: ignore[attr-defined]
+
+
+def test_every_artefact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    seen: set[str] = set()
+    for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path):
+        assert seen.issuperset(item.inputs)
+        seen.add(item.key)
+
+
+def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, HEAD + "[train]\nsteps = 5\n[plus]\nrate = 2\n")
+    assert recipe.train.model_dump() == FakeConfig(steps=5, rate=0.5).model_dump()
+    assert recipe.plus.model_dump() == FakeConfig(steps=5, rate=2.0).model_dump()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (HEAD + "[plus]\nstep = 1", "plus.step: unknown key: did you mean 'steps'?"),
+        (HEAD + "plus = 1", "plus: expected a table, got 1"),
+        (HEAD + "[train]\nsteps = 'x'\n[plus]\nrate = 1.0", "train.steps: expected a whole number, got 'x'"),
+        (HEAD.replace("astra_", "astro_"), "methods: unknown method 'astro_plus': did you mean 'astra'?"),
+        (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: maze"),
+        (
+            HEAD.replace("astra_plus", "fine_tuned_plus"),
+            "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without "
+            "effect: leave out _plus",
+        ),
+        (HEAD.replace("7", "0"), "recipe: expected each of seeds once, got [0, 0]"),
+        (HEAD + "[sweep]\npercent = [5, 5]", "recipe: expected each of sweep.percent once, got [5, 5]"),
+        (
+            HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
+            "recipe: sweep.percent: 5 % of 9 episodes are none: expected more",
+        ),
+        (HEAD.replace("[0, 7]", "[]"), "seeds: tuple should have at least 1 item after validation, not 0"),
+    ],
+)
+def test_faults_are_told(tmp_path: Path, fake_recipe: type[Recipe], text: str, expected: str) -> None:
+    with pytest.raises(RecipeError) as caught:
+        load(tmp_path, fake_recipe, text)
+    assert str(caught.value) == f"{tmp_path / 'r.toml'}: {expected}"

@@ -1,0 +1,64 @@
+"""Whatever a recipe holds: a model, or one clear message. ASTRA_DATA_FUZZ is how many examples are tried."""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from astra_data.core.config import validated
+from astra_data.core.errors import RecipeError
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.recipe import Recipe
+
+fuzzed = settings(
+    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "60")),
+    deadline=None,
+    derandomize="ASTRA_DATA_FUZZ" not in os.environ,
+    database=None,
+)
+RECIPES = sorted((Path(__file__).parents[2] / "recipes").glob("*.toml"))
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+KEYS = st.sampled_from([*Recipe.model_fields, "collect.episodes", "train.hidden_sizes", "pair.x"])
+
+
+def load(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recipe.toml"
+        path.write_bytes(content)
+        shutil.copy(RECIPES[0].with_name("antmaze_umaze.toml"), folder)
+        try:
+            load_experiment(path, Path(folder))
+        except RecipeError as error:
+            assert str(error).startswith(str(path))
+
+
+@fuzzed
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_recipe(content: bytes) -> None:
+    load(content)
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+@fuzzed
+@given(place=st.floats(0, 1), text=st.binary(max_size=8), length=st.integers(0, 20))
+def test_a_recipe_with_a_damaged_place(path: Path, place: float, text: bytes, length: int) -> None:
+    whole = path.read_bytes()
+    first = int(place * len(whole))
+    load(whole[:first] + text + whole[first + length :])
+
+
+@fuzzed
+@given(st.dictionaries(KEYS, VALUES, max_size=6))
+def test_tables_of_anything(tables: dict[str, object]) -> None:
+    try:
+        validated(tables, Recipe, "recipe")
+    except RecipeError as error:
+        assert str(error).startswith("recipe")

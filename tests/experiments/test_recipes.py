@@ -1,0 +1,92 @@
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import RecipeError
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.plan import plan
+from astra_data.studies.study import GapRecipe
+
+HOUSE = Path(__file__).parents[2]
+
+
+WALKS = [HOUSE / "recipes/nao_real.toml"]
+"""Recipes of `astra-data gap`, which have no stages."""
+
+
+@pytest.mark.parametrize("path", WALKS, ids=lambda path: path.stem)
+def test_a_recipe_of_walks_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
+    first = path.read_text().splitlines()[0]
+    assert first == f"# uv run astra-data gap recipes/{path.name} --data FOLDER"
+    assert (path.parent / load_recipe(path, GapRecipe).mapping).is_file()
+
+
+@pytest.mark.parametrize(
+    "path", sorted({*(HOUSE / "recipes").glob("*.toml")} - {*WALKS}), ids=lambda path: path.stem
+)
+def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
+    first, experiment = path.read_text().splitlines()[0], load_experiment(path, Path("runs"))
+    command = "sweep" if experiment.recipe.sweep.percent else "run"
+    assert first == f"# uv run astra-data {command} recipes/{path.name}"
+    assert plan(experiment.recipe, path, experiment.folder)
+
+
+def test_only_the_legs_differ_in_the_morphology_test() -> None:
+    experiment = load_experiment(HOUSE / "recipes" / "leg_scale.toml", Path("runs"))
+    assert experiment.recipe.evaluate.leg_scale == 1.25
+    assert experiment.borrowed == {"collect", "pair", "ground", "train", "align"}
+
+
+@pytest.mark.parametrize("name", ["kinematics", "extended"])
+def test_only_the_simulator_differs_in_the_humanoids_tests(name: str) -> None:
+    ours, base = (
+        load_experiment(HOUSE / "recipes" / f"humanoid_{kind}.toml", Path("runs"))
+        for kind in (name, "walker2d")
+    )
+    assert ours.borrowed == {"collect"}
+    kept = ours.recipe.model_copy(update={"task": base.recipe.task, "based_on": None})
+    assert kept == base.recipe
+
+
+@pytest.mark.parametrize(
+    ("name", "borrowed"), [("nao_navigation_50", {"collect"}), ("nao_navigation_200", set())]
+)
+def test_only_the_data_differs_in_the_augmentation_test(name: str, borrowed: set[str]) -> None:
+    experiment = load_experiment(HOUSE / "recipes" / f"{name}.toml", Path("runs"))
+    assert experiment.borrowed == borrowed
+    ours, base = (
+        experiment.recipe,
+        load_experiment(HOUSE / "recipes/nao_navigation.toml", Path("runs")).recipe,
+    )
+    assert ours.augment is not None
+    assert ours.augment.episodes == ours.collect.episodes
+    assert (ours.ground, ours.train, ours.align) == (base.ground, base.train, base.align)
+
+
+HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[collect]\nstart = "task"\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "end", "asked"),
+    [
+        (', "rma", "follower"', "", "methods: follower"),
+        ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
+        ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
+        ("", "[plus]\ncommand_limit_m_s = 1.0\n", "plus.command_limit_m_s"),
+        ("", "[evaluate]\nleg_scale = 1.25\n", "evaluate.leg_scale"),
+        ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),
+    ],
+)
+def test_what_needs_a_maze_is_refused_where_there_is_none(
+    tmp_path: Path, more: str, end: str, asked: str
+) -> None:
+    path = tmp_path / "humanoid.toml"
+    path.write_text(HUMANOID.format(""))
+    assert load_experiment(path, tmp_path).recipe.task == "humanoid-walker2d"
+    path.write_text(HUMANOID.format("").replace('"task"', '"anywhere"'))
+    with pytest.raises(RecipeError, match=r'collect.start = "anywhere" \(the default; "task" does not\)'):
+        load_experiment(path, tmp_path)
+    path.write_text(HUMANOID.format(more) + end)
+    with pytest.raises(RecipeError, match=f"humanoid-walker2d has no maze, which these need: {asked};"):
+        load_experiment(path, tmp_path)

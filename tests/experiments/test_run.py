@@ -1,0 +1,223 @@
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError, RecipeError
+from astra_data.experiments.run import check, run, run_stage
+
+pytestmark = pytest.mark.usefixtures("fake_recipe")
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "r.toml"
+    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[plus]\nsteps = 5\n')
+    return path
+
+
+def asked(folder: Path) -> dict[str, object]:
+    content: dict[str, object] = json.loads((folder / "asked.json").read_text())
+    return content
+
+
+def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = run(recipe, root=tmp_path, jobs=2)
+    assert folder == tmp_path / "r"
+    assert asked(folder / "train/astra_plus/seed_0") == {
+        "task": "maze",
+        "method": "astra_plus",
+        "dataset": str(folder / "pair/seed_0"),
+        "grounding": str(folder / "ground/astra/seed_0"),
+        "initial": None,
+        "seed": 0,
+        "steps": 5,
+    }
+    assert asked(folder / "evaluate/astra/seed_0")["target_encoder"] == str(folder / "align/astra/seed_0")
+    assert asked(folder / "report")["methods"] == ["astra", "astra_plus"]
+    assert json.loads((folder / "recipe.json").read_text())["plus"]["steps"] == 5
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"report  finished in [\d.]+ s  \(9 of 9\)", lines[-1])
+
+    unfinished = [key for key, is_finished in check(recipe, root=tmp_path).items() if not is_finished]
+    assert unfinished == ["report"]
+    run(recipe, root=tmp_path, jobs=1)
+    assert (folder / "train/astra/seed_0/attempts").read_text() == "."
+
+
+@pytest.mark.parametrize(("jobs", "each_of_two"), [(None, 1), (1, 3)])
+def test_items_side_by_side_share_the_cores(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int | None, each_of_two: int
+) -> None:
+    monkeypatch.setattr("astra_data.experiments.run.cores", lambda: 3)
+    folder = run(recipe, root=tmp_path, jobs=jobs)
+    assert asked(folder / "collect/seed_0")["num_threads"] == 3
+    for row in ("astra", "astra_plus"):
+        assert asked(folder / "evaluate" / row / "seed_0")["num_threads"] == each_of_two
+
+
+def test_trainings_in_the_target_get_their_share_of_the_cores_and_one_table(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.experiments.run.cores", lambda: 8)
+    methods = '["direct_transfer", "target", "full_obs"]'
+    recipe.write_text(f'task = "maze"\nmethods = {methods}\nseeds = [0]\n[target]\nnum_envs = 7\n')
+    folder = run(recipe, root=tmp_path, jobs=2, until="train")
+    for row in ("target", "full_obs"):
+        told = asked(folder / "train" / row / "seed_0")
+        assert told["num_threads"] == 4 and "num_envs=7" in str(told["settings"])
+    assert "num_threads" not in asked(folder / "train/direct_transfer/seed_0")
+
+
+def test_a_stage_may_make_what_its_own_items_read(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text('task = "maze"\nmethods = ["fine_tuned"]\nseeds = [0]\n')
+    run(recipe, root=tmp_path, until="pair")
+    folder = run_stage(recipe, "train", root=tmp_path)
+    assert asked(folder / "fine_tuned/seed_0")["initial"] == str(folder / "direct_transfer/seed_0")
+
+
+@pytest.mark.parametrize(("device", "jobs"), [("cpu", 5), ("cuda:0", 2)])
+def test_few_items_at_a_time_hold_a_context_of_a_gpu(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, jobs: int
+) -> None:
+    told: list[int] = []
+    monkeypatch.setattr("astra_data.experiments.run.cores", lambda: 5)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("astra_data.experiments.run.execute", lambda *_, jobs, **__: told.append(jobs))
+    run(recipe, root=tmp_path, device=device)
+    run(recipe, root=tmp_path, device=device, jobs=3)
+    assert told == [jobs, 3]
+
+
+def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
+    text = recipe.read_text()
+    recipe.write_text(text + "[pair]\nfails = true\n")
+    with pytest.raises(BadInputError, match=r"^pair/seed_0: told to fail$"):
+        run(recipe, root=tmp_path, jobs=1)
+    assert (tmp_path / "r/collect/seed_0").is_dir()
+    assert not (tmp_path / "r/pair/seed_0").exists()
+    (tmp_path / "r/recipe.json").unlink()
+    recipe.write_text(text)
+    run(recipe, root=tmp_path, jobs=1, until="pair")
+    assert (tmp_path / "r/pair/seed_0/attempts").read_text() == ".."
+    assert not (tmp_path / "r/ground").exists()
+
+
+def test_a_folder_in_use_is_left_alone(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "r"
+
+    def files() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+    def run_again(*_: object, **__: object) -> None:
+        before = files()
+        with pytest.raises(BadInputError) as caught:
+            run_stage(recipe, "collect", root=tmp_path)
+        assert str(caught.value) == f"{folder} is in use by another run: wait until it ends, or stop it"
+        assert files() == before
+
+    with monkeypatch.context() as patched:
+        patched.setattr("astra_data.experiments.run.execute", run_again)
+        run(recipe, root=tmp_path)
+    run_stage(recipe, "collect", root=tmp_path, jobs=1)
+    assert (folder / "collect/seed_0").is_dir()
+
+
+def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingStageError) as caught:
+        run_stage(recipe, "train", method="astra", root=tmp_path)
+    root = tmp_path / "r"
+    assert str(caught.value) == (
+        f"{root / 'pair/seed_0'} is missing: run `astra-data pair {recipe} --root {tmp_path}` first"
+    )
+
+
+def test_moved_copies_are_made_by_running_the_recipe(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text() + "[augment]\nsteps = 4\n")
+    run_stage(recipe, "collect", root=tmp_path)
+    missing = tmp_path / "r/augment/seed_0"
+    message = f"{missing} is missing: run `astra-data run {recipe} --root {tmp_path}` first"
+    with pytest.raises(MissingStageError, match=f"^{re.escape(message)}$"):
+        run_stage(recipe, "pair", root=tmp_path)
+
+
+def test_a_report_does_not_wait_for_every_seed(recipe: Path, tmp_path: Path) -> None:
+    run_stage(recipe, "report", root=tmp_path)
+    assert asked(tmp_path / "r/report")["seeds"] == [0]
+
+
+def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, tmp_path: Path) -> None:
+    text, folder = recipe.read_text(), tmp_path / "r"
+    run(recipe, root=tmp_path, jobs=2)
+    recipe.write_text(text.replace("steps = 5", "steps = 6"))
+    with pytest.raises(RecipeError) as caught:
+        check(recipe, root=tmp_path)
+    assert str(caught.value) == (
+        f"plus changed in the recipe since {folder} was made: "
+        "give the recipe another name, or remove "
+        f"{folder / 'evaluate/astra_plus'} {folder / 'train/astra_plus'}"
+    )
+    shutil.rmtree(folder / "train/astra_plus")
+    shutil.rmtree(folder / "evaluate/astra_plus")
+    assert sorted(key for key, is_finished in check(recipe, root=tmp_path).items() if not is_finished) == [
+        "evaluate/astra_plus/seed_0",
+        "report",
+        "train/astra_plus/seed_0",
+    ]
+    recipe.write_text(text.replace("seeds = [0]", "seeds = [0, 1]"))
+    assert check(recipe, root=tmp_path)["collect/seed_1"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stage": "trian"}, "unknown stage 'trian': did you mean 'train'?"),
+        ({"stage": "train", "method": "astr"}, "the recipe has no method 'astr': did you mean 'astra'?"),
+        ({"stage": "train", "seeds": [0, 3]}, "the recipe has no seed 3; its seeds: 0"),
+        ({"stage": "collect", "device": "gpu"}, "expected a device such as cpu, cuda or cuda:1, got 'gpu'"),
+    ],
+)
+def test_bad_arguments(recipe: Path, tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        run_stage(recipe, root=tmp_path, **arguments)
+    assert str(caught.value) == message
+
+
+def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text().replace("seeds = [0]", "seeds = [0, 1, 2]"))
+    folder = run(recipe, seeds=[2, 0], root=tmp_path, jobs=2)
+    assert sorted(path.name for path in (folder / "evaluate/astra").iterdir()) == ["seed_0", "seed_2"]
+    told = asked(folder / "report")
+    assert told["seeds"] == [2, 0]
+    assert told["command"] == f"astra-data run {recipe} --seed 2 --seed 0"
+    run_stage(recipe, "pair", seeds=[0], root=tmp_path)
+    with pytest.raises(MissingStageError, match="collect/seed_1 is missing"):
+        run_stage(recipe, "pair", root=tmp_path)
+
+
+def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) -> None:
+    def call(*arguments: str) -> str:
+        result = CliRunner().invoke(cli.app, [*arguments, "--root", str(tmp_path)], catch_exceptions=False)
+        assert result.exit_code == 0
+        return result.output
+
+    assert "0 of 9 items are finished" in call("check", str(recipe))
+    assert "collect/seed_0  finished" in call("collect", str(recipe), "--seed", "0")
+    assert "  finished  collect/seed_0\n  to do     pair/seed_0\n" in call("check", str(recipe))
+    with pytest.raises(AstraDataError, match="unknown stage 'x'"):
+        call("run", str(recipe), "--until", "x")
+
+
+def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("astra_data.experiments.run.execute", interrupted)
+    result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
+    assert result.exit_code == 130
+    assert "run the same command again" in result.output

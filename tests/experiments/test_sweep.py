@@ -1,0 +1,197 @@
+import csv
+import sys
+from pathlib import Path
+from shutil import rmtree
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fake_runs import bare_results, write_json
+from typer.testing import CliRunner
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.points import Point
+from astra_data.experiments.sweep import sweep
+from astra_data.reports.sizes import SizesResults
+
+pytestmark = pytest.mark.usefixtures("fake_recipe")
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "r.toml"
+    path.write_text(
+        'task = "maze"\nmethods = ["nas", "astra", "follower"]\nseeds = [0, 1]\n'
+        "[collect]\nepisodes = 20\n[sweep]\npercent = [50, 150]\n"
+    )
+    return path
+
+
+def lines(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def attempts(folder: Path) -> dict[str, str]:
+    return {str(path.parent.relative_to(folder)): path.read_text() for path in folder.rglob("attempts")}
+
+
+def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
+    recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+    assert lines(folder) == [
+        {
+            "method": "nas",
+            "percent": "50",
+            "seed": "1",
+            "success": "1.0",
+            "steps": "0.5",
+            "return": "0.5",
+            "failed": "0.5",
+            "simulated_success": "0.5",
+            "dataset_version": "fake@data-1.0.0",
+            "dataset_hash": "hash1",
+            "commit": "abc",
+            "wall_seconds": "24.5",
+        }
+    ]
+    told = capsys.readouterr().out
+    assert "evaluate/nas/percent_050/seed_1  done 1.00  (1 of 1 points, 0 min left)" in told
+
+    # A point whose artefacts are removed is not finished any more; the table says what is there.
+    sweep(recipe, root=tmp_path, jobs=2)
+    made = attempts(folder)
+    assert set(made.values()) == {"."}
+    assert sum(key.startswith("pair") for key in made) == 2
+    assert sum(key.startswith("subset") for key in made) == 4
+    assert [tuple(line[key] for key in ("method", "percent", "seed")) for line in lines(folder)] == [
+        (method, percent, seed)
+        for method in ("nas", "astra", "follower")
+        for percent in ("50", "150")
+        for seed in ("0", "1")
+    ]
+    assert {line["simulated_success"] for line in lines(folder) if line["method"] == "follower"} == {""}
+    assert {line["wall_seconds"] for line in lines(folder) if line["method"] == "astra"} == {"24.75"}
+
+
+def test_points_outlive_what_they_were_made_of(recipe: Path, tmp_path: Path) -> None:
+    folder = sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+    rmtree(folder / "train")
+    sweep(recipe, methods=["follower"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+    times = {line["method"]: line["wall_seconds"] for line in lines(folder)}
+    assert times["nas"] == ""
+    assert float(times["follower"]) > 0
+
+
+def publish(recipe: Path, points: dict[int, dict[str, list[int]]]) -> Path:
+    """Write results of some seeds of rows, by size; return their file."""
+    settings = load_experiment(recipe, recipe.parent).recipe.settings
+    sizes = [
+        {"percent": percent, "results": bare_results("r", rows, settings)} for percent, rows in points.items()
+    ]
+    path = recipe.parent / "results" / "r.json"
+    whole = {"recipe": "r", "task": "maze", "command": "", "sizes": sizes}
+    write_json(path, SizesResults.model_validate(whole).model_dump(mode="json", by_alias=True))
+    return path
+
+
+def test_only_points_that_are_not_published_are_made(recipe: Path, tmp_path: Path) -> None:
+    publish(recipe, {50: {"nas": [0, 1], "astra": [0]}, 150: {"nas": [1], "follower": [0, 1]}})
+    folder = sweep(recipe, methods=["nas", "follower"], unpublished=True, root=tmp_path, jobs=2)
+    made = [tuple(line[key] for key in ("method", "percent", "seed")) for line in lines(folder)]
+    assert made == [("nas", "150", "0"), ("follower", "50", "0"), ("follower", "50", "1")]
+    # Only what they need: of seed 1 no policy, hence no grounding but for the simulators of the follower.
+    keys = set(attempts(folder))
+    assert {key for key in keys if key.startswith("train")} == {"train/nas/percent_150/seed_0"}
+    assert not {key for key in keys if key.startswith("align")}
+    publish(recipe, {50: {"nas": [0, 1]}, 150: {"nas": [0, 1]}})
+    with pytest.raises(BadInputError, match="all of these points are published"):
+        sweep(recipe, methods=["nas"], unpublished=True, root=tmp_path)
+
+
+def test_points_published_with_other_settings_do_not_count(recipe: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected published results in .*r.json, found none"):
+        sweep(recipe, unpublished=True, root=tmp_path)
+    publish(recipe, {50: {"nas": [0]}})
+    recipe.write_text(recipe.read_text() + "[report]\nsteps = 7\n[train]\nsteps = 7\n")
+    with pytest.raises(RecipeError, match=r"^train changed in .*r.toml since its results in"):
+        sweep(recipe, unpublished=True, root=tmp_path)
+    assert not (tmp_path / "r").exists()
+
+
+def test_settings_of_rows_that_are_not_published_may_change(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text().replace('"astra"', '"full_obs"'))
+    publish(recipe, {50: {"nas": [0, 1], "follower": [0, 1]}, 150: {"nas": [0, 1], "follower": [0, 1]}})
+    recipe.write_text(recipe.read_text() + "[target]\nnum_envs = 7\n")
+    folder = sweep(recipe, seeds=[0], unpublished=True, root=tmp_path, jobs=2)
+    assert {line["method"] for line in lines(folder)} == {"full_obs"}
+    publish(recipe, {50: {"full_obs": [0]}})
+    recipe.write_text(recipe.read_text().replace("num_envs = 7", "num_envs = 8"))
+    with pytest.raises(RecipeError, match=r"^target changed in .*r.toml since its results in"):
+        load_experiment(recipe, tmp_path).published()
+
+
+def test_plus_settings_may_change_until_such_rows_are_published(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text().replace('"astra"', '"astra", "astra_plus"') + "[plus]\nsteps = 7\n")
+    publish(recipe, {50: {"astra": [0]}})
+    recipe.write_text(recipe.read_text().replace("steps = 7", "steps = 8"))
+    assert load_experiment(recipe, tmp_path).published() == {Point("astra", 0, 50)}
+    publish(recipe, {50: {"astra": [0], "astra_plus": [0]}})
+    recipe.write_text(recipe.read_text().replace("steps = 8", "steps = 9"))
+    with pytest.raises(RecipeError, match=r"^plus changed in .*r.toml since its results in"):
+        load_experiment(recipe, tmp_path).published()
+
+
+def test_a_failed_sweep_keeps_the_points_that_are_finished(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text() + "[train]\nfails = true\n")
+    sweep(recipe, methods=["follower"], root=tmp_path, jobs=1)
+    with pytest.raises(BadInputError, match=r"^train/nas/percent_050/seed_0: told to fail$"):
+        sweep(recipe, methods=["nas"], seeds=[0], percents=[50], root=tmp_path, jobs=1)
+    assert len(lines(tmp_path / "r")) == 4
+
+
+def test_sizes_may_be_added_below_the_largest(recipe: Path, tmp_path: Path) -> None:
+    sweep(recipe, methods=["follower"], seeds=[0], percents=[150], root=tmp_path, jobs=1)
+    recipe.write_text(recipe.read_text().replace("[50, 150]", "[25, 150]"))
+    sweep(recipe, methods=["follower"], seeds=[0], percents=[25], root=tmp_path, jobs=1)
+    assert [line["percent"] for line in lines(tmp_path / "r")] == ["25", "150"]
+    recipe.write_text(recipe.read_text().replace("[25, 150]", "[25, 200]"))
+    with pytest.raises(RecipeError, match=r"^sweep changed in the recipe since .*/collect"):
+        sweep(recipe, root=tmp_path)
+
+
+def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Any] = []
+    trackio = SimpleNamespace(
+        init=lambda **settings: told.append(settings), log=told.append, finish=lambda: told.append("finished")
+    )
+    part: dict[str, Any] = {"methods": ["follower"], "seeds": [1], "percents": [50], "root": tmp_path}
+    monkeypatch.setitem(sys.modules, "trackio", None)
+    with pytest.raises(BadInputError, match=r'pip install "astra-data\[trackio\]"'):
+        sweep(recipe, **part, trackio="ants")
+    assert not (tmp_path / "r").exists()
+    monkeypatch.setitem(sys.modules, "trackio", trackio)
+    for _ in range(2):
+        sweep(recipe, **part, trackio="ants")
+    began, logged, ended = told
+    assert (began["project"], began["name"], ended) == ("ants", "r follower 50 1", "finished")
+    assert began["config"]["dataset_hash"] == "hash1"
+    assert logged["success"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--percent", "75"], "the recipe has no size 75; its sizes: 50, 150"),
+        (["--method", "nass"], "the recipe has no method 'nass': did you mean 'nas'?"),
+        (["--address", "head:6379"], "sweep: --address is for --engine ray"),
+        (["--engine", "ray", "--device", "cuda:1"], "expected device cpu or cuda on a cluster, got 'cuda:1'"),
+    ],
+)
+def test_bad_options(recipe: Path, tmp_path: Path, options: list[str], message: str) -> None:
+    result = CliRunner().invoke(cli.app, ["sweep", str(recipe), "--root", str(tmp_path), *options])
+    assert isinstance(result.exception, BadInputError)
+    assert str(result.exception) == message

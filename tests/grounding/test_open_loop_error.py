@@ -1,0 +1,79 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_episodes import toy_episodes
+
+from astra_data.grounding.open_loop_error import distances, gap_report
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.worlds.registry import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+STEPS = 60
+
+
+def episodes(speed: float) -> PairedEpisodes:
+    """Return three episodes in a corridor whose target moves at `speed` times the command along x."""
+    action = torch.zeros(3, STEPS, 2)
+    action[..., 0] = torch.tensor([0.5, 0.8, 1.0])[:, None]
+    velocity = torch.zeros(3, STEPS + 1, 2)
+    velocity[:, 1:] = speed * action
+    start = torch.tensor(TASK.maze.cell_centre(1, 1), dtype=torch.float32)
+    position = start + (velocity * TASK.timestep_s).cumsum(1)
+    state = torch.cat([position, velocity], dim=-1)
+    simulator = TASK.simulator(3 * STEPS)
+    simulator.reset_to(state[:, :-1].reshape(-1, 4))
+    simulated = simulator.step(action.reshape(-1, 2)).reshape(3, STEPS, 4)
+    mask = torch.ones(3, STEPS)
+    mask[2, 40:] = 0.0
+    return toy_episodes(state[:, :-1], action, next_state=state[:, 1:], simulated_next=simulated, mask=mask)
+
+
+def untrained() -> GroundingModel:
+    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(8,)))
+
+
+def test_quantities_are_measured_apart() -> None:
+    task = replace(TASK, quantities={"height_m": (2,), "way_m": (0, 3)})
+    wrong = torch.tensor([[[3.0, 9.0, -2.0, 4.0], [0.0, 9.0, 0.5, -1.0]]])
+    assert distances(task, wrong).tolist() == [[[2.0, 5.0], [0.5, 1.0]]]
+
+
+def test_a_perfect_simulator_has_no_gap() -> None:
+    report = gap_report(TASK, untrained(), episodes(speed=1.0), seed=0)
+    assert report["horizons"] == [1, 10, 50]
+    assert report["replays"] == 3 + 3 + 2
+    for kind in ("raw", "grounded"):
+        for quantity in ("position_m", "velocity_m_s"):
+            for figure in ("mean", "low", "high"):
+                assert report[kind][quantity][figure] == pytest.approx([0.0, 0.0, 0.0], abs=2e-4)
+
+
+def test_a_slow_target_is_left_behind_in_proportion_to_the_horizon() -> None:
+    report = gap_report(TASK, untrained(), episodes(speed=0.9), seed=0)
+    # Of eight replays only two are still within the data after 50 steps.
+    speeds = [(3 * 0.5 + 3 * 0.8 + 2 * 1.0) / 8] * 2 + [(0.5 + 0.8) / 2]
+    position = [
+        0.1 * speed * TASK.timestep_s * steps for speed, steps in zip(speeds, (1, 10, 50), strict=True)
+    ]
+    for kind in ("raw", "grounded"):  # an untrained grounding is the raw simulator
+        assert report[kind]["position_m"]["mean"] == pytest.approx(position, rel=0.01)
+        velocity = report[kind]["velocity_m_s"]
+        assert velocity["mean"] == pytest.approx([0.1 * speed for speed in speeds], rel=0.01)
+        for low, mean, high in zip(velocity["low"], velocity["mean"], velocity["high"], strict=True):
+            assert low < mean < high
+
+
+def test_a_constant_correction_closes_a_constant_gap() -> None:
+    model = untrained()
+    slow = episodes(speed=0.5)
+    # The same command throughout, so that one number corrects each step.
+    one = slow.select(torch.tensor([0]))
+    error = (one.windows.next_state - one.windows.simulated_next)[0]
+    assert error.std(0).max() < 1e-4
+    with torch.no_grad():
+        list(model.corrections.parameters())[-1].copy_(error.mean(0))
+    report = gap_report(TASK, model, one, seed=0)
+    assert report["raw"]["position_m"]["mean"][-1] > 0.5
+    assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=2e-3)

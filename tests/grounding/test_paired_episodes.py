@@ -1,0 +1,173 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fake_dataset import write_fake
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset import DatasetWriter
+from astra_data.dataset.columns import (
+    ABSTRACT_NEXT_STATE,
+    ABSTRACT_SIMULATED_NEXT_STATE,
+    ABSTRACT_STATE,
+    ACTION,
+    DONE,
+    GOAL,
+    OUTCOME_COLUMNS,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Column,
+    Episode,
+)
+from astra_data.grounding.paired_episodes import PairedEpisodes
+
+LENGTHS = (7, 1, 12, 30, 5)
+ABSTRACT = (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE)
+
+
+def label(episode: int, step: int) -> float:
+    """Return the first entry of everything that happened in a step."""
+    return 100.0 * (episode + 1) + step
+
+
+SIZES = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
+
+
+def write(folder: Path, sizes: dict[str, int]) -> Path:
+    columns = [*(Column(name, size=size) for name, size in sizes.items()), *OUTCOME_COLUMNS]
+    description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
+    description |= {"environment": {"id": "toy"}, "simulator": {"id": "toy"}, "parents": []}
+    with DatasetWriter(folder, columns, fps=20, task="toy", description=description) as writer:
+        for episode, length in enumerate(LENGTHS):
+            steps = np.array([label(episode, step) for step in range(length)], dtype=np.float32)
+            last = np.arange(length) == length - 1
+            values = {
+                name: steps[:, None] + np.arange(size, dtype=np.float32) for name, size in sizes.items()
+            }
+            # The third episode succeeds, the fourth topples, the others run out of time.
+            ended = last & (episode in (2, 3))
+            values |= {REWARD: -steps, TERMINATED: ended, TRUNCATED: last & ~ended, DONE: last}
+            writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("pairs") / "dataset", SIZES)
+
+
+def test_without_a_goal_all_else_is_the_same(root: Path, tmp_path: Path) -> None:
+    sizes = {name: size for name, size in SIZES.items() if name != GOAL}
+    aimless, usual = PairedEpisodes.load(write(tmp_path / "dataset", sizes)), PairedEpisodes.load(root)
+    for name, values in vars(usual.windows).items():
+        found = getattr(aimless.windows, name)
+        assert found.shape == (5, 30, 0) if name == "goal" else torch.equal(found, values)
+    assert aimless.draw_windows(3, 10)[0].goal.shape == (3, 10, 0)
+
+
+@pytest.fixture
+def episodes(root: Path) -> PairedEpisodes:
+    return PairedEpisodes.load(root)
+
+
+def test_episodes_are_padded_at_the_end(episodes: PairedEpisodes) -> None:
+    windows = episodes.windows
+    assert len(episodes) == 5
+    assert episodes.lengths.tolist() == list(LENGTHS)
+    for episode, length in enumerate(LENGTHS):
+        expected = torch.tensor([label(episode, step) for step in range(length)])
+        for values in (episodes.target_state, windows.state, windows.next_state, windows.simulated_next):
+            assert torch.equal(values[episode, :length, 0], expected)
+            assert (values[episode, length:] == 0).all()
+        assert windows.mask[episode].tolist() == [1.0] * length + [0.0] * (30 - length)
+    assert len(episodes.steps(windows.goal)) == sum(LENGTHS)
+
+
+def test_rewards_of_steps_that_end_the_task_badly_stand_apart(episodes: PairedEpisodes) -> None:
+    going_on, ending = episodes.windows.reward.unbind(-1)
+    assert ending.nonzero().tolist() == [[3, LENGTHS[3] - 1]]
+    for episode, length in enumerate(LENGTHS):
+        expected = -torch.tensor([label(episode, step) for step in range(length)])
+        shown = (going_on + ending)[episode, :length]
+        assert torch.equal(shown[:-1], expected[:-1])
+        # The step that fulfils the task is the simulator's to reward.
+        assert shown[-1] == (0.0 if episode == 2 else expected[-1])
+
+
+def test_only_the_last_second_before_a_bad_end_topples_soon(episodes: PairedEpisodes) -> None:
+    assert episodes.windows.topples_soon.nonzero().tolist() == [[3, step] for step in range(10, 30)]
+
+
+def test_the_previous_action_is_one_step_late(episodes: PairedEpisodes) -> None:
+    windows = episodes.windows
+    assert (windows.previous_action[:, 0] == 0).all()
+    for episode, length in enumerate(LENGTHS):
+        assert torch.equal(windows.previous_action[episode, 1:length], windows.action[episode, : length - 1])
+
+
+def test_a_split_is_by_episodes_and_by_the_seed(episodes: PairedEpisodes) -> None:
+    training, held_out = episodes.split(0.4, seed=3)
+    names = [set(part.target_state[:, 0, 0].tolist()) for part in (training, held_out)]
+    assert [len(part) for part in names] == [3, 2]
+    assert names[0] | names[1] == {label(episode, 0) for episode in range(5)}
+    assert torch.equal(training.windows.state[:, 0, 0], training.target_state[:, 0, 0])
+    again, _ = episodes.split(0.4, seed=3)
+    assert torch.equal(again.target_state, training.target_state)
+    assert len({tuple(episodes.split(0.4, seed)[1].target_state[:, 0, 0].tolist()) for seed in range(9)}) > 1
+    assert len(episodes.split(0.0001, seed=0)[1]) == 1
+
+
+@pytest.mark.parametrize("length", [1, 10, 100])
+def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length: int) -> None:
+    torch.manual_seed(0)
+    count = 20_000
+    windows, target_state = episodes.draw_windows(count, length)
+    length = min(length, 30)
+    assert windows.mask.shape == (count, length)
+    assert torch.equal(target_state[..., 0], windows.state[..., 0])
+    labels = windows.state[..., 0]
+    within = labels > 0
+    assert within[windows.mask.bool()].all()
+    # One episode each, and steps in order.
+    number, step = (labels / 100).floor(), labels % 100
+    assert ((number == number[:, :1]) | ~within).all()
+    assert ((step - step[:, :1] == torch.arange(length)) | ~within).all()
+    seen, times = labels[windows.mask.bool()].unique(return_counts=True)
+    expected = {label(episode, step) for episode, steps in enumerate(LENGTHS) for step in range(steps)}
+    assert set(seen.tolist()) == expected
+    mean = count * length / sum(steps + length - 1 for steps in LENGTHS)
+    assert (times - mean).abs().max() < 5 * mean**0.5
+
+
+def test_windows_come_from_torchs_generator(episodes: PairedEpisodes) -> None:
+    torch.manual_seed(4)
+    first, _ = episodes.draw_windows(8, 6)
+    torch.manual_seed(4)
+    second, _ = episodes.draw_windows(8, 6)
+    assert torch.equal(first.state, second.state)
+
+
+def test_an_unpaired_dataset_is_refused(tmp_path: Path) -> None:
+    write_fake(tmp_path / "raw")
+    with pytest.raises(BadInputError, match="expected a dataset that was paired"):
+        PairedEpisodes.load(tmp_path / "raw")
+
+
+@pytest.mark.parametrize(
+    ("kept", "dropped"), [("invariant", (1, 2)), ("position", ()), (None, ())], ids=["no", "yes", "untold"]
+)
+def test_what_tells_the_place_is_dropped_if_phi_drops_it(
+    tmp_path: Path, kept: str | None, dropped: tuple[int, ...]
+) -> None:
+    root = write(tmp_path / "dataset", SIZES | {STATE: 4})
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][STATE]["astra"] = {"role": ["invariant", "position", "position", "heading"]}
+    if kept:
+        info["features"][ABSTRACT_STATE]["astra"] = {"role": [kept] * 4}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    assert PairedEpisodes.load(root).dropped_place == dropped

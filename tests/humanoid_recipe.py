@@ -1,0 +1,37 @@
+"""The smallest recipe of a humanoid that uses the target, a grounding and every stage."""
+
+RECIPE = """
+task = "humanoid-walker2d"
+methods = ["direct_transfer", "nas", "astra"]
+seeds = [0, 1]
+
+[collect]
+episodes = 8
+max_steps = 40
+start = "task"
+hold_s = [0.03, 0.2]
+
+[ground]
+updates = 10
+batch_windows = 4
+window = 20
+latent_size = 8
+held_out_share = 0.25
+
+[train]
+num_envs = 8
+rollout_steps = 16
+total_steps = 512
+hidden_sizes = [8]
+memory_size = 8
+data_start_share = 0.5
+
+[align]
+updates = 10
+batch_windows = 4
+window = 20
+held_out_share = 0.25
+
+[evaluate]
+episodes = 3
+"""

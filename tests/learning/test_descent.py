@@ -1,0 +1,76 @@
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.errors import BadInputError
+from astra_data.learning.descent import Descent, DescentConfig
+
+CONFIG = DescentConfig(updates=40, learning_rate=0.05, gradient_norm=0.5)
+
+
+def model() -> nn.Linear:
+    torch.manual_seed(0)
+    return nn.Linear(3, 2)
+
+
+def loss_of(one: nn.Module, update: int) -> Tensor:
+    torch.manual_seed(100 + update)
+    seen = torch.randn(16, 3)
+    return torch.as_tensor((one(seen) - 4.0 * seen[:, :2]).square().mean())
+
+
+def fit(one: nn.Linear, descent: Descent, until: int = CONFIG.updates) -> nn.Linear:
+    while descent.done < until:
+        descent.update(loss_of(one, descent.done))
+    return one
+
+
+def test_it_is_adam_down_a_half_cosine_with_clipped_gradients() -> None:
+    ours, theirs = model(), model()
+    fit(ours, Descent(ours, CONFIG))
+    optimizer = torch.optim.Adam(theirs.parameters(), lr=0.05)
+    for update in range(40):
+        for group in optimizer.param_groups:
+            group["lr"] = 0.05 * (1 + math.cos(math.pi * update / 40)) / 2
+        gradients = torch.autograd.grad(loss_of(theirs, update), list(theirs.parameters()))
+        norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        for parameter, gradient in zip(theirs.parameters(), gradients, strict=True):
+            parameter.grad = gradient * 0.5 / norm.clamp_min(0.5)
+        optimizer.step()
+    torch.testing.assert_close(ours.weight, theirs.weight, rtol=1e-4, atol=1e-5)
+
+
+def test_from_a_checkpoint_it_goes_on_to_the_bit(tmp_path: Path) -> None:
+    whole, begun, resumed = model(), model(), model()
+    fit(whole, Descent(whole, CONFIG))
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    first = Descent(begun, CONFIG, checkpoint=checkpoint)
+    fit(begun, first, until=15)
+    first.keep(error=0.25, nothing=None)
+    second = Descent(resumed, CONFIG, checkpoint=checkpoint)
+    assert (second.done, second.share, second.is_over) == (15, 15 / 40, False)
+    assert second.points == [{"step": 15, "error": 0.25, "nothing": None}]
+    assert second.stopwatch.seconds > 0
+    fit(resumed, second)
+    assert second.is_over
+    assert torch.equal(resumed.weight, whole.weight)
+
+
+def test_the_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    Descent(model(), CONFIG, checkpoint=checkpoint).keep()
+    with pytest.raises(BadInputError, match=f"remove {tmp_path}"):
+        Descent(nn.Linear(5, 2), CONFIG, checkpoint=checkpoint)
+
+
+def test_parameters_that_rest_are_left_alone() -> None:
+    one = model()
+    one.bias.requires_grad_(False)
+    before = one.bias.clone()
+    descent = Descent(one, CONFIG, weight_decay=0.1)
+    fit(one, descent)
+    assert descent.parameters == [one.weight]
+    assert torch.equal(one.bias, before)

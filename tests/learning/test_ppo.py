@@ -1,0 +1,122 @@
+import math
+from statistics import fmean
+from typing import Any
+
+import pytest
+import torch
+from toy_worlds import ConstantReward, GoToZero, Recall
+
+from astra_data.core.checkpoint import flatten, unflatten
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.ppo import Ppo, PpoConfig
+from astra_data.worlds.batched import BatchedEnv
+
+
+def ppo(
+    env: BatchedEnv,
+    iterations: int,
+    *,
+    horizon: int,
+    memory: int = 0,
+    **settings: Any,  # noqa: ANN401
+) -> Ppo:
+    config = PpoConfig(
+        total_steps=iterations * env.num_envs * 16,
+        **{"rollout_steps": 16, "learning_rate": 3e-3, "reward_scale": 1.0, **settings},
+    )
+    torch.manual_seed(0)
+    shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,))
+    return Ppo(env, ActorCritic(shape), config, horizon=horizon, seed=1)
+
+
+def train(learner: Ppo) -> list[dict[str, float]]:
+    metrics = []
+    while not learner.done:
+        metrics.append(learner.iterate())
+    return metrics
+
+
+def distance_after(policy: ActorCritic, steps: int) -> float:
+    """Return how far from 0 the policy's mean action leaves points that start at ±1."""
+    place = torch.tensor([[-1.0], [1.0]])
+    with torch.no_grad():
+        for _ in range(steps):
+            place = (place + 0.2 * policy.policy(place)[0]).clamp(-1.0, 1.0)
+    return float(place.abs().max())
+
+
+def test_learns_to_go_to_a_target() -> None:
+    learner = ppo(GoToZero(32), 40, horizon=20)
+    assert distance_after(learner.policy, 10) > 0.8
+    train(learner)
+    assert distance_after(learner.policy, 10) < 0.15
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
+    whole = ppo(GoToZero(8), 6, horizon=7, memory=memory)
+    train(whole)
+    world, other_world = GoToZero(8), GoToZero(8)
+    begun = ppo(world, 6, horizon=7, memory=memory)
+    for _ in range(3):
+        begun.iterate()
+    saved = unflatten(flatten({"ppo": begun.state_dict(), "world": world.state_dict()}))
+    saved = {name: _cloned(state) for name, state in saved.items()}
+    begun.iterate()  # goes on elsewhere; must not reach into what was saved
+    resumed = ppo(other_world, 6, horizon=7, memory=memory)
+    resumed.load_state_dict(saved["ppo"], other_world.load_state_dict(saved["world"]))
+    assert resumed.steps == whole.steps / 2
+    train(resumed)
+    for name, value in whole.policy.state_dict().items():
+        assert torch.equal(value, resumed.policy.state_dict()[name]), name
+
+
+def _cloned(state: dict[str, Any]) -> dict[str, Any]:
+    return unflatten({name: tensor.clone() for name, tensor in flatten(state).items()})
+
+
+@pytest.mark.parametrize(("terminates_after", "expected"), [(float("inf"), 10.0), (10.0, 4.1)])
+def test_running_out_of_time_bootstraps_and_ending_does_not(terminates_after: float, expected: float) -> None:
+    """One unit each step is worth 1 / (1 - 0.9) = 10, or the mean over an ending episode of 10 steps."""
+    horizon = 10 if terminates_after > 10 else 1000
+    env = ConstantReward(16, terminates_after)
+    learner = ppo(env, 60, horizon=horizon, discount=0.9, learning_rate=0.01, gradient_norm=10.0)
+    train(learner)
+    with torch.no_grad():
+        value = float(learner.policy.value(torch.ones(1, 1)))
+    assert value == pytest.approx(expected, rel=0.12)
+
+
+def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
+    with_memory = train(ppo(Recall(64), 60, horizon=100, memory=8, learning_rate=5e-3))
+    without = train(ppo(Recall(64), 60, horizon=100, learning_rate=5e-3))
+    # An episode of three steps is worth at most 1.
+    assert 3 * fmean(point["reward"] for point in with_memory[-5:]) > 0.7
+    assert 3 * fmean(point["reward"] for point in without[-5:]) < 0.2
+
+
+def test_metrics_count_finished_episodes() -> None:
+    metrics = ppo(ConstantReward(4, 8.0), 1, horizon=10**6).iterate()
+    assert metrics["episodes"] == 4 * 16 / 8
+    assert (metrics["success"], metrics["episode_steps"]) == (1.0, 8.0)
+    assert metrics["reward"] == pytest.approx(1.0)
+
+
+def test_who_is_restarted_early_at_first_lasted_as_long_as_it_did() -> None:
+    learner = ppo(ConstantReward(64, math.inf), 2, horizon=8)
+    first, second = learner.iterate(), learner.iterate()
+    # Of ages from 0 to 7, all end once by the eighth step, and then every eight.
+    assert first["episodes"] == pytest.approx(128, abs=32)
+    assert second["episodes"] == 128
+    assert 4 < first["episode_steps"] < 8 == second["episode_steps"]
+
+
+def test_without_finished_episodes_success_is_unknown() -> None:
+    metrics = ppo(ConstantReward(4, math.inf), 1, horizon=10**6).iterate()
+    assert metrics["episodes"] == 0
+    assert math.isnan(metrics["success"]) and math.isnan(metrics["episode_steps"])
+    assert metrics["reward"] == pytest.approx(1.0)
+
+
+def test_fewer_environments_than_minibatches_are_enough() -> None:
+    train(ppo(GoToZero(2), 2, horizon=5, minibatches=4))

@@ -1,0 +1,105 @@
+import pytest
+import torch
+from pydantic import ValidationError
+from toy_worlds import Slope
+
+from astra_data.core.checkpoint import flatten, unflatten
+from astra_data.learning.networks.adaptation import AdaptiveShape, Student, Teacher
+from astra_data.learning.rma import Adaptation, RmaConfig
+
+HISTORY = 40
+
+
+class Shown(Teacher):
+    """A teacher whose extrinsics are the parameter itself."""
+
+    def extrinsics(self, told: torch.Tensor) -> torch.Tensor:
+        return told[..., 1:]
+
+
+def begin(num_envs: int, iterations: int) -> Adaptation:
+    torch.manual_seed(0)
+    shape = AdaptiveShape(1, 1, hidden_sizes=(8,), extrinsics_size=1, history_length=HISTORY)
+    config = RmaConfig(
+        extrinsics_size=1,
+        history_length=HISTORY,
+        adaptation_steps=iterations * 16 * num_envs,
+        adaptation_learning_rate=3e-3,
+    )
+    world = Slope(num_envs)
+    return Adaptation(world, Shown(shape, 1), config, rollout_steps=16, horizon=100, seed=1)
+
+
+@torch.no_grad()
+def correlation(student: Student, *, shuffled: bool) -> float:
+    """Return that of estimated and true parameters after a full history; `shuffled` is that of other rows."""
+    torch.manual_seed(5)
+    world, count = Slope(256), 256
+    told, previous, hidden = world.reset(), torch.zeros(count, 1), student.initial_hidden(count)
+    for _ in range(HISTORY):
+        features, hidden = student.remember(told[:, :1], previous, hidden)
+        previous, _ = student.policy(features)
+        told = world.step(previous).observation
+    estimate = student.adaptation(hidden.roll(1, dims=0) if shuffled else hidden)
+    return float(torch.corrcoef(torch.stack([estimate[:, 0], told[:, 1]]))[0, 1])
+
+
+def test_a_student_recovers_what_its_history_shows() -> None:
+    learner = begin(64, 15)
+    untrained = abs(correlation(learner.student, shuffled=False))
+    points = []
+    while not learner.done:
+        points.append(learner.iterate())
+    assert correlation(learner.student, shuffled=False) > 0.9 > untrained
+    assert abs(correlation(learner.student, shuffled=True)) < 0.3
+    assert points[0]["r2_extrinsics"] < 0.5 < points[-1]["r2_extrinsics"] <= 1.0
+    assert points[-1].keys() == {"success", "episode_steps", "episodes", "reward", "r2_extrinsics"}
+
+
+def test_the_student_acts_and_only_its_estimate_learns() -> None:
+    """Actions are those of the deployed student, computed here from scratch."""
+    learner = begin(4, 2)
+    acted: list[torch.Tensor] = []
+    world = learner.env
+    step = world.step
+    world.step = lambda action: (acted.append(action.clone()), step(action))[1]  # type: ignore[method-assign, func-returns-value]
+    before = {name: value.clone() for name, value in learner.student.state_dict().items()}
+    first_told, first_hidden = learner.acting.observation.clone(), learner.acting.hidden.clone()
+    with torch.no_grad():
+        features, _ = learner.student.remember(first_told[:, :1], torch.zeros(4, 1), first_hidden)
+        expected, _ = learner.student.policy(features)
+    learner.iterate()
+    assert torch.equal(acted[0], expected)
+    changed = {
+        name.split(".")[0]
+        for name, value in learner.student.state_dict().items()
+        if not torch.equal(value, before[name])
+    }
+    assert changed == {"adaptation"}
+
+
+def test_resuming_gives_the_same_parameters_to_the_bit() -> None:
+    whole, begun = begin(4, 4), begin(4, 4)
+    while not whole.done:
+        whole.iterate()
+    begun.iterate()
+    begun.iterate()
+    assert isinstance(begun.env, Slope)
+    saved = unflatten(flatten({"learner": begun.state_dict(), "world": begun.env.state_dict()}))
+    saved = {
+        name: unflatten({k: v.clone() for k, v in flatten(value).items()}) for name, value in saved.items()
+    }
+    begun.iterate()  # goes on elsewhere; must not reach into what was saved
+    resumed = begin(4, 4)
+    assert isinstance(resumed.env, Slope)
+    resumed.load_state_dict(saved["learner"], resumed.env.load_state_dict(saved["world"]))
+    while not resumed.done:
+        resumed.iterate()
+    assert resumed.steps == whole.steps
+    for one, other in zip(resumed.student.parameters(), whole.student.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_too_short_a_history_is_refused() -> None:
+    with pytest.raises(ValidationError, match="greater than or equal to 40"):
+        RmaConfig(history_length=39)

@@ -1,0 +1,246 @@
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from toy_worlds import ConstantReward, GoToZero, Recall
+
+from astra_data.core.checkpoint import flatten, unflatten
+from astra_data.core.errors import BadInputError
+from astra_data.learning.networks.policy import PolicyShape, features_of
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.learning.recorded import Recorded
+from astra_data.learning.sac import Sac, SacConfig
+from astra_data.worlds.batched import BatchedEnv
+
+
+def sac(
+    env: BatchedEnv,
+    steps: int,
+    *,
+    horizon: int,
+    memory: int = 0,
+    recorded: Recorded | None = None,
+    **settings: Any,  # noqa: ANN401
+) -> Sac:
+    usual = {"rollout_steps": 10, "updates_per_step": 3, "batch_size": 64, "discount": 0.9}
+    config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
+    torch.manual_seed(0)
+    shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32, 32))
+    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1, recorded=recorded)
+
+
+def train(learner: Sac) -> list[dict[str, float]]:
+    metrics = []
+    while not learner.done:
+        metrics.append(learner.iterate())
+    return metrics
+
+
+def distance_after(policy: SoftActor, steps: int) -> float:
+    """Return how far from 0 the policy's likeliest action leaves points that start at ±1."""
+    place, hidden = torch.tensor([[-1.0], [1.0]]), policy.initial_hidden(2)
+    action = torch.zeros(2, 1)
+    with torch.no_grad():
+        for _ in range(steps):
+            features, hidden = policy.remember(place, action, hidden)
+            action = policy.act(features)
+            place = (place + 0.2 * action).clamp(-1.0, 1.0)
+    return float(place.abs().max())
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_learns_to_go_to_a_target(memory: int) -> None:
+    learner = sac(GoToZero(16), 150, horizon=20, memory=memory, window=8, burn_in=2, batch_size=128)
+    assert distance_after(learner.policy, 10) > 0.5
+    metrics = train(learner)
+    assert distance_after(learner.policy, 10) < 0.15
+    assert learner.steps == 150 * 16
+    assert metrics[-1]["reward"] > metrics[0]["reward"]
+
+
+def test_the_second_half_learns_ever_more_slowly() -> None:
+    one, other = (sac(GoToZero(8), steps, horizon=7) for steps in (40, 80))
+    for alike in (True, True, True, False):
+        one.iterate()
+        other.iterate()
+        pairs = zip(one.policy.parameters(), other.policy.parameters(), strict=True)
+        assert all(torch.equal(*pair) for pair in pairs) == alike
+    before = copy.deepcopy(other.policy)
+    steps = []
+    while not other.done:
+        other.iterate()
+        pairs = zip(before.parameters(), other.policy.parameters(), strict=True)
+        steps.append(max(float((now - then).detach().abs().max()) for now, then in pairs))
+        before = copy.deepcopy(other.policy)
+    assert steps[-1] < 0.5 * steps[0]
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
+    # The replay has wrapped around by then.
+    settings: dict[str, Any] = {
+        "horizon": 7,
+        "memory": memory,
+        "window": 6,
+        "burn_in": 2,
+        "buffer_size": 8 * 25,
+    }
+    whole = sac(GoToZero(8), 60, **settings)
+    train(whole)
+    world, other_world = GoToZero(8), GoToZero(8)
+    begun = sac(world, 60, **settings)
+    for _ in range(3):
+        begun.iterate()
+    saved = _cloned({"sac": begun.state_dict(), "world": world.state_dict()})
+    resumed = sac(other_world, 60, **settings)
+    resumed.load_state_dict(saved["sac"], other_world.load_state_dict(saved["world"]))
+    assert resumed.steps == whole.steps / 2
+    train(resumed)
+    for name, value in whole.policy.state_dict().items():
+        assert torch.equal(value, resumed.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_recorded_actions_are_imitated_where_rewards_leave_the_choice(memory: int) -> None:
+    action = torch.full((4, 12, 1), 0.6)
+    action[:, 9:] = -1.0  # after the end
+    previous = torch.cat([torch.zeros(4, 1, 1), action[:, :-1]], dim=1)
+    recorded = Recorded(torch.ones(4, 12, 1), previous, action, torch.full((4,), 9))
+    settings: dict[str, Any] = {
+        "horizon": 9,
+        "memory": memory,
+        "window": 6,
+        "burn_in": 2,
+        "imitation_weight": 1.0,
+    }
+    learner = sac(ConstantReward(16, math.inf), 200, recorded=recorded, **settings)
+    train(learner)
+    with torch.no_grad():
+        hidden = learner.policy.initial_hidden(1)
+        features, _ = learner.policy.remember(torch.ones(1, 1), torch.zeros(1, 1), hidden)
+        assert float(learner.policy.act(features)) == pytest.approx(0.6, abs=0.1)
+
+
+def _cloned(state: dict[str, Any]) -> dict[str, Any]:
+    return unflatten({name: tensor.clone() for name, tensor in flatten(state).items()})
+
+
+@pytest.mark.parametrize(
+    ("terminates_after", "memory", "expected"), [(math.inf, 0, 10.0), (math.inf, 8, 10.0), (10.0, 0, 5.26)]
+)
+def test_running_out_of_time_bootstraps_and_ending_does_not(
+    terminates_after: float, memory: int, expected: float
+) -> None:
+    """One unit each step is worth 1 / (1 - 0.9) = 10; where a tenth of like steps are the last, 1 / 0.19."""
+    horizon = 10 if terminates_after > 10 else 1000
+    env = ConstantReward(16, terminates_after)
+    learner = sac(
+        *(env, 400),
+        horizon=horizon,
+        memory=memory,
+        window=4,
+        burn_in=1,
+        target_rate=0.05,
+        initial_temperature=1e-6,
+        learning_rate=3e-3,
+    )
+    train(learner)
+    loss = learner._loss
+    begun = (torch.ones(1, 1, 1), torch.zeros(1, 1, 1), learner.policy.initial_hidden(1), torch.ones(1, 1))
+    judging = features_of(learner._memory, *begun)[:, 0].detach()
+    state = TensorDict({"judging": judging, "action": torch.zeros(1, 1)}, batch_size=[1])
+    with torch.no_grad(), loss.qvalue_network_params[0].to_module(loss.qvalue_network):
+        value = float(loss.qvalue_network(state)["state_action_value"])
+    assert value == pytest.approx(expected, rel=0.12)
+
+
+def test_a_window_begins_with_the_memory_that_the_policy_had_when_it_acted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learner = sac(GoToZero(8), 40, horizon=9, memory=4, window=2, burn_in=0)
+    policy = learner.policy
+    acting, learning = policy.remember, policy.remember_sequence
+    acted: dict[tuple[float, ...], list[float]] = {}
+    begun: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def remember(
+        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        for moment, memory in zip(torch.cat([observation, previous], dim=-1), hidden, strict=True):
+            acted[tuple(moment.tolist())] = memory.tolist()
+        return acting(observation, previous, hidden)
+
+    def remember_sequence(
+        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor, start: torch.Tensor
+    ) -> torch.Tensor:
+        begun.append((torch.cat([observation, previous], dim=-1)[:, 0], hidden))
+        return learning(observation, previous, hidden, start)
+
+    monkeypatch.setattr(policy, "remember", remember)
+    monkeypatch.setattr(policy, "remember_sequence", remember_sequence)
+    train(learner)
+    moments, memories = (torch.cat(column) for column in zip(*begun, strict=True))
+    assert memories.tolist() == [acted[tuple(moment.tolist())] for moment in moments]
+    assert float((memories.abs().amax(-1) > 0).float().mean()) > 0.5
+
+
+def test_the_memory_that_values_come_from_follows_slowly() -> None:
+    learner = sac(
+        GoToZero(8),
+        20,
+        horizon=9,
+        memory=4,
+        window=2,
+        burn_in=0,
+        rollout_steps=1,
+        updates_per_step=1,
+        target_rate=0.1,
+    )
+    expected = [values.clone() for values in _memory_of(learner, "late")]
+    while not learner.done:
+        learner.iterate()
+        now = _memory_of(learner, "now")
+        expected = [0.9 * before + 0.1 * after for before, after in zip(expected, now, strict=True)]
+        for late, values in zip(_memory_of(learner, "late"), expected, strict=True):
+            torch.testing.assert_close(late, values, atol=1e-6, rtol=0)
+    assert any((a - b).abs().max() > 1e-4 for a, b in zip(now, expected, strict=True))
+
+
+def _memory_of(learner: Sac, which: str) -> list[torch.Tensor]:
+    memory = learner._memory if which == "now" else learner._late_memory
+    assert memory is not None
+    return [values.detach().clone() for values in memory.parameters()]
+
+
+def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
+    settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 192}
+    with_memory = train(sac(Recall(32), 300, memory=8, **settings))
+    without = train(sac(Recall(32), 300, **settings))
+    # An episode of three steps is worth at most 1.
+    assert 3 * with_memory[-1]["reward"] > 0.7
+    assert 3 * without[-1]["reward"] < 0.3
+
+
+def test_metrics_count_finished_episodes() -> None:
+    metrics = sac(ConstantReward(4, 8.0), 16, rollout_steps=16, horizon=10**6).iterate()
+    assert metrics["episodes"] == 4 * 16 / 8
+    assert metrics["episode_steps"] == 8
+    assert metrics["success"] == 1.0
+    assert metrics["reward"] == pytest.approx(1.0)
+
+
+def test_a_window_has_to_hold_steps_to_learn_from() -> None:
+    with pytest.raises(ValueError, match=r"burn_in: expected less than the window of 8, got 8"):
+        SacConfig(window=8, burn_in=8)
+    with pytest.raises(ValueError, match=r"batch_size: expected a window of 32 or more, got 16"):
+        SacConfig(batch_size=16)
+
+
+def test_the_buffer_has_to_hold_a_window() -> None:
+    sizes: dict[str, Any] = {"horizon": 9, "memory": 8, "window": 6, "burn_in": 0}
+    with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
+        sac(GoToZero(8), 10, buffer_size=55, **sizes)
+    sac(GoToZero(8), 10, buffer_size=56, **sizes)

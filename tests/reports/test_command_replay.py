@@ -1,0 +1,21 @@
+import pytest
+
+from astra_data.reports.command_replay import replay_commands
+from astra_data.worlds.registry import TASKS
+
+
+def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -> None:
+    task = TASKS["nao-navigation-surrogate"]
+    replay = replay_commands(task)
+    steps = len(replay.time_s)
+    assert replay.time_s[0] == pytest.approx(task.timestep_s)
+    assert replay.command.shape == (steps, 2)
+    assert replay.simulated.shape == (steps, 4)
+    assert replay.target.shape == (60, steps, 4)
+    start = task.maze.cell_centre(*task.maze.start)
+    # 0.8 of 0.25 m/s for ten control steps of 0.192 s, and back again in the end.
+    way = replay.simulated[:, :2] - replay.simulated[0, :2]
+    assert way[9] == pytest.approx([0.2 * 9 * 0.192, 0.0], abs=1e-5)
+    assert way[-1] == pytest.approx([-0.2 * 0.192, 0.0], abs=1e-5)
+    assert replay.simulated[0, :2] == pytest.approx(start, abs=0.2)
+    assert replay.target[:, 0, :2].mean(axis=0) == pytest.approx(start, abs=0.05)

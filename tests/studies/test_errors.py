@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+import torch
+from toy_walks import FPS, piece
+
+from astra_data.studies.errors import AXES, Trial, summary
+from astra_data.studies.predictors import Gains
+from astra_data.studies.walks import StepsConfig, Walks
+
+CONFIG = StepsConfig(rows=10, history=4)
+
+
+def test_errors_are_taken_in_the_bodys_and_the_fields_frame() -> None:
+    walk = piece(400, 0)
+    walk.broken[200] = True
+    trial = Trial.of(Walks.of_pieces([walk], FPS, CONFIG), 4, (1, 3))
+    errors = trial.squared_errors(Gains()).double()
+    assert errors.shape[1:] == (2, 5)
+    torch.testing.assert_close(errors[..., :2].sum(-1), errors[..., 3:].sum(-1), equal_nan=True)
+    # A start one or two steps before the jump is judged after one step only.
+    assert not errors[:, 0].isnan().any()
+    assert errors[:, 1].isnan().all(-1).sum() >= 20
+
+
+def test_summaries_weigh_starts_and_compare_with_the_raw_simulator() -> None:
+    piece_of = np.array([0, 0, 0, 1])
+    ones = np.ones((1, 4, 1, len(AXES)))
+    uneven = ones.copy()
+    uneven[0, 3] = np.nan
+    models = summary(
+        {"raw": 4 * ones, "ridge": ones, "astra": np.concatenate([ones, 0 * ones])}, piece_of, [1.0]
+    )
+    cell = models["astra"]["1"]["left_m"]
+    assert cell["rmse"] == pytest.approx(0.5**0.5, abs=1e-5)
+    assert cell["low"] == cell["high"] == pytest.approx(0.5**0.5, abs=1e-5)
+    assert cell["less_than_raw"] == pytest.approx(1 - 0.5**0.5 / 2, abs=1e-5)
+    assert models["ridge"]["1"]["mean"]["less_than_raw"] == pytest.approx(0.5)
+    assert models["astra"]["1"]["mean"]["less_than_ridge"] == pytest.approx(1 - 0.5**0.5, abs=1e-5)
+    alone = summary({"raw": uneven}, piece_of, [1.0])["raw"]["1"]["turn_rad"]
+    assert alone["rmse"] == pytest.approx(1.0)
+
+
+def test_intervals_resample_pieces() -> None:
+    piece_of = np.repeat([0, 1], 100)
+    squared = np.where(piece_of == 0, 1.0, 9.0)[None, :, None, None] * np.ones((1, 200, 1, len(AXES)))
+    cell = summary({"raw": squared}, piece_of, [1.0])["raw"]["1"]["forward_m"]
+    assert (cell["rmse"], cell["low"], cell["high"]) == pytest.approx((5**0.5, 1.0, 3.0), abs=1e-5)

@@ -1,0 +1,62 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_walks import actions, log, states, write_archive
+
+from astra_data.core.errors import BadInputError
+from astra_data.studies.recordings import WalkingConfig, broken_rows, read_recordings
+
+MAPPING = Path(__file__).parents[2] / "recipes/imports/nao_guda.toml"
+CONFIG = WalkingConfig()
+
+
+def test_archives_and_loose_logs_are_recordings(tmp_path: Path) -> None:
+    folder, home = tmp_path / "logs", tmp_path / "home"
+    folder.mkdir()
+    write_archive(folder / "b.tar.gz", 400, seed=1)
+    write_archive(folder / "a.tar.gz", 300, seed=0)
+    (folder / "LICENSE").write_text("text")
+    found = read_recordings(folder, MAPPING, home, CONFIG)
+    assert [(recording.name, recording.rows) for recording in found] == [("a", 299), ("b", 399)]
+    (path,) = (path for path in home.iterdir() if path.name.startswith("a-"))
+    assert read_recordings(path, MAPPING, home, CONFIG)[0].content_hash == found[0].content_hash
+    (tmp_path / "loose").mkdir()
+    (tmp_path / "loose/run_2.log").write_text(json.dumps(log(200, 3)))
+    (tmp_path / "loose/run_10.log").write_text(json.dumps(log(100, 3)))
+    (one,) = read_recordings(tmp_path / "loose", MAPPING, home, CONFIG)
+    assert one.name == "loose"
+    np.testing.assert_allclose(one.pieces[0].state[:200], states(actions(200, 3))[:-1], atol=1e-5)
+
+
+def test_long_episodes_become_pieces_that_share_a_state(tmp_path: Path) -> None:
+    archive = write_archive(tmp_path / "a.tar.gz", 500, seed=0)
+    config = WalkingConfig(piece_s=3.0)
+    pieces = read_recordings(archive, MAPPING, tmp_path / "home", config)[0].pieces
+    assert [len(piece) for piece in pieces] == [180, 180, 139]
+    np.testing.assert_array_equal(pieces[0].state[-1], pieces[1].state[0])
+
+
+def test_jumps_and_carried_stretches_are_no_walking() -> None:
+    state = np.zeros((301, 5))
+    state[:, 0] = np.arange(301) * 0.004  # 0.24 m/s
+    state[100:, 1] += 0.08
+    state[150:, 2] += 2 * np.pi  # the same heading
+    state[160:, 2] += 0.2
+    broken = broken_rows(state, 60, CONFIG)
+    assert np.flatnonzero(broken).tolist() == [99, 159]
+    state[200:231, 0] += np.arange(31) * 0.01  # carried, 0.84 m/s
+    state[231:, 0] += 0.3
+    assert broken_rows(state, 60, CONFIG)[200:230].all()
+
+
+def test_nothing_usable_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="does not exist: expected a dataset, or logs"):
+        read_recordings(tmp_path / "none", MAPPING, tmp_path, CONFIG)
+    (tmp_path / "notes.txt").write_text("no log")
+    with pytest.raises(BadInputError, match=r"found none: it has no datasets, no archives"):
+        read_recordings(tmp_path, MAPPING, tmp_path / "home", CONFIG)
+    (tmp_path / "other.json").write_text('{"speed": [1, 2]}')
+    with pytest.raises(BadInputError, match="no field 'observations'"):
+        read_recordings(tmp_path, MAPPING, tmp_path / "home", CONFIG)

@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from astra_data.training.behaviors import RandomCommands, WallWatch
+from astra_data.worlds.registry import task_named
+
+TASK = task_named("nao-navigation")
+HOLD = (3, 16)
+STARTS = torch.tensor([[-1.5, 2.0], [0.0, 2.0], [1.5, 1.0], [0.0, 0.0]])
+"""Middles of corridors of the maze, which are 1 m wide."""
+
+
+def believed(position: Tensor) -> Tensor:
+    state = torch.zeros(len(position), 29)
+    state[:, :2] = position
+    return state
+
+
+def nearest(behavior: RandomCommands) -> float:
+    """Return the least clearance in m of robots that do exactly as they are told for three minutes."""
+    simulator = TASK.simulator(len(STARTS))
+    simulator.reset_to(torch.cat([STARTS, torch.zeros_like(STARTS)], dim=-1))
+    behavior.start(len(STARTS), seed=0)
+    least = np.inf
+    for _ in range(1000):
+        action = behavior.act(believed(simulator.state[:, :2]), torch.zeros(len(STARTS), 2))
+        position = simulator.step(action)[:, :2].double().numpy()
+        least = min(least, TASK.maze.clearance(position).min())
+    return least
+
+
+def test_a_watch_foresees_the_clearance_of_a_second() -> None:
+    towards, along = [0.0, 1.0], [1.0, 0.0]
+    clearance = WallWatch(TASK, 0.2).clearance(believed(STARTS[1:2]), np.array([[towards, along]]))
+    # 0.25 m/s for five steps of 0.192 s, on a grid of 0.05 m.
+    assert clearance.shape == (1, 2)
+    assert clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
+
+
+def test_commands_that_are_watched_keep_clear_of_walls() -> None:
+    assert nearest(RandomCommands(2, HOLD)) < 0.2
+    assert nearest(RandomCommands(2, HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6
+
+
+def test_a_robot_that_is_too_near_is_led_away() -> None:
+    behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.3))
+    behavior.start(64, seed=0)
+    near = torch.tensor([[0.0, 2.35]]).expand(64, 2)
+    command = behavior.act(believed(near), torch.zeros(64, 2))
+    assert float(command[:, 1].max()) < 0.0
+
+
+def test_commands_are_held_and_repeat_with_the_seed() -> None:
+    first, second = RandomCommands(2, (4, 4)), RandomCommands(2, (4, 4))
+    first.start(5, seed=1)
+    second.start(5, seed=1)
+    state = believed(torch.zeros(5, 2))
+    commands = torch.stack([first.act(state, state[:, :2]) for _ in range(8)])
+    assert torch.equal(commands, torch.stack([second.act(state, state[:, :2]) for _ in range(8)]))
+    assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4])
+    assert not torch.equal(commands[3], commands[4])
+
+
+def test_each_axis_of_a_command_is_drawn_by_itself() -> None:
+    behavior = RandomCommands(4, (1, 1))
+    behavior.start(500, seed=0)
+    command = behavior.act(torch.zeros(500, 47), torch.zeros(500, 0))
+    assert command.shape == (500, 4)
+    correlation = torch.corrcoef(command.T) - torch.eye(4)
+    assert float(correlation.abs().max()) < 0.2
+    assert 0.5 < float(command.std()) < 0.65

@@ -1,0 +1,64 @@
+import pytest
+import torch
+from torch import Tensor
+
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.alignment import TargetEncoder
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.simulator_env import policy_observation
+from astra_data.worlds.registry import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+STATE, GOAL = torch.randn(3, 6, 29), torch.randn(3, 2)
+GOALS = GOAL[:, None].expand(3, 6, 2)
+
+
+def run(deployed: DeployedPolicy, *, in_simulator: bool = False) -> Tensor:
+    """Return the actions (B, T, A) for the states above, or for φ of them."""
+    deployed.start(3)
+    act = deployed.act_in_simulator if in_simulator else deployed.act
+    states = TASK.abstraction(STATE) if in_simulator else STATE
+    return torch.stack([act(states[:, step], GOAL) for step in range(6)], dim=1)
+
+
+def previous(actions: Tensor) -> Tensor:
+    return torch.cat([torch.zeros(3, 1, 2), actions[:, :-1]], dim=1)
+
+
+@pytest.mark.parametrize(
+    ("aligned", "in_simulator"), [(False, False), (True, False), (False, True), (True, True)]
+)
+@torch.no_grad()
+def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: bool) -> None:
+    """Only target states are for ψ^t; ψ^s encodes abstract ones, wherever they come from."""
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    target = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
+    policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2))
+    for layer in policy.actor.parameters():
+        layer.mul_(10)  # actions of some size
+    deployed = DeployedPolicy(TASK, policy, model, target if aligned else None)
+    actions = run(deployed, in_simulator=in_simulator)
+    abstract = STATE[..., [0, 1, 15, 16]]
+    if aligned and not in_simulator:
+        latent, _ = target.encoder(target.encoder_input(STATE, GOALS, previous(actions)))
+    else:
+        latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
+    observation = policy_observation(TASK.objective, abstract, GOALS, latent)
+    torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
+    assert actions.abs().max() > 0.1
+
+
+@torch.no_grad()
+def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> None:
+    torch.manual_seed(0)
+    policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=8))
+    deployed = DeployedPolicy(TASK, policy)
+    actions = run(deployed)
+    observation = policy_observation(TASK.objective, STATE[..., [0, 1, 15, 16]], GOALS, None)
+    features = policy.remember_sequence(
+        observation, previous(actions), policy.initial_hidden(3), torch.zeros(3, 6)
+    )
+    torch.testing.assert_close(actions, policy.policy(features)[0], atol=1e-5, rtol=0)
+    assert torch.equal(run(deployed), actions)

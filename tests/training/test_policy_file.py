@@ -1,0 +1,80 @@
+from pathlib import Path
+
+import pytest
+import torch
+from toy_episodes import no_episodes
+
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.grounding_file import Grounding, save_grounding
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.adaptation import AdaptiveShape, Student
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.training.build_env import WorldConfig
+from astra_data.training.policy_file import PolicyFile, Simulation
+from astra_data.worlds.variation import PlanarVariation
+
+
+def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
+    policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
+    thinness, scatter = torch.rand(6, 5), torch.randn(4, 4)
+    world = WorldConfig(reward="blend", topple=True, residual_noise=0.5)
+    variation = PlanarVariation(friction=(0.8, 1.2))
+    simulation = Simulation(thinness, scatter, world, variation)
+    saved = PolicyFile(policy, simulation, "toy@data-1.0.0", "abc")
+    saved.save(tmp_path / "policy.safetensors")
+    loaded = PolicyFile.load(tmp_path / "policy.safetensors")
+    assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
+    assert loaded.simulation is not None
+    assert (loaded.simulation.world, loaded.simulation.variation) == (world, variation)
+    assert loaded.simulation.thinness is not None
+    assert torch.equal(loaded.simulation.thinness, thinness)
+    assert torch.equal(loaded.simulation.scatter, scatter)
+    assert loaded.policy.shape == policy.shape
+    assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
+    step = torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 8)
+    for one, other in zip(loaded.policy.remember(*step), policy.remember(*step), strict=True):
+        assert torch.equal(one, other)
+    features = torch.randn(4, 11)
+    assert torch.equal(loaded.policy.policy(features)[0], policy.policy(features)[0])
+    assert isinstance(loaded.policy, ActorCritic)
+    assert torch.equal(loaded.policy.value(features), policy.value(features))
+
+
+def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
+    student = Student(AdaptiveShape(3, 2, hidden_sizes=(16, 8), extrinsics_size=4, history_length=44))
+    PolicyFile(student, None, "toy@data-1.0.0", "abc").save(tmp_path / "policy.safetensors")
+    loaded = PolicyFile.load(tmp_path / "policy.safetensors").policy
+    assert isinstance(loaded, Student)
+    assert loaded.shape == student.shape
+    step = torch.randn(4, 3), torch.randn(4, 2), torch.randn_like(student.initial_hidden(4))
+    for one, other in zip(loaded.remember(*step), student.remember(*step), strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("grounding", "kind"),
+    [(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), "history"), (PlanarVariation(), "variation")],
+)
+def test_a_grounding_is_no_policy(grounding: Grounding, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    save_grounding(path, grounding, no_episodes())
+    with pytest.raises(
+        BadInputError,
+        match=r"policy.safetensors: expected a policy \(kind actor_critic or adaptive or soft_actor\), "
+        f"found kind {kind}: run that stage again$",
+    ):
+        PolicyFile.load(path)
+
+
+@pytest.mark.parametrize(
+    ("lacks", "found"),
+    [("kind", "a file without a kind"), ("shape", "no 'shape'"), ("observed", "no 'observed'")],
+)
+def test_a_policy_of_an_older_version_is_told(lacks: str, found: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    PolicyFile(ActorCritic(ActorCriticShape(3, 2, memory_size=8)), None, "toy@data-1.0.0", "abc").save(path)
+    tensors, told = load_tensors(path)
+    save_tensors(path, tensors, {key: value for key, value in told.items() if key != lacks})
+    with pytest.raises(BadInputError, match=f"expected a policy .*found {found}: run that stage again$"):
+        PolicyFile.load(path)

@@ -1,0 +1,254 @@
+import pytest
+import torch
+
+from astra_data.grounding.simulator import GroundedSimulator
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.training.simulator_env import DataStarts, SimulatorWorld, policy_observation
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.point_mass import PointMass
+from astra_data.worlds.plane.varied_point_mass import VariedPointMass
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.variation import PlanarVariation
+
+TASK = Navigation(U_MAZE, horizon=700)
+
+
+def world(num_envs: int = 4, **options: float | torch.Tensor) -> SimulatorWorld:
+    simulator = PointMass(U_MAZE, num_envs, timestep_s=0.05)
+    return SimulatorWorld(TASK, simulator, **options)  # type: ignore[arg-type]
+
+
+def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
+    state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
+    seen = policy_observation(TASK, state, goal, None)
+    assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
+    with_latent = policy_observation(TASK, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
+    assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
+
+
+def test_the_same_torch_seed_gives_the_same_starts() -> None:
+    observations = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        observations.append(world().reset())
+    assert torch.equal(observations[0], observations[1])
+    assert not torch.equal(observations[0], observations[2])
+
+
+def test_resumes_where_it_was() -> None:
+    first, second = world(), world()
+    first.reset()
+    first.step(torch.ones(4, 2))
+    observation = second.load_state_dict(first.state_dict())
+    for _ in range(3):
+        action = 2 * torch.rand(4, 2) - 1
+        a, b = first.step(action), second.step(action)
+        assert torch.equal(a.observation, b.observation)
+        assert torch.equal(a.reward, b.reward)
+    assert observation.shape == (4, 8)
+
+
+@pytest.mark.parametrize("is_varied", [False, True])
+def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
+    task = TASKS["humanoid-walker2d"]
+    simulator, another = (
+        task.varied_simulator(3, task.varied.wide, "cpu") if is_varied else task.simulator(3, "cpu")
+        for _ in range(2)
+    )
+    first, second = (SimulatorWorld(task.objective, one) for one in (simulator, another))
+    first.reset()
+    simulator.reset_to(simulator.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]]))
+    for _ in range(4):
+        first.step(torch.zeros(3, 4))
+    second.load_state_dict(first.state_dict())
+    for _ in range(4):
+        after = []
+        for one in (first, second):
+            torch.manual_seed(0)
+            after.append(one.step(torch.zeros(3, 4)).observation)
+        assert torch.equal(*after)
+
+
+def test_thin_data_costs_what_it_is_said_to() -> None:
+    thinness = torch.zeros(U_MAZE.fine_walls.shape)
+    thinness[:, : thinness.shape[1] // 2] = 0.25  # x < 0
+    plain, costly = world(2), world(2, thinness=thinness)
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [4.0, 4.0, 0.0, 0.0]])
+    goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
+    steps = []
+    for one in (plain, costly):
+        one.load_state_dict({"state": state, "goal": goal})
+        steps.append(one.step(torch.tensor([[0.0, 1.0]]).expand(2, 2)))
+    assert (steps[1].reward - steps[0].reward).tolist() == pytest.approx([-0.25, 0.0])
+
+
+def test_doubt_costs_what_it_is_said_to() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=3))
+    with torch.no_grad():
+        for offset, head in zip((0.0, 0.0, 0.9), model.corrections, strict=True):
+            list(head.parameters())[-1][2:].fill_(offset)
+    # The heads differ in two of four entries, by sqrt(0.27 / 2) over all.
+    disagreement = (0.9**2 / 3 / 2) ** 0.5
+    rewards = []
+    for penalty in (0.0, 0.5):
+        model.usual_disagreement.fill_(disagreement / 3)
+        grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), model)
+        one = SimulatorWorld(TASK, grounded, doubt_penalty=penalty)
+        torch.manual_seed(1)
+        one.reset()
+        rewards.append(one.step(torch.zeros(2, 2)).reward)
+        assert grounded.doubt.tolist() == pytest.approx([2.0, 2.0])
+        model.usual_disagreement.fill_(2 * disagreement)
+        one.step(torch.zeros(2, 2))
+        assert not grounded.doubt.any()  # less than usual
+    assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-1.0, -1.0])
+
+
+@pytest.mark.parametrize(("heads", "steps"), [(1, 0), (1, 1), (3, 0)])
+def test_without_other_heads_or_a_step_there_is_no_doubt(heads: int, steps: int) -> None:
+    shape = GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=heads)
+    grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), GroundingModel(shape))
+    for _ in range(steps):
+        grounded.step(torch.zeros(2, 2))
+    assert grounded.doubt.tolist() == [0.0, 0.0]
+
+
+def test_episodes_may_start_from_recorded_moments() -> None:
+    moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
+    starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)
+    torch.manual_seed(0)
+    one = world(1000, starts=starts, data_start_share=0.3)  # type: ignore[arg-type]
+    one.reset()
+    recorded = (one.simulator.state == moment).all(dim=1)
+    assert float(recorded.float().mean()) == pytest.approx(0.3, abs=0.05)
+    assert bool((one.goal[recorded] == starts.goal).all())
+    # At rest near the task's start otherwise.
+    other = one.simulator.state[~recorded]
+    assert bool((other[:, 2:] == 0).all())
+    assert float((other[:, :2] - torch.tensor([-4.0, 4.0])).abs().max()) <= 0.6 + 1e-5
+
+
+def test_reaching_the_goal_is_success() -> None:
+    one = world(1)
+    one.load_state_dict(
+        {"state": torch.tensor([[-3.54, -4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
+    )
+    step = one.step(torch.tensor([[-1.0, 0.0]]))
+    assert bool(step.success)
+    assert bool(step.terminated)
+    assert float(step.reward) == pytest.approx(10.05, abs=0.01)
+
+
+def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4).clone()
+    goal = torch.tensor([[-4.0, -4.0]]).expand(3, 2)
+    action = torch.tensor([[1.0, 0.0]]).expand(3, 2)
+    rewards = []
+    for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
+        inner = PointMass(U_MAZE, 3, timestep_s=0.05)
+        one = SimulatorWorld(TASK, GroundedSimulator(inner, model), **options)
+        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+        latent = one.simulator.latent  # type: ignore[union-attr]
+        rewards.append(one.step(action).reward)
+    risk = model.topple_risk(latent, action, one.simulator.state).detach()
+    assert (risk > 0).all()
+    torch.testing.assert_close(rewards[1] - rewards[0], -10.0 * risk)
+    torch.testing.assert_close(rewards[2] - rewards[0], -30.0 * risk)
+
+
+def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() -> None:
+    torch.manual_seed(0)
+    task = TASKS["nao-kick"]
+    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, position_octaves=0, ball_index=4))
+    one = SimulatorWorld(task.objective, GroundedSimulator(task.simulator(3), model), reward="predicted")
+    # Balls that roll on in the field, into the goal, and over the side line.
+    balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
+    state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
+    goal = torch.tensor([[1.5, 0.0]]).expand(3, 2)
+    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+    latent = one.simulator.latent  # type: ignore[union-attr]
+    action = torch.zeros(3, 3)
+    step = one.step(action)
+    own = task.objective.reward(state, one.simulator.state, goal, torch.tensor([False, False, True]))
+    predicted = model.predict_reward(latent, action).detach()
+    assert step.terminated.tolist() == [False, True, True]
+    torch.testing.assert_close(step.reward, torch.cat([predicted[:1], own[1:]]))
+    assert float(own[1]) > 9.0
+    assert float(own[2]) < -9.0
+    assert float(predicted[0]) != pytest.approx(float(own[0]))
+
+
+def test_predicted_corrections_are_added_to_the_tasks_own_reward() -> None:
+    rewards = []
+    for corrects in (False, True):
+        torch.manual_seed(1)
+        model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, corrects_reward=corrects))
+        for reward in ("abstract", "predicted"):
+            one = SimulatorWorld(
+                TASK, GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model), reward=reward
+            )
+            state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4)
+            one.load_state_dict({"state": state, "goal": -state[:, :2], "hidden": torch.zeros(3, 8)})
+            rewards.append(one.step(torch.tensor([[1.0, 0.0]]).expand(3, 2)).reward)
+    own, whole, _, corrected = rewards
+    assert (own - whole).abs().min() > 1e-3
+    torch.testing.assert_close(corrected, own + whole)
+
+
+def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
+    torch.manual_seed(0)
+    task = TASKS["nao-navigation"]
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0))
+    one = SimulatorWorld(task.objective, GroundedSimulator(task.simulator(2), model), reward="predicted")
+    # The one in the middle of a corridor, the other just before the wall at x = -2.
+    state = torch.tensor([[0.0, 2.0, 0.0, 0.0], [-1.999, 2.0, 0.0, 0.0]])
+    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)]).float().expand(2, 2)
+    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(2, 8)})
+    latent = one.simulator.latent  # type: ignore[union-attr]
+    action = torch.tensor([[0.0, 0.0], [-1.0, 0.0]])
+    step = one.step(action)
+    assert step.terminated.tolist() == one.failed.tolist() == [False, True]
+    predicted = model.predict_reward(latent, action).detach()
+    torch.testing.assert_close(step.reward[:1], predicted[:1])
+    assert float(step.reward[1]) == pytest.approx(task.objective.failure_reward, abs=0.01)
+
+
+def test_commands_are_clipped_and_shortened() -> None:
+    commands = torch.tensor([[3.0, 0.0], [0.6, 0.8], [1.0, 1.0], [0.1, -0.2], [0.0, 0.0]])
+    limited = TASK.limit_command(commands, 0.5)
+    expected = torch.tensor([[0.5, 0.0], [0.3, 0.4], [0.5 / 2**0.5] * 2, [0.1, -0.2], [0.0, 0.0]])
+    torch.testing.assert_close(limited, expected)
+    torch.testing.assert_close(TASK.limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
+
+
+def test_caution_scales_the_penalties() -> None:
+    one = world(1, thinness=torch.ones(U_MAZE.fine_walls.shape), command_limit_m_s=0.5)
+    state = {"state": torch.tensor([[-4.0, 4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
+    rewards = []
+    for caution in (0.0, 0.25, 1.0):
+        one.load_state_dict(state)
+        one.caution = caution
+        rewards.append(float(one.step(torch.tensor([[1.0, 0.0]])).reward))
+    assert one.simulator.state[0].tolist() == pytest.approx([-3.975, 4.0, 0.5, 0.0], abs=1e-5)
+    assert [rewards[0] - reward for reward in rewards] == pytest.approx([0.0, 0.25, 1.0], abs=1e-5)
+
+
+def test_parameters_of_the_episode_are_told_where_asked_for() -> None:
+    variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    simulator = VariedPointMass(U_MAZE, 4, variation, timestep_s=0.05)
+    assert SimulatorWorld(TASK, simulator).observation_size == 8
+    telling = SimulatorWorld(TASK, simulator, tells_parameters=True)
+    assert (telling.observation_size, telling.parameter_count) == (8 + 7, 7)
+    before = telling.reset()
+    torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
+    torch.testing.assert_close(before[:, 13], simulator.parameters[:, 5] / 5.0)
+    assert not before[:, [9, 10, 11, 12, 14]].any()  # these do not vary
+    assert torch.equal(telling.step(torch.ones(4, 2)).observation[:, 8:], before[:, 8:])
+    after = telling.reset(torch.tensor([True, False, False, False]))
+    assert (after[0, [8, 13]] != before[0, [8, 13]]).all()
+    assert torch.equal(after[1:, 8:], before[1:, 8:])
+    assert torch.equal(telling.load_state_dict(telling.state_dict()), after)

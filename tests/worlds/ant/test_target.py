@@ -1,0 +1,177 @@
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from astra_data.worlds.ant.body import ant_model, standing_pose, wall_geoms
+from astra_data.worlds.ant.target import AntMazeEnv
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.plane.navigation import Navigation
+
+TASK = Navigation(U_MAZE, horizon=700)
+
+
+def placed(positions: list[list[float]], **options: float) -> AntMazeEnv:
+    """Stand ants at `positions`, with the goal far away."""
+    env = AntMazeEnv(TASK, len(positions), seed=0, num_threads=1, **options)  # type: ignore[arg-type]
+    env.reset()
+    state = np.concatenate([standing_pose(len(positions)), np.zeros((len(positions), 14))], axis=1)
+    state[:, :2] = positions
+    env.reset_to(np.arange(len(positions)), state)
+    return env
+
+
+def rolled(env: AntMazeEnv, rows: list[int], angle: float) -> None:
+    """Turn `rows` by `angle` about x, well above the ground."""
+    state = env.state.numpy().astype(np.float64)[rows]
+    state[:, 2], state[:, 3:7] = 2.0, [np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]
+    env.reset_to(np.array(rows), state)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    def run(seed: int) -> bytes:
+        env = AntMazeEnv(TASK, 3, seed=seed, num_threads=2)
+        observations = [env.reset()]
+        generator = torch.Generator().manual_seed(0)
+        for count in range(5):
+            step = env.step(2 * torch.rand(3, 2, generator=generator) - 1)
+            observations += [step.observation, step.reward]
+            if count == 2:
+                observations.append(env.reset(torch.tensor([True, False, True])))
+        return b"".join(values.numpy().tobytes() for values in observations)
+
+    assert run(1) == run(1)
+    assert run(1) != run(2)
+
+
+def test_reseeding_starts_the_draws_anew() -> None:
+    env = AntMazeEnv(TASK, 2, seed=5, num_threads=1)
+    first = env.reset()
+    assert not torch.equal(env.reset(), first)
+    env.reseed(5)
+    assert torch.equal(env.reset(), first)
+
+
+def test_a_partial_reset_leaves_the_other_rows() -> None:
+    env = AntMazeEnv(TASK, 3, seed=0, num_threads=1)
+    before = env.reset()
+    after = env.reset(torch.tensor([False, True, False]))
+    assert (before == after).all(dim=1).tolist() == [True, False, True]
+
+
+def test_inactive_rows_are_frozen() -> None:
+    env = placed([[-4, 4], [-4, 4]])
+    before = env.state
+    step = env.step(torch.ones(2, 2), active=torch.tensor([True, False]))
+    assert (env.state == before).all(dim=1).tolist() == [False, True]
+    assert float(step.reward[1]) == 0.0
+
+
+@pytest.mark.parametrize(("degrees", "toppled"), [(0.0, False), (60.0, False), (100.0, True), (180.0, True)])
+def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> None:
+    env = placed([[-4, 4], [-4, 4]])
+    rolled(env, [0], np.radians(degrees))
+    step = env.step(torch.zeros(2, 2))
+    assert env.failed.tolist() == [toppled, False]
+    assert step.terminated.tolist() == [toppled, False]
+    assert float(step.reward[0]) == pytest.approx(-10.0 * toppled, abs=0.1)
+
+
+def test_walls_are_felt_and_the_floor_is_not() -> None:
+    # The walls' faces are at y = 6 and x = -6, and feet stand 0.6 m to the sides.
+    env = placed([[-4.0, 5.45], [-5.45, 4.0], [-4.0, 4.0], [0.0, 4.0]])
+    felt = torch.zeros(4, dtype=torch.bool)
+    for _ in range(6):
+        env.step(torch.zeros(4, 2))
+        felt |= env.wall_contact
+    assert felt.tolist() == [True, True, False, False]
+
+
+def test_wall_contact_equals_a_search_through_all_contacts() -> None:
+    env = placed([[x, 4.0] for x in (-5.5, -5.0, -4.5, -4.0)], leg_scale=1.25)
+    model = ant_model(U_MAZE, leg_scale=1.25)
+    first, last = wall_geoms(model) or (0, 0)
+    copies = [mujoco.MjData(model) for _ in range(4)]
+    for data, qpos in zip(copies, env.physics.qpos, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+    command = torch.tensor([[-1.0, 0.0]]).expand(4, 2)
+    for _ in range(20):
+        torques = env.controller(env.physics.qpos, env.physics.qvel, command.double().numpy())
+        env.step(command)
+        touching = []
+        for data, control in zip(copies, torques, strict=True):
+            data.ctrl[:] = control
+            mujoco.mj_step(model, data, 5)
+            pairs = [{int(geom) for geom in contact.geom} for contact in data.contact]
+            touching.append(any(first <= geom <= last for pair in pairs for geom in pair))
+        assert env.wall_contact.tolist() == touching
+    assert env.wall_contact.any()
+
+
+def test_commands_are_clipped() -> None:
+    wild, tame = placed([[-4, 4]]), placed([[-4, 4]])
+    for _ in range(3):
+        first = wild.step(torch.tensor([[7.0, -3.0]]))
+        second = tame.step(torch.tensor([[1.0, -1.0]]))
+    assert torch.equal(first.observation[:, :29], second.observation[:, :29])
+
+
+def test_starts_goals_and_headings() -> None:
+    env = AntMazeEnv(TASK, 400, seed=0, num_threads=2)
+    observation = env.reset().double()
+    assert observation.shape == (400, 31)
+    for points, cell in ((observation[:, :2], U_MAZE.start), (observation[:, 29:], U_MAZE.goal)):
+        offset = points - torch.tensor(U_MAZE.cell_centre(*cell))
+        assert float(offset.mean()) == pytest.approx(0.0, abs=0.03)
+        assert float(offset.std()) == pytest.approx(0.2, abs=0.02)
+    yaw = 2 * torch.atan2(observation[:, 6], observation[:, 3])
+    assert torch.allclose(yaw.cos().mean(), torch.tensor(0.0).double(), atol=0.12)
+    assert torch.allclose(yaw.sin().mean(), torch.tensor(0.0).double(), atol=0.12)
+    assert bool((observation[:, 15:29] == 0).all())
+
+
+def test_starts_anywhere_leave_the_start_cell() -> None:
+    env = AntMazeEnv(TASK, 50, seed=0, start_anywhere=True, num_threads=1)
+    position = env.reset()[:, :2].numpy()
+    assert (np.linalg.norm(position - U_MAZE.cell_centre(*U_MAZE.start), axis=1) > 2).mean() > 0.5
+
+
+def test_success_ends_the_episode() -> None:
+    env = placed([[-4, 4], [-4, 4]])
+    env.goal = torch.tensor([[-4.0, 4.0], [-4.0, -4.0]])
+    step = env.step(torch.zeros(2, 2))
+    assert step.success.tolist() == step.terminated.tolist() == [True, False]
+    assert float(step.reward[0]) > 9.0
+
+
+def test_zero_command_stands_still() -> None:
+    env = placed([[-4, 4], [0, 4]])
+    start = env.state[:, :2]
+    for _ in range(60):
+        env.step(torch.zeros(2, 2))
+    assert float((env.state[:, :2] - start).norm(dim=1).max()) < 0.5
+    assert not env.failed.any()
+    speeds = []
+    for _ in range(20):
+        env.step(torch.zeros(2, 2))
+        speeds.append(env.state[:, 15:17].norm(dim=1))
+    assert float(torch.stack(speeds).mean()) < 0.15
+
+
+def test_the_reach_covers_every_leg() -> None:
+    # The farthest that any geom's surface is from the torso's centre, legs stretched.
+    def farthest(leg_scale: float) -> float:
+        model = ant_model(leg_scale=leg_scale)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        torso = data.body("torso").xpos
+        ends = []
+        for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE):
+            axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
+            centre = data.geom_xpos[geom] - torso
+            ends += [np.linalg.norm(centre + sign * axis) + model.geom_size[geom, 0] for sign in (1, -1)]
+        return float(max(ends))
+
+    assert farthest(1.0) < 1.6
+    assert farthest(1.25) < 1.6 * 1.25

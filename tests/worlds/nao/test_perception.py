@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from astra_data.worlds.nao.perception import NO_ERRORS, BallSight, Localisation, PerceptionErrors
+
+STEP_S = 0.192
+ROBOTS = 4000
+
+
+def everyone(count: int = ROBOTS) -> NDArray[np.bool_]:
+    return np.ones(count, dtype=bool)
+
+
+def test_without_errors_beliefs_are_true() -> None:
+    rng = np.random.default_rng(0)
+    place, sight = Localisation(5, NO_ERRORS, STEP_S), BallSight(5, NO_ERRORS, STEP_S)
+    pose, ball = rng.uniform(-1, 1, (5, 3)), rng.uniform(-1, 1, (5, 2))
+    place.reset(np.arange(5), pose, rng)
+    sight.reset(np.arange(5), ball)
+    for _ in range(10):
+        pose, ball = pose + rng.normal(0, 0.05, (5, 3)), ball + np.array([0.1, -0.05])
+        place.update(pose, rng, everyone(5))
+        sight.update(ball, pose, place.pose, rng, everyone(5))
+        np.testing.assert_allclose(place.pose[:, :2], pose[:, :2], atol=1e-12)
+        np.testing.assert_allclose(np.cos(place.pose[:, 2] - pose[:, 2]), 1.0, atol=1e-12)
+        np.testing.assert_allclose(sight.position, ball, atol=1e-9)
+        np.testing.assert_allclose(sight.velocity, np.tile([0.1, -0.05], (5, 1)) / STEP_S, atol=1e-9)
+
+
+def test_errors_are_as_large_as_told() -> None:
+    rng = np.random.default_rng(0)
+    errors = PerceptionErrors(jumps_per_s=0.0)
+    place = Localisation(ROBOTS, errors, STEP_S)
+    place.reset(np.arange(ROBOTS), np.zeros((ROBOTS, 3)), rng)
+    seen = []
+    for _ in range(40):
+        place.update(np.zeros((ROBOTS, 3)), rng, everyone())
+        seen.append(place.pose.copy())
+    expected = [np.hypot(0.03, 0.005)] * 2 + [np.radians(2.0)]
+    assert seen[-1].std(axis=0) == pytest.approx(expected, rel=0.04)
+    # Errors 2 s apart are correlated by 1 / e.
+    apart = round(2.0 / STEP_S)
+    both = np.corrcoef(seen[-1][:, 2], seen[-1 - apart][:, 2])[0, 1]
+    assert both == pytest.approx(np.exp(-apart * STEP_S / 2.0), abs=0.05)
+
+
+def test_positions_jump_as_often_and_as_far_as_told() -> None:
+    rng = np.random.default_rng(0)
+    errors = PerceptionErrors(white_m=0.0, drift_m=0.0, drift_rad=0.0, latency_s=0.0)
+    place = Localisation(ROBOTS, errors, STEP_S)
+    place.reset(np.arange(ROBOTS), np.zeros((ROBOTS, 3)), rng)
+    jumps, before = [], place.pose[:, :2]
+    for _ in range(50):
+        place.update(np.zeros((ROBOTS, 3)), rng, everyone())
+        moved = np.linalg.norm(place.pose[:, :2] - before * np.exp(-STEP_S / 2.0), axis=1)
+        jumps += moved[moved > 1e-9].tolist()
+        before = place.pose[:, :2]
+    assert len(jumps) / (ROBOTS * 50 * STEP_S / 60) == pytest.approx(5.0, rel=0.1)
+    assert min(jumps) >= 0.1 - 1e-9
+    assert max(jumps) <= 0.3 + 1e-9
+
+
+def test_beliefs_are_late() -> None:
+    rng = np.random.default_rng(0)
+    errors = PerceptionErrors(0.0, 0.0, 0.0, jumps_per_s=0.0, latency_s=0.067)
+    place = Localisation(1, errors, STEP_S)
+    place.reset(np.array([0]), np.zeros((1, 3)), rng)
+    for step in range(1, 5):
+        place.update(np.array([[0.2 * step * STEP_S, 0.0, 0.0]]), rng, everyone(1))
+        assert place.pose[0, 0] == pytest.approx(0.2 * (step * STEP_S - 0.067))
+
+
+@pytest.mark.parametrize(("distance", "spread"), [(0.0, 0.012), (1.0, 0.045), (4.0, 0.106)])
+def test_the_ball_is_seen_worse_from_afar(distance: float, spread: float) -> None:
+    rng = np.random.default_rng(0)
+    errors = PerceptionErrors(0.0, 0.0, 0.0, jumps_per_s=0.0, latency_s=0.0)
+    sight = BallSight(ROBOTS, errors, STEP_S)
+    ball, pose = np.tile([distance, 0.0], (ROBOTS, 1)), np.zeros((ROBOTS, 3))
+    sight.reset(np.arange(ROBOTS), ball)
+    for _ in range(20):
+        sight.update(ball, pose, pose, rng, everyone())
+    assert (sight.position - ball).std(axis=0) == pytest.approx([spread, spread], rel=0.06)
+
+
+def test_a_ball_behind_the_robot_is_remembered() -> None:
+    rng = np.random.default_rng(0)
+    errors = PerceptionErrors(ball_missed=0.0, ball_m=0.0, ball_m_per_m=0.0)
+    sight = BallSight(2, errors, STEP_S)
+    pose = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]])
+    sight.reset(np.arange(2), np.tile([1.0, 0.0], (2, 1)))
+    for _ in range(3):
+        sight.update(np.tile([1.5, 0.0], (2, 1)), pose, pose, rng, everyone(2))
+    assert sight.position[0].tolist() == pytest.approx([1.5, 0.0])
+    assert sight.position[1].tolist() == [1.0, 0.0]
+    assert sight.unseen_s.tolist() == pytest.approx([0.0, 3 * STEP_S])
+
+
+def test_what_rests_stays_and_what_is_restored_goes_on() -> None:
+    rng = np.random.default_rng(0)
+    place = Localisation(2, PerceptionErrors(), STEP_S)
+    place.reset(np.arange(2), np.zeros((2, 3)), rng)
+    before = place.pose.copy()
+    place.update(np.ones((2, 3)), rng, np.array([True, False]))
+    assert (place.pose[0] != before[0]).all()
+    assert (place.pose[1] == before[1]).all()
+    arrays = {name: values.copy() for name, values in place.arrays().items()}
+    place.update(np.ones((2, 3)), np.random.default_rng(1), everyone(2))
+    again = Localisation(2, PerceptionErrors(), STEP_S)
+    again.restore(arrays)
+    again.update(np.ones((2, 3)), np.random.default_rng(1), everyone(2))
+    np.testing.assert_array_equal(again.pose, place.pose)

@@ -1,0 +1,169 @@
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.nao.perception import NO_ERRORS
+from astra_data.worlds.nao.target import Floats, NaoEnv
+from astra_data.worlds.registry import TASKS
+
+LEVELS = ("surrogate", "mujoco")
+
+
+def env(task: str = "nao-navigation", count: int = 3, level: str = "surrogate", **options: Any) -> NaoEnv:  # noqa: ANN401 - handed on
+    name = task if level == "mujoco" else f"{task}-{level}"
+    made = TASKS[name].target(count, seed=0, num_threads=1, **options)
+    assert isinstance(made, NaoEnv)
+    made.reset()
+    return made
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("task", ["nao-navigation", "nao-kick"])
+def test_states_have_their_columns_and_abstractions(task: str, level: str) -> None:
+    name = task if level == "mujoco" else f"{task}-{level}"
+    one = env(task, level=level)
+    columns = TASKS[name].state_columns
+    assert one.state.shape == (3, columns[0].size)
+    assert columns[0].names is not None
+    assert len(columns[0].names) == columns[0].size
+    assert one.reset().shape == (3, one.observation_size)
+    abstract = TASKS[name].abstraction(one.state)
+    assert abstract.shape == one.truth.shape == (3, TASKS[name].abstract_state.size)
+    assert TASKS[name].beyond(one.state).shape[1] == columns[0].size - abstract.shape[1]
+    # Beliefs are near the truth.
+    assert (abstract - one.truth).abs().max() < 0.5
+
+
+def test_robots_turn_to_where_they_are_to_go_and_go_there() -> None:
+    one = env(count=8, errors=NO_ERRORS)
+    start = one.position
+    for _ in range(25):
+        one.step(torch.tensor([[0.8, 0.0]]).expand(8, 2))
+    way = one.position - start
+    assert way[:, 0].min() > 0.3
+    assert (way[:, 1].abs() < 0.5 * way[:, 0]).all()
+    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), 1.0, atol=0.1)
+
+
+def test_robots_with_a_ball_keep_facing_it() -> None:
+    one = env("nao-kick", 8, errors=NO_ERRORS)
+    away = torch.nn.functional.normalize(one.truth[:, :2] - one.truth[:, 4:6])
+    for _ in range(40):
+        one.step(torch.nn.functional.pad(0.5 * away, (0, 1)))
+    apart = one.robots.ball - one.robots.pose[:, :2]
+    assert np.linalg.norm(apart, axis=1).min() > 0.5
+    bearing = np.arctan2(apart[:, 1], apart[:, 0]) - one.robots.pose[:, 2]
+    np.testing.assert_allclose(np.cos(bearing), 1.0, atol=0.1)
+
+
+def test_robots_turn_to_their_ball_before_they_walk() -> None:
+    one = env("nao-kick", 4, errors=NO_ERRORS)
+    place, angle = np.zeros((4, 3)), np.array([0.0, np.pi / 4, np.pi / 2, -3.0])
+    one.robots.reset(np.arange(4), place, np.random.default_rng(0))
+    one.localisation.reset(np.arange(4), place, np.random.default_rng(0))
+    one.sight.reset(np.arange(4), np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    ahead = torch.tensor([[1.0, 0.0]]).expand(4, 2)
+    command = one._body_command(ahead, np.zeros(4, dtype=bool))
+    np.testing.assert_allclose(command[:, 0] / command[0, 0], [1.0, 0.5, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(np.sign(command[:, 2]), [0.0, 1.0, 1.0, -1.0])
+    kicking = one._body_command(0 * ahead, np.ones(4, dtype=bool))
+    assert (kicking[:, :2] == 0).all()
+    np.testing.assert_array_equal(kicking[:, 2], command[:, 2])
+
+
+def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
+    one = env("nao-kick", 2, errors=NO_ERRORS)
+    place, ball = np.zeros((2, 3)), np.array([[-0.8, 0.0], [0.8, 0.0]])
+    one.robots.reset(np.arange(2), place, np.random.default_rng(0), ball)
+    one.localisation.reset(np.arange(2), place, np.random.default_rng(0))
+    # Both believe that it lies in front of them.
+    one.sight.reset(np.arange(2), ball[[1, 1]])
+    one.sight.errors = replace(NO_ERRORS, ball_seen_rad=np.pi / 2)
+    heading = []
+    for _ in range(40):
+        one.step(torch.zeros(2, 3))
+        heading.append(one.robots.pose[:, 2])
+    assert np.abs(heading)[:, 0].max() > np.pi / 2
+    assert np.abs(heading)[:, 1].max() < 0.2
+    np.testing.assert_allclose(one.sight.position, ball, atol=0.1)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_kick_reaches_a_foot_far_and_moves_no_robot(level: str) -> None:
+    one = env("nao-kick", 8, level, errors=NO_ERRORS)
+    place, angle = np.zeros((8, 3)), np.linspace(-np.pi, np.pi, 8)
+    place[:, 2] = angle
+    distance = np.array([0.17, 0.3] * 4)[:, None]
+    ball = distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    one.robots.reset(np.arange(8), place, np.random.default_rng(0), ball)
+    one.localisation.reset(np.arange(8), place, np.random.default_rng(0))
+    one.sight.reset(np.arange(8), ball)
+    fastest: Floats = np.zeros(8)
+    for _ in range(10):
+        one.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(8, 3))
+        fastest = np.maximum(fastest, np.linalg.norm(one.robots.ball_velocity, axis=1))
+    assert fastest[::2].min() > 0.35
+    assert fastest[1::2].max() == pytest.approx(0.0, abs=0.02)
+    assert np.abs(one.robots.pose[:, :2]).max() < 0.1
+    assert not one.robots.fallen.any()
+
+
+def test_touching_a_wall_fails() -> None:
+    one = env(count=2)
+    for _ in range(60):
+        step = one.step(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
+        if step.terminated[0]:
+            break
+    assert one.failed.tolist() == [True, False]
+    assert one.wall_contact.tolist() == [True, False]
+    assert step.terminated.tolist() == [True, False]
+    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
+
+
+def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
+    one = env("nao-kick", 2)
+    balls = np.array([[1.4, 0.0], [1.4, 1.2]])
+    one.robots.reset(
+        np.arange(2), np.column_stack([balls - [0.3, 0.0], [0.0, 0.0]]), np.random.default_rng(0), balls
+    )
+    one.localisation.reset(np.arange(2), one.robots.pose, np.random.default_rng(0))
+    ended = torch.zeros(2, dtype=torch.bool)
+    success = ended.clone()
+    for _ in range(40):
+        step = one.step(torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), ~ended)
+        success |= step.success & ~ended
+        ended |= step.terminated
+    assert ended.all()
+    assert success.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed(level: str) -> None:
+    one, other = (env("nao-kick", 2, level) for _ in range(2))
+    action = torch.tensor([[0.7, 0.2, 0.0], [-0.5, 0.9, 1.0]])
+    for _ in range(3):
+        assert torch.equal(one.step(action).observation, other.step(action).observation)
+    fresh = env("nao-kick", 2, level)
+    fresh.load_state_dict(one.state_dict())
+    for _ in range(3):
+        assert torch.equal(one.step(action).observation, fresh.step(action).observation)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_robots_can_be_stood_where_a_state_believes_them(level: str) -> None:
+    one = env("nao-kick", 2, level)
+    state = one.state.double().numpy()
+    one.step(torch.ones(2, 3))
+    one.reset_to(np.arange(2), state)
+    np.testing.assert_allclose(one.robots.pose[:, :2], state[:, :2], atol=1e-6)
+    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), state[:, 2], atol=1e-6)
+    np.testing.assert_allclose(one.robots.ball, state[:, 29:31], atol=1e-6)
+
+
+def test_its_legs_are_as_they_are() -> None:
+    with pytest.raises(BadInputError, match="leg_scale: expected 1"):
+        env(leg_scale=1.25)

@@ -1,0 +1,146 @@
+from typing import Any
+
+import pytest
+import torch
+
+from astra_data.worlds.plane.ball_agent import BallAgent
+from astra_data.worlds.plane.mazes import FIELD
+from astra_data.worlds.plane.varied_ball_agent import VariedBallAgent
+from astra_data.worlds.variation import BallVariation, PlanarVariation
+
+OPTIONS: dict[str, Any] = {
+    "timestep_s": 0.2,
+    "radius_m": 0.2,
+    "speed_m_s": 0.25,
+    "reach_m": 0.19,
+    "knock_m_s": 1.0,
+    "kick_reach_m": 0.3,
+    "kick_m_s": 1.5,
+}
+AHEAD = torch.tensor([[1.0, 0.0, 0.0]])
+STAY = torch.zeros(1, 3)
+START = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.22, 0.0, 0.0, 0.0]])
+
+
+def one(count: int = 1) -> BallAgent:
+    simulator = BallAgent(FIELD, count, **OPTIONS)
+    simulator.reset_to(START.expand(count, 8))
+    return simulator
+
+
+def test_it_walks_into_its_ball() -> None:
+    simulator = one()
+    state = simulator.step(AHEAD)
+    # The ball leaves at 1 m/s from 0.19 m ahead of 0.05 m, and rolls for 0.2 s.
+    way = 1.0 * 0.2 - 0.3 * 0.2**2 / 2
+    expected = [0.05, 0.0, 0.25, 0.0, 0.05 + 0.19 + way, 0.0, 1.0 - 0.3 * 0.2, 0.0]
+    assert state[0].tolist() == pytest.approx(expected, abs=1e-5)
+    for _ in range(100):
+        state = simulator.step(STAY)
+    assert state[0, 4].item() == pytest.approx(0.24 + 1.0 / 0.6, abs=1e-4)
+    assert state[0, 6:].abs().max() == 0
+
+
+def test_it_stands_and_kicks() -> None:
+    simulator = one(2)
+    simulator.reset_to(torch.cat([START, START + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0])]))
+    state = simulator.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(2, 3))
+    way = 1.5 * 0.2 - 0.3 * 0.2**2 / 2
+    assert state[0].tolist() == pytest.approx([0, 0, 0, 0, 0.22 + way, 0, 1.5 - 0.3 * 0.2, 0], abs=1e-5)
+    # Out of reach.
+    assert state[1].tolist() == pytest.approx([0, 0, 0, 0, 0.32, 0, 0, 0], abs=1e-5)
+
+
+def test_walls_stop_the_mass_but_not_the_ball() -> None:
+    simulator = one()
+    for _ in range(200):
+        state = simulator.step(AHEAD)
+    assert simulator.blocked.all()
+    # The room's inside ends at 2.5 m, 0.2 m before which the mass is stopped.
+    assert state[0, 0].item() == pytest.approx(2.3, abs=0.01)
+    assert state[0, 4].item() > 2.5
+    simulator.reset_to(START, torch.tensor([0]))
+    assert not simulator.blocked.any()
+
+
+def test_a_correction_is_taken_over_as_far_as_there_is_room() -> None:
+    simulator = one()
+    simulator.step(AHEAD)
+    landed = torch.tensor([[0.3, 0.1, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
+    assert torch.equal(simulator.settle(START, landed), landed)
+    assert torch.equal(simulator.state, landed)
+    far = landed.clone()
+    far[0, 1] = 9.0
+    settled = simulator.settle(START, far)
+    assert settled[0, 1].item() < 2.31
+    assert torch.equal(settled[:, 2:], far[:, 2:])
+
+
+def test_plain_parameters_are_the_plain_simulator() -> None:
+    torch.manual_seed(0)
+    varied = VariedBallAgent(FIELD, 50, PlanarVariation(), **OPTIONS)
+    plain = one(50)
+    varied.reset_to(plain.state)
+    for _ in range(60):
+        action = torch.randn(50, 3)
+        torch.testing.assert_close(varied.step(action), plain.step(action))
+        assert torch.equal(varied.blocked, plain.blocked)
+
+
+@pytest.mark.parametrize(
+    ("variation", "entry", "expected"),
+    [
+        (BallVariation(ball_friction=(2.0, 2.0)), 6, 1.0 - 0.6 * 0.2),
+        (BallVariation(contact_direction_deg=(90.0, 90.0)), 7, 1.0 - 0.3 * 0.2),
+        (BallVariation(friction=(0.5, 0.5)), 2, 0.125),
+    ],
+    ids=["friction", "direction", "speed"],
+)
+def test_parameters_do_what_their_names_say(variation: BallVariation, entry: int, expected: float) -> None:
+    simulator = VariedBallAgent(FIELD, 1, variation, **OPTIONS)
+    simulator.reset_to(torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]))
+    state = simulator.step(AHEAD)
+    assert state[0, entry].item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_direction_of_a_kick_varies_too() -> None:
+    simulator = VariedBallAgent(FIELD, 1, BallVariation(contact_direction_deg=(90.0, 90.0)), **OPTIONS)
+    simulator.reset_to(START)
+    state = simulator.step(torch.tensor([[1.0, 0.0, 1.0]]))
+    assert state[0, 6:].tolist() == pytest.approx([0.0, 1.5 - 0.3 * 0.2], abs=1e-5)
+
+
+def test_noise_of_sensors_only_shows() -> None:
+    torch.manual_seed(0)
+    variation = BallVariation(ball_position_noise_m=(0.1, 0.1), ball_velocity_noise_m_s=(0.2, 0.2))
+    simulator = VariedBallAgent(FIELD, 5000, variation, **OPTIONS)
+    simulator.reset_to(START.expand(5000, 8))
+    simulator.step(torch.zeros(5000, 3))
+    error = (simulator.state - simulator.true_state).abs().amax(0)
+    torch.testing.assert_close(
+        error, torch.tensor([0.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.2, 0.2]), atol=1e-4, rtol=0.01
+    )
+
+
+def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
+    simulator = one(3)
+    states = START.repeat(3, 1)
+    # The first is walked away from, the second rolls, the third is walked into.
+    states[1, 6] = 0.3
+    simulator.reset_to(states)
+    simulator.step(torch.cat([-AHEAD, -AHEAD, AHEAD]))
+    landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.5, 0.5, 0.3, 0.3]).repeat(3, 1)
+    settled = simulator.settle(states, landed)
+    assert torch.equal(settled[:, :4], landed[:, :4])
+    assert torch.equal(settled[0, 4:], START[0, 4:])
+    assert torch.equal(settled[1:, 4:], landed[1:, 4:])
+    assert torch.equal(simulator.state, settled)
+
+
+def test_a_correction_that_all_but_stops_a_ball_leaves_it_where_it_lay() -> None:
+    simulator = one()
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]))
+    landed = torch.tensor([[0.1, 0.1, 0.2, 0.2, 0.24, 0.01, 0.1, 0.1]])
+    settled = simulator.settle(START, landed)
+    assert torch.equal(settled[:, :4], landed[:, :4])
+    assert torch.equal(settled[:, 4:], START[:, 4:])

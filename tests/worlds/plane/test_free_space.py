@@ -1,0 +1,107 @@
+import numpy as np
+import pytest
+import torch
+
+from astra_data.worlds.plane.free_space import FreeSpace, GoalDistance
+from astra_data.worlds.plane.mazes import U_MAZE, Maze
+
+ROOM = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))
+"""One room, free in [-2, 2]²; with a radius of 0.1 m, in [-1.9, 1.9]²."""
+
+PILLAR = Maze(rows=("11111", "10001", "10101", "10001", "11111"), scale=2.0, start=(1, 1), goal=(3, 3))
+"""A corridor around a block that is closed in [-1.1, 1.1]² with a radius of 0.1 m."""
+
+
+def slide(maze: Maze, start: list[float], end: list[float]) -> tuple[list[float], bool]:
+    rest, stopped = FreeSpace.of_maze(maze, radius_m=0.1).slide(torch.tensor([start]), torch.tensor([end]))
+    return rest[0].tolist(), bool(stopped[0])
+
+
+@pytest.mark.parametrize(
+    ("end", "rest"),
+    [
+        ([1.95, 0.0], [1.9, 0.0]),
+        ([-1.95, 0.0], [-1.9, 0.0]),
+        ([0.0, 1.95], [0.0, 1.9]),
+        ([0.0, -1.95], [0.0, -1.9]),
+        ([1.95, 1.95], [1.9, 1.9]),  # into a corner
+        ([-1.95, 1.5], [-1.9, 1.5]),  # slanted: only the blocked axis stops
+        ([1.5, -1.95], [1.5, -1.9]),
+    ],
+)
+def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> None:
+    # Starts within the last free cell, for a step does not look at the cells between its ends.
+    start = [float(np.clip(value, -1.85, 1.85)) for value in end]
+    reached, stopped = slide(ROOM, start, end)
+    assert reached == pytest.approx(rest, abs=2e-4)
+    assert stopped
+    free = FreeSpace.of_maze(ROOM, radius_m=0.1)
+    assert not free.blocked[free.cells(torch.tensor(reached))]
+
+
+def test_free_motion_is_exact() -> None:
+    reached, stopped = slide(ROOM, [0.3, -0.2], [0.35, -0.25])
+    assert reached == pytest.approx([0.35, -0.25])
+    assert not stopped
+
+
+def test_an_outer_corner_met_diagonally_lets_one_axis_pass() -> None:
+    # From below and left of the pillar's corner at (-1.1, -1.1): x goes first and is free, then y is stopped.
+    reached, stopped = slide(PILLAR, [-1.12, -1.12], [-1.08, -1.08])
+    assert reached == pytest.approx([-1.08, -1.1], abs=2e-4)
+    assert stopped
+
+
+def test_a_long_walk_never_leaves_the_free_space() -> None:
+    free = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
+    generator = torch.Generator().manual_seed(0)
+    position = torch.tensor(U_MAZE.free_centres(), dtype=torch.float32).repeat(20, 1)
+    heading = torch.randn(position.shape, generator=generator)
+    for _ in range(100):
+        heading = heading + 0.1 * torch.randn(position.shape, generator=generator)
+        position, _ = free.slide(position, position + 0.08 * torch.nn.functional.normalize(heading))
+        assert not free.blocked[free.cells(position)].any()
+
+
+def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:
+    # x = 1.95 is closed; 1.85 is free, 2.05 is deeper.
+    reached, stopped = slide(ROOM, [1.95, 0.0], [1.85, 0.0])
+    assert reached == pytest.approx([1.85, 0.0])
+    assert not stopped
+    reached, stopped = slide(ROOM, [1.95, 0.0], [2.05, 0.05])
+    assert stopped
+    assert reached == pytest.approx([2.0, 0.05], abs=2e-4)
+    # Along the wall it is as deep everywhere.
+    reached, stopped = slide(ROOM, [1.95, 0.0], [1.95, 0.15])
+    assert reached == pytest.approx([1.95, 0.15])
+    assert not stopped
+
+
+def test_a_wall_cannot_be_walked_through_from_inside() -> None:
+    free = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
+    position = torch.tensor([[-4.0, 1.95]])  # just inside the wall between the arms, which is 4 m thick
+    for _ in range(200):
+        position, _ = free.slide(position, position + torch.tensor([[0.0, -0.05]]))
+    assert position[0, 1] > 1.8
+
+
+def test_goal_distance_is_bilinear() -> None:
+    # A field that is itself linear is reproduced exactly, between cell centres too.
+    height, width = ROOM.fine_walls.shape
+    half = torch.tensor(ROOM.half_extent, dtype=torch.float32)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    x, y = x * ROOM.fine_m - half[0], y * ROOM.fine_m - half[1]
+    fields = torch.stack([2 * x - 3 * y, x + y])
+    distance = GoalDistance(fields, torch.tensor([[0.0, 0.0], [1.0, 1.0]]), half, ROOM.fine_m)
+    position = torch.rand(200, 2, generator=torch.Generator().manual_seed(0)) * 4 - 2
+    near = distance(position, torch.tensor([[0.2, 0.1]]).expand(200, 2))
+    torch.testing.assert_close(near, 2 * position[:, 0] - 3 * position[:, 1], atol=1e-4, rtol=0)
+    far = distance(position, torch.tensor([[0.8, 0.9]]).expand(200, 2))
+    torch.testing.assert_close(far, position.sum(-1), atol=1e-4, rtol=0)
+
+
+def test_goal_distance_follows_the_goal() -> None:
+    distance = GoalDistance.of_maze(U_MAZE, spacing_m=0.2)
+    goal = torch.tensor([[-4.0, -4.0], [-3.6, -4.0]])
+    position = torch.tensor([[0.0, -4.0], [0.0, -4.0]])
+    assert distance(position, goal).tolist() == pytest.approx([4.0, 3.6], abs=0.1)

@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
+
+CORRIDOR = Maze(rows=("1111111", "1000001", "1111111"), scale=4.0, start=(1, 1), goal=(1, 5))
+
+
+def shortest(maze: Maze, start: tuple[float, float], goal: tuple[float, float]) -> float:
+    return float(maze.distance_field(np.array(goal))[maze.fine_index(np.array(start))])
+
+
+def test_the_long_maze_is_the_u_maze_twice() -> None:
+    assert LONG_MAZE.rows[:5] == (*U_MAZE.rows[:4], "10111")
+    assert LONG_MAZE.cell_centre(*LONG_MAZE.start) == (-4.0, 8.0)
+    assert LONG_MAZE.cell_centre(*LONG_MAZE.goal) == (4.0, -8.0)
+
+
+def test_cells_and_points_agree() -> None:
+    centres = U_MAZE.free_centres()
+    assert len(centres) == len(U_MAZE.free_cells()) == 7
+    assert (U_MAZE.clearance(centres) > 1.9).all()
+    walls = np.array([U_MAZE.cell_centre(*cell) for cell in U_MAZE.wall_cells()])
+    assert len(walls) == 25 - 7
+    assert not U_MAZE.clearance(walls).any()
+    assert not U_MAZE.clearance(np.array([[100.0, 0.0], [0.0, -100.0]])).any()
+
+
+def test_the_fine_grid_repeats_the_walls() -> None:
+    points = np.random.default_rng(0).uniform(-9.9, 9.9, (500, 2))
+    centres = np.array([U_MAZE.cell_centre(row, column) for row in range(5) for column in range(5)])
+    nearest = np.abs(points[:, None] - centres).max(axis=-1).argmin(axis=1)
+    assert (U_MAZE.fine_walls[U_MAZE.fine_index(points)] == U_MAZE.walls.ravel()[nearest]).all()
+
+
+def test_clearance_in_the_middle_and_beside_a_wall() -> None:
+    points = np.array([[0.0, 4.0], [0.0, 5.5], [0.0, 4.0 + 1.75], [0.0, 0.0]])
+    assert U_MAZE.clearance(points) == pytest.approx([2.0, 0.5, 0.25, 0.0], abs=U_MAZE.fine_m)
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "length"),
+    [
+        ((-8.0, 0.0), (8.0, 0.0), 16.0),  # along the corridor
+        ((-8.0, -1.0), (8.0, 1.0), np.hypot(16.0, 2.0)),  # across it
+        ((-8.0, -1.5), (-5.0, 1.5), np.hypot(3.0, 3.0)),  # diagonally
+    ],
+)
+def test_distance_along_a_straight_corridor(
+    start: tuple[float, float], goal: tuple[float, float], length: float
+) -> None:
+    assert shortest(CORRIDOR, start, goal) == pytest.approx(length, rel=0.03)
+
+
+def test_distance_around_the_u() -> None:
+    # The U's inner wall ends in the corners (2, 2) and (2, -2): two slanted legs and its end between them.
+    length = 2 * np.hypot(6.0, 2.0) + 4.0
+    assert shortest(U_MAZE, (-4.0, 4.0), (-4.0, -4.0)) == pytest.approx(length, rel=0.03)
+
+
+def test_distance_in_a_wall_grows_inward() -> None:
+    field = U_MAZE.distance_field(np.array([-4.0, -4.0]))
+    depths = [field[U_MAZE.fine_index(np.array([-8.0 + offset, -4.0]))] for offset in (1.95, 1.45, 0.95)]
+    assert depths == pytest.approx([2.05, 2.55, 3.05], rel=0.05)
+
+
+def test_a_disc_goes_around_corners_at_its_radius() -> None:
+    # A tight string: a tangent to the circle about each corner, an arc, and the wall's end between them.
+    apart = np.hypot(6.0, 2.0)
+    arc = np.arctan2(2.0, -6.0) - np.arccos(1.0 / apart)
+    length = 2 * (np.sqrt(apart**2 - 1.0) + arc) + 4.0
+    goal, start = np.array([-4.0, -4.0]), U_MAZE.fine_index(np.array([-4.0, 4.0]))
+    assert U_MAZE.distance_field(goal, radius=1.0)[start] == pytest.approx(length, rel=0.03)
+    # 0.5 m from a wall it is 0.5 m from where it may be: in the aisle's middle, 1 m on.
+    field = U_MAZE.distance_field(goal, radius=1.0)
+    assert field[U_MAZE.fine_index(np.array([0.0, -5.45]))] == pytest.approx(
+        field[U_MAZE.fine_index(np.array([0.0, -4.95]))] + 0.5, abs=0.15
+    )
+
+
+def test_a_margin_keeps_paths_away_from_corners() -> None:
+    goal, start = np.array([-4.0, -4.0]), U_MAZE.fine_index(np.array([-4.0, 4.0]))
+    wide = U_MAZE.distance_field(goal, margin=1.0)
+    # Past the corners at 1 m, a path is longer, and nowhere shorter than the free one.
+    assert wide[start] > 1.02 * U_MAZE.distance_field(goal)[start]
+    assert wide[start] < 2 * np.hypot(6.0, 3.0) + 6.0 + 1.0

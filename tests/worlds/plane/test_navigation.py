@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
+from astra_data.worlds.plane.navigation import Navigation, RewardKind
+
+TASK = Navigation(U_MAZE, horizon=700)
+
+
+def along(corners: list[list[float]], count: int) -> Tensor:
+    """Return `count` points (count, 2) along a line through `corners`."""
+    places = np.linspace(0, len(corners) - 1, count)
+    columns = [np.interp(places, range(len(corners)), column) for column in zip(*corners, strict=True)]
+    return torch.tensor(np.stack(columns, axis=-1), dtype=torch.float32)
+
+
+@pytest.mark.parametrize("kind", ["geodesic", "euclidean", "sparse"])
+def test_progress_adds_up_to_the_distance_gained(kind: RewardKind) -> None:
+    task = Navigation(U_MAZE, horizon=700, reward_kind=kind)
+    path = along([[-4, 4], [4, 4], [4, -4], [0, -4]], 120)
+    goal = torch.tensor([[-4.0, -4.0]]).expand(119, 2)
+    gained = task.progress(path[:-1], path[1:], goal).sum()
+    # From two slanted legs around the inner wall's end, or 8 m as the crow flies, to the last 4 m.
+    expected = {"geodesic": 2 * np.hypot(6, 2) + 4 - 4, "euclidean": 8 - 4, "sparse": 0.0}[kind]
+    assert float(gained) == pytest.approx(expected, rel=0.04, abs=1e-4)
+
+
+def test_success_and_toppling_are_paid_once_each() -> None:
+    goal = torch.tensor([[-4.0, -4.0]]).expand(4, 2)
+    position = goal + torch.tensor([[0.44, 0.0], [0.46, 0.0], [0.46, 0.0], [0.0, 0.46]])
+    toppled = torch.tensor([False, False, True, False])
+    assert TASK.reached(position, goal).tolist() == [True, False, False, False]
+    reward = TASK.reward(position, position, goal, toppled)
+    assert reward.tolist() == pytest.approx([10.0, 0.0, -10.0, 0.0], abs=1e-5)
+
+
+def test_waves_tell_the_position_finely() -> None:
+    goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
+    state = torch.tensor([[5.0, 2.5, 0.0, 0.0], [-10.0, 10.0, 0.0, 0.0]])
+    plain = TASK.observe(state, goal)
+    seen = Navigation(U_MAZE, horizon=700, position_waves=2).observe(state, goal)
+    assert torch.equal(seen[:, :8], plain)
+    # The maze reaches from -10 to 10 m: a quarter and an eighth of a wave, then twice as much.
+    sines, cosines = seen[0, 8:12].tolist(), seen[0, 12:].tolist()
+    assert sines == pytest.approx([1.0, 0.5**0.5, 0.0, 1.0], abs=1e-6)
+    assert cosines == pytest.approx([0.0, 0.5**0.5, -1.0, 0.0], abs=1e-6)
+
+
+def test_a_metre_is_paid_as_the_task_says() -> None:
+    goal = torch.tensor([[-4.0, -4.0]])
+    before, after, failed = (
+        goal + torch.tensor([[2.0, 0.0]]),
+        goal + torch.tensor([[1.0, 0.0]]),
+        goal[:, 0] > 0,
+    )
+    task = Navigation(U_MAZE, horizon=700, metre_reward=4.0)
+    assert float(task.reward(before, after, goal, failed)) == pytest.approx(4.0, abs=0.1)
+
+
+@pytest.mark.parametrize("maze", [U_MAZE, LONG_MAZE])
+def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
+    task = Navigation(maze, horizon=1)
+    for draw, cell in ((task.draw_starts, task.maze.start), (task.draw_goals, task.maze.goal)):
+        points = draw(np.random.default_rng(0), 4000)[:, :2] - np.array(task.maze.cell_centre(*cell))
+        assert points.shape == (4000, 2)
+        assert points.mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.02)
+        assert points.std(axis=0) == pytest.approx([0.2, 0.2], abs=0.01)
+        assert np.abs(points).max() <= 0.6 + 1e-9
+
+
+def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -> None:
+    points = TASK.draw_anywhere(np.random.default_rng(0), 7000)[:, :2]
+    assert U_MAZE.clearance(points).min() > 0.8
+    # The two arms are mirror images.
+    assert (points[:, 1] > 0).mean() == pytest.approx(0.5, abs=0.02)
+    arms = (np.abs(points[:, 1]) > 2).mean()
+    # Arms of 10.4 m by 2.4 m (2 of them), and 5.6 m by 2.4 m of bend between them.
+    assert arms == pytest.approx(2 * 10.4 * 2.4 / (2 * 10.4 * 2.4 + 4 * 2.4), abs=0.03)
+
+
+def test_draws_repeat() -> None:
+    first = TASK.draw_anywhere(np.random.default_rng(7), 5)
+    np.testing.assert_array_equal(first, TASK.draw_anywhere(np.random.default_rng(7), 5))

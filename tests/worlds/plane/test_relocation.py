@@ -1,0 +1,129 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array, Episode
+from astra_data.worlds.plane.relocation import Relocation, outcomes, positions
+from astra_data.worlds.registry import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+GOAL = np.array(TASK.maze.cell_centre(*TASK.maze.goal), np.float32)
+
+
+def relocation(**changes: Any) -> Relocation:  # noqa: ANN401
+    settings: dict[str, Any] = {
+        "rotations": "quarter",
+        "translations": True,
+        "reflections": False,
+        "margin_m": 1.3,
+        "min_steps": 5,
+        "tries": 100,
+    }
+    return Relocation(TASK, **settings | changes)
+
+
+def straight(start: tuple[float, float], end: tuple[float, float], steps: int) -> Episode:
+    """Return an episode that slides from `start` to `end`, commanded along (1, 1)."""
+    path = np.zeros((steps + 1, 29), np.float32)
+    path[:, :2] = np.linspace(start, end, steps + 1)
+    path[:, 3] = 1
+    columns = {STATE: path[:-1].copy(), NEXT_STATE: path[1:].copy()}
+    return Episode(0, {**columns, ACTION: np.full((steps, 2), 0.9, np.float32)})
+
+
+def test_only_what_keeps_its_distance_may_move() -> None:
+    # The upper corridor is 4 m wide, its middle at y = 4 m; the path sags toward the wall and comes back.
+    path = straight((-4.0, 4.0), (4.0, 4.0), 100)
+    for name in (STATE, NEXT_STATE):
+        x = path.columns[name][:, 0]
+        path.columns[name][:, 1] -= np.where(np.abs(x) < 1.0, 1.5, 0.0)
+    (first, second) = relocation().stretches(path)
+    assert (first[0], second[1]) == (0, 100)
+    assert abs(first[1] - 37) <= 1
+    assert abs(second[0] - 63) <= 1
+    assert relocation(min_steps=40).stretches(path) == []
+    assert relocation(margin_m=0.3).stretches(path) == [(0, 100)]
+
+
+def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:  # noqa: ANN401
+    rng = np.random.default_rng(0)
+    drawn = [relocation(**changes).draw(episode, rng) for _ in range(count)]
+    assert None not in drawn
+    return drawn
+
+
+def moved(change: Any, episode: Episode) -> Array:  # noqa: ANN401
+    return np.asarray(change.positions(positions(TASK, episode.columns[STATE]).astype(np.float64)))
+
+
+def test_quarter_turns_go_everywhere_that_is_free() -> None:
+    path = straight((-4.5, 4.0), (-3.5, 4.0), 20)
+    drawn: Array = np.array([moved(change, path) for change, _ in draws(80, path)])
+    ends = drawn.astype(np.float32)  # as they are stored
+    assert (TASK.maze.clearance(ends.astype(np.float64)) > 1.3).all()
+    bearing = np.arctan2(*(ends[:, -1] - ends[:, 0]).T[::-1])
+    turns = np.round(bearing / (np.pi / 2))
+    np.testing.assert_allclose(bearing, turns * np.pi / 2, atol=1e-6)
+    assert set(turns % 4) == {0, 1, 2, 3}
+    # In all three corridors.
+    assert ends[:, 0, 1].max() > 3
+    assert ends[:, 0, 1].min() < -3
+    assert (np.abs(ends[:, 0, 1]) < 2).any()
+
+
+def test_turns_that_lengthen_a_command_beyond_its_limit_are_drawn_again() -> None:
+    path = straight((-4.5, 4.0), (-4.4, 4.0), 20)
+    turned = [change.vectors(np.array([0.9, 0.9])) for change, _ in draws(20, path, rotations="any")]
+    assert np.abs(turned).max() <= 1 + 1e-6
+    assert len({round(float(x), 3) for x, _ in turned}) == 20
+
+
+def test_without_translation_a_stretch_starts_where_it_did() -> None:
+    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
+    for change, steps in draws(10, path, translations=False, reflections=True):
+        np.testing.assert_allclose(moved(change, path)[steps.start], [-4.0, 4.0], atol=1e-6)
+
+
+def test_without_rotation_the_bearing_stays() -> None:
+    path = straight((-4.0, 4.0), (-3.5, 4.0), 20)
+    for change, _ in draws(10, path, rotations="none"):
+        assert change.rotation_rad == 0.0
+        assert not change.reflected
+
+
+def test_what_fits_nowhere_is_given_up() -> None:
+    # Nine metres fit into a corridor, but not at right angles to it where they start.
+    path = straight((-4.5, 4.0), (4.5, 4.0), 60)
+    change = relocation(translations=False, tries=50).draw(path, np.random.default_rng(0))
+    assert change is not None
+    assert change[0].rotation_rad == 0.0
+    long = straight((-4.5, 4.0), (4.5, 4.0), 60)
+    long.columns[ACTION][:] = 2.0
+    assert relocation(tries=5).draw(long, np.random.default_rng(0)) is None
+
+
+@pytest.mark.parametrize(("toppled_at", "length", "success"), [(None, 16, True), (9, 10, False)])
+def test_an_episode_ends_at_the_goal_or_where_it_topples(
+    toppled_at: int | None, length: int, success: bool
+) -> None:
+    # 0.1 m per step along the lower corridor; within 0.45 m of the goal from step 15 on.
+    path = straight((GOAL[0] + 2.0, GOAL[1]), (GOAL[0] - 1.0, GOAL[1]), 30)
+    before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
+    toppled = np.arange(30) == toppled_at
+    judged = outcomes(TASK.objective, before, after, GOAL, toppled)
+    assert {len(values) for values in judged.values()} == {length}
+    assert judged["next.success"].tolist() == [False] * (length - 1) + [success]
+    assert judged["next.terminated"].tolist() == judged["next.done"].tolist()
+    assert not judged["next.truncated"].any()
+    # The last step earns +10 or -10; all of them 0.1 m of progress.
+    assert judged["next.reward"][-1] == pytest.approx(10.1 if success else -9.9, abs=0.02)
+    assert judged["next.reward"][:-1].mean() == pytest.approx(0.1, abs=0.02)
+
+
+def test_an_episode_that_just_stops_is_truncated() -> None:
+    path = straight((4.0, 4.0), (3.0, 4.0), 10)
+    before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
+    judged = outcomes(TASK.objective, before, after, GOAL, np.zeros(10, dtype=bool))
+    assert judged["next.truncated"].tolist() == judged["next.done"].tolist() == [False] * 9 + [True]
+    assert not judged["next.terminated"].any()

@@ -1,0 +1,97 @@
+import pytest
+import torch
+from pydantic import ValidationError, create_model
+
+from astra_data.core.config import Config, validated
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.methods.compass import CompassConfig
+from astra_data.worlds.variation import (
+    AnyVariation,
+    BallVariation,
+    JointVariation,
+    PlanarVariation,
+    Variation,
+)
+
+
+def test_parameters_are_drawn_uniformly_from_their_ranges() -> None:
+    torch.manual_seed(0)
+    variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    drawn = dict(zip(variation.names, variation.draw(20_000).unbind(-1), strict=True))
+    assert (drawn["timestep_scale"] == 1.0).all() and (drawn["action_noise"] == 0.0).all()
+    for name, (low, high) in {"friction": (0.8, 1.2), "heading_bias_deg": (-5.0, 5.0)}.items():
+        assert low <= float(drawn[name].min()) and float(drawn[name].max()) <= high
+        quarters = torch.quantile(drawn[name], torch.tensor([0.25, 0.5, 0.75]))
+        width = high - low
+        expected = torch.tensor([low + width / 4, low + width / 2, low + 3 * width / 4])
+        torch.testing.assert_close(quarters, expected, atol=0.02 * width, rtol=0)
+
+
+def test_normal_parameters_are_between_minus_one_and_one() -> None:
+    variation = PlanarVariation(friction=(0.8, 1.2), action_scale=(0.1, 0.1))
+    ends = variation.ranges().T
+    torch.testing.assert_close(variation.normal(ends)[:, 0], torch.tensor([-1.0, 1.0]))
+    assert variation.normal(ends)[:, 1:].abs().max() == 0.0
+
+
+KINDS = (PlanarVariation, BallVariation, JointVariation)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_survives_json_and_knows_its_parameters(kind: type[Variation]) -> None:
+    variation = kind(**{name: (0.8, 1.2) for name in kind.model_fields})
+    assert Variation.of_json({name: list(ends) for name, ends in variation.model_dump().items()}) == variation
+    assert variation.names == tuple(kind.model_fields)
+    # What steers stays, noise and sensors become plain.
+    noiseless = variation.noiseless()
+    assert type(noiseless) is kind
+    changed = {name for name in kind.model_fields if getattr(noiseless, name) != (0.8, 1.2)}
+    assert changed == {name for name in kind.model_fields if "noise" in name or "observation" in name}
+    assert changed == set(variation.names) - set(kind.steering)
+    assert all(getattr(noiseless, name) == getattr(kind(), name) for name in changed)
+    replayed = variation.replayed()
+    sensed = {name for name in kind.model_fields if getattr(replayed, name) != (0.8, 1.2)}
+    assert sensed == set(kind.sensing) == {name for name in kind.model_fields if "observation" in name}
+
+
+def test_redrawing_leaves_the_other_rows_alone() -> None:
+    variation = PlanarVariation(friction=(0.8, 1.2))
+    before = variation.draw(4)
+    after = variation.redraw(before, torch.tensor([1, 3]))
+    assert (after != before).any(-1).tolist() == [False, True, False, True]
+
+
+def test_of_any_ranges_a_simulator_takes_its_own() -> None:
+    ranges = AnyVariation(friction=(0.8, 1.2), observation_scale=(0.9, 1.1))
+    assert ranges.of_kind(JointVariation) == JointVariation(
+        **ranges.model_dump(include={*JointVariation().names})
+    )
+    assert AnyVariation(**BallVariation().model_dump()).of_kind(PlanarVariation) == PlanarVariation()
+    with pytest.raises(
+        BadInputError, match=r"^expected ranges of friction, .*, got one of observation_scale$"
+    ):
+        ranges.of_kind(BallVariation)
+
+
+def test_an_upside_down_range_is_refused() -> None:
+    with pytest.raises(ValidationError, match="expected the lower end first"):
+        PlanarVariation(friction=(1.2, 0.8))
+
+
+@pytest.mark.parametrize("model", [PlanarVariation, CompassConfig])
+@pytest.mark.parametrize(
+    ("name", "ends", "expected"),
+    [
+        ("friction", (0.0, 1.0), "a range above 0"),
+        ("timestep_scale", (-0.5, 1.0), "a range above 0"),
+        ("action_noise", (-0.1, 0.1), "a range from 0 up"),
+        ("position_noise_m", (-0.1, 0.1), "a range from 0 up"),
+        ("velocity_noise_m_s", (-0.1, 0.1), "a range from 0 up"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(
+    model: type[Config], name: str, ends: tuple[float, float], expected: str
+) -> None:
+    with pytest.raises(RecipeError) as caught:
+        validated({"row": {name: list(ends)}}, create_model("Rows", row=(model, ...)), "r.toml")
+    assert str(caught.value) == f"r.toml: row.{name}: expected {expected}, got {list(ends)}"
