@@ -1,1 +1,85 @@
-"""Robot trajectories into LeRobot datasets, and those into policies that work on the robot."""
+"""Robot trajectories into LeRobot datasets, and those into policies that work on the robot.
+
+Every name below is loaded when it is first used, so that reading a dataset needs neither torch nor MuJoCo.
+
+data        Dataset  DatasetWriter  StagedWriter  Episode  Column  Frames
+edits       augment  pair  subset  merge
+sharing     push  pull
+worlds      Task  Objective  Simulator  TASKS
+learning    METHODS  ground  train  align  evaluate  load_policy
+all of it   run
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from astra_data.core.optional import explained
+
+if TYPE_CHECKING:
+    from astra_data.dataset.columns import Column as Column
+    from astra_data.dataset.columns import Episode as Episode
+    from astra_data.dataset.edit import merge as merge
+    from astra_data.dataset.edit import subset as subset
+    from astra_data.dataset.frames import Frames as Frames
+    from astra_data.dataset.reader import Dataset as Dataset
+    from astra_data.dataset.staging import StagedWriter as StagedWriter
+    from astra_data.dataset.writer import DatasetWriter as DatasetWriter
+    from astra_data.exchange.sharing.pull import pull as pull
+    from astra_data.exchange.sharing.push import push as push
+    from astra_data.experiments.run import run as run
+    from astra_data.experiments.trained_policy import load_policy as load_policy
+    from astra_data.methods import METHODS as METHODS
+    from astra_data.stages.align import align as align
+    from astra_data.stages.augment import augment as augment
+    from astra_data.stages.evaluate import evaluate as evaluate
+    from astra_data.stages.ground import ground as ground
+    from astra_data.stages.pair import pair as pair
+    from astra_data.stages.train import train as train
+    from astra_data.worlds.objective import Objective as Objective
+    from astra_data.worlds.protocols import Simulator as Simulator
+    from astra_data.worlds.registry import TASKS as TASKS
+    from astra_data.worlds.task import Task as Task
+
+_MODULES = {
+    "Column": "dataset.columns",
+    "Dataset": "dataset.reader",
+    "DatasetWriter": "dataset.writer",
+    "Episode": "dataset.columns",
+    "Frames": "dataset.frames",
+    "METHODS": "methods",
+    "Objective": "worlds.objective",
+    "Simulator": "worlds.protocols",
+    "StagedWriter": "dataset.staging",
+    "TASKS": "worlds.registry",
+    "Task": "worlds.task",
+    "align": "stages.align",
+    "augment": "stages.augment",
+    "evaluate": "stages.evaluate",
+    "ground": "stages.ground",
+    "load_policy": "experiments.trained_policy",
+    "merge": "dataset.edit",
+    "pair": "stages.pair",
+    "pull": "exchange.sharing.pull",
+    "push": "exchange.sharing.push",
+    "run": "experiments.run",
+    "subset": "dataset.edit",
+    "train": "stages.train",
+}
+__all__ = sorted(_MODULES)
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever is named
+    if name not in _MODULES:
+        raise AttributeError(f"module 'astra_data' has no attribute '{name}'; it has {', '.join(__all__)}")
+    try:
+        module = import_module(f"astra_data.{_MODULES[name]}")
+    except ModuleNotFoundError as error:
+        if (reported := explained(error)) is None:
+            raise
+        raise reported from error
+    globals()[name] = value = getattr(module, name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -26,6 +26,7 @@ from astra_data.cli import (
     sweeping,
 )
 from astra_data.core.errors import AstraDataError
+from astra_data.core.optional import explained
 
 app = typer.Typer(
     help="Robot trajectories into datasets, datasets into policies that transfer from an abstract simulator.",
@@ -97,10 +98,11 @@ def main() -> None:
     """Run the command line; a reported error becomes one line, unless ASTRA_DATA_DEBUG is set."""
     try:
         app()
-    except AstraDataError as error:
-        if os.environ.get("ASTRA_DATA_DEBUG"):
+    except (AstraDataError, ModuleNotFoundError) as error:
+        reported = explained(error) if isinstance(error, ModuleNotFoundError) else error
+        if reported is None or os.environ.get("ASTRA_DATA_DEBUG"):
             raise
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {reported}", err=True)
         sys.exit(1)
 
 

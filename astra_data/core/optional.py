@@ -1,9 +1,25 @@
-"""Packages that not everybody needs."""
+"""Packages of the optional extras: import them, or say how to install them."""
 
 from importlib import import_module
 from typing import Any
 
 from astra_data.core.errors import BadInputError
+
+EXTRAS = {
+    "torch": "sim",
+    "mujoco": "sim",
+    "gymnasium": "sim",
+    "gymnasium_robotics": "sim",
+    "safetensors": "sim",
+    "scipy": "sim",
+    "torchrl": "train",
+    "tensordict": "train",
+    "matplotlib": "report",
+    "PIL": "report",
+    "rliable": "report",
+    "jinja2": "report",
+}
+"""Which extra brings each package that whole rooms of the code import."""
 
 
 def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
@@ -15,10 +31,19 @@ def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
     try:
         return import_module(module)
     except ImportError as error:
-        package = module.partition(".")[0]
-        raise BadInputError(f"{package} is needed and not installed: {cure(extra)}") from error
+        raise _not_installed(module, extra) from error
+
+
+def explained(error: ModuleNotFoundError) -> BadInputError | None:
+    """Return an error that says which extra brings the missing module; None if none of `EXTRAS` does."""
+    package = (error.name or "").partition(".")[0]
+    return _not_installed(package, EXTRAS[package]) if package in EXTRAS else None
 
 
 def cure(extra: str) -> str:
     """Return the commands that install an `extra`, for messages."""
     return f'uv sync --extra {extra} in a checkout, else pip install "astra-data[{extra}]"'
+
+
+def _not_installed(module: str, extra: str) -> BadInputError:
+    return BadInputError(f"{module.partition('.')[0]} is needed and not installed: {cure(extra)}")

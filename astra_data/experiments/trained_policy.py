@@ -1,0 +1,57 @@
+"""Load what a run has trained, ready to be deployed."""
+
+import json
+from pathlib import Path
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import base_method, place
+from astra_data.experiments.plan import grounded_as
+from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.methods import method_named
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.worlds.registry import task_named
+
+
+def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> DeployedPolicy:
+    """Load the policy of a row, with its encoder if it has one; call `start` before the first `act`.
+
+    Args:
+        run: the folder of a run, such as "runs/quickstart".
+        row: a row of its recipe, such as "astra_plus".
+        seed: one of its seeds.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+
+    Raises:
+        BadInputError: the row trains no policy, or an artefact of it is not there.
+
+    Example:
+        >>> from astra_data import load_policy
+        >>> policy = load_policy("runs/quickstart", "astra")
+        >>> policy.start(1)
+        >>> velocity = policy.act(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
+    """
+    folder = Path(run)
+    recipe = folder / "recipe.json"
+    if not recipe.is_file():
+        raise BadInputError(
+            f"{folder}: expected the folder of a run, which holds recipe.json: make it with astra-data run"
+        )
+    method = method_named(row)
+    if not method.trains:
+        raise BadInputError(f"{row} trains no policy: it is written by hand")
+    base, where = grounded_as(base_method(row)), place(seed, percent)
+    files = {"train": folder / "train" / row / where / "policy.safetensors"}
+    if method.grounds:
+        files["ground"] = folder / "ground" / base / where / "grounding.safetensors"
+    if method.aligns:
+        files["align"] = folder / "align" / base / where / "target_encoder.safetensors"
+    if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
+        raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
+    return deploy(
+        task_named(json.loads(recipe.read_text())["task"]),
+        PolicyFile.load(files["train"]),
+        load_grounding(files["ground"]) if method.grounds else None,
+        load_target_encoder(files["align"]) if method.aligns else None,
+    )

@@ -1,0 +1,30 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import EXTRAS, explained, optional
+
+DISTRIBUTIONS = {"PIL": "pillow", "gymnasium_robotics": "gymnasium-robotics"}
+
+
+def test_a_missing_package_is_one_error_that_says_how_to_install_it() -> None:
+    with pytest.raises(BadInputError, match=r"^nosuch is needed .* pip install \"astra-data\[mcap\]\"$"):
+        optional("nosuch.inner", "mcap")
+    assert optional("json", "mcap").loads("1") == 1
+
+
+def test_a_module_of_an_extra_is_explained_and_others_are_not() -> None:
+    reported = explained(ModuleNotFoundError("No module named 'torch'", name="torch.nn"))
+    assert reported is not None
+    assert 'pip install "astra-data[sim]"' in str(reported)
+    assert explained(ModuleNotFoundError("No module named 'astra_data.nosuch'", name="astra_data.nosuch")) is None
+
+
+def test_every_package_is_in_the_extra_that_is_named() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    for package, extra in EXTRAS.items():
+        wanted = project["optional-dependencies"][extra]
+        assert any(entry.startswith(f"{DISTRIBUTIONS.get(package, package)}>=") for entry in wanted), package
+        assert not any(entry.startswith(f"{package}>=") for entry in project["dependencies"])

@@ -1,0 +1,170 @@
+"""How many small changes of the code do the tests notice? Mutants are drawn with Cosmic Ray.
+
+    uv run --with cosmic-ray python tools/mutate.py learning grounding --count 40 --seed 0
+
+A mutant is run, in a copy of the checkout, against the test files that import its module, the one of the same
+name first. Left out are mutants that change nothing a test could see: type unions, defaults of settings,
+decorators. Survivors are printed as diffs: read them, for some are equivalent.
+"""
+
+import ast
+import difflib
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Annotated
+
+import typer
+from cosmic_ray.mutating import MutationVisitor
+from cosmic_ray.plugins import get_operator, operator_names
+from rich.console import Console
+from rich.progress import Progress
+
+ROOT = Path(__file__).parents[1]
+SKIPPED = ("BitOr", "RemoveDecorator", "VariableInserter", "VariableReplacer")
+PATIENCE_S = 240
+"""A mutant whose tests take longer counts as noticed."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one file, whose path is below the checkout."""
+
+    path: Path
+    operator: str
+    code: str
+
+    def diff(self) -> str:
+        """Return the change as a unified diff."""
+        before = (ROOT / self.path).read_text().splitlines()
+        lines = difflib.unified_diff(
+            before, self.code.splitlines(), str(self.path), str(self.path), "", "", 0, ""
+        )
+        return "\n".join(list(lines)[2:])
+
+
+def mutants(path: Path) -> Iterator[Mutant]:
+    """Yield every mutant of a file, one per place and operator, but for those that no test could see."""
+    source = (ROOT / path).read_text()
+    settings = {
+        line
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.ClassDef)
+        for field in node.body
+        if isinstance(field, ast.AnnAssign)
+        for line in range(field.lineno, (field.end_lineno or field.lineno) + 1)
+    }
+    lines = source.splitlines()
+    for name in operator_names():
+        if any(skipped in name for skipped in SKIPPED):
+            continue
+        occurrence = 0
+        while (code := MutationVisitor.mutate_code(source, get_operator(name)(), occurrence)) is not None:
+            occurrence += 1
+            changed = {
+                number
+                for number, (old, new) in enumerate(zip(lines, code.splitlines(), strict=False), start=1)
+                if old != new
+            }
+            if changed and not changed & settings:
+                yield Mutant(path, name, code)
+
+
+def tests_of(path: Path) -> list[str]:
+    """Return the test files that import the module at `path`, the mirrored one first."""
+    module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+    package, _, name = module.rpartition(".")
+    mirrored = Path("tests", *path.parts[1:-1], f"test_{path.name}")
+    found = [mirrored] if (ROOT / mirrored).exists() else []
+    for test in sorted(ROOT.glob("tests/**/test_*.py")):
+        names = {
+            f"{node.module}.{alias.name}"
+            for node in ast.walk(ast.parse(test.read_text()))
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        if any(one == f"{package}.{name}" or one.startswith(f"{module}.") for one in names):
+            found.append(test.relative_to(ROOT))
+    return [str(test) for test in dict.fromkeys(found)]
+
+
+def is_noticed(mutant: Mutant, copy: Path, tests: list[str]) -> bool:
+    """Run the tests on the mutant in a copy of the checkout."""
+    target = copy / mutant.path
+    target.write_text(mutant.code)
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", *tests]
+    settings = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(command, cwd=copy, env=settings, capture_output=True, timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        return True
+    finally:
+        shutil.copy(ROOT / mutant.path, target)
+    return done.returncode != 0
+
+
+def main(
+    rooms: Annotated[list[str], typer.Argument(help="Rooms or files below astra_data.")],
+    count: Annotated[int, typer.Option(help="Mutants to draw.", min=1)] = 40,
+    seed: Annotated[int, typer.Option(help="Of the draw.")] = 0,
+    jobs: Annotated[int, typer.Option(help="Mutants at a time.", min=1)] = 2,
+) -> None:
+    """Draw mutants of the rooms and count those that the tests notice."""
+    console, draw = Console(), random.Random(seed)
+    files = [
+        file.relative_to(ROOT)
+        for room in rooms
+        for file in (
+            [ROOT / "astra_data" / room]
+            if room.endswith(".py")
+            else (ROOT / "astra_data" / room).rglob("*.py")
+        )
+    ]
+    tested = {file: tests for file in files if (tests := tests_of(file))}
+    console.print(
+        f"not run, for no test imports them: {', '.join(map(str, set(files) - set(tested))) or 'none'}"
+    )
+    every = [mutant for file in sorted(tested) for mutant in mutants(file)]
+    drawn = draw.sample(every, min(count, len(every)))
+    noticed: Counter[str] = Counter()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ThreadPoolExecutor(jobs) as pool,
+        Progress(console=console) as bar,
+    ):
+        copies: SimpleQueue[Path] = SimpleQueue()
+        for number in range(jobs):
+            copy = Path(folder) / str(number)
+            shutil.copytree(
+                ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", ".*_cache", "runs", "datasets")
+            )
+            copies.put(copy)
+
+        def run(mutant: Mutant) -> None:
+            copy = copies.get()
+            seen = is_noticed(mutant, copy, tested[mutant.path])
+            copies.put(copy)
+            noticed["killed" if seen else "survived"] += 1
+            if not seen:
+                console.print(f"\nsurvived ({mutant.operator}):\n{mutant.diff()}", markup=False)
+            bar.advance(task)
+
+        task = bar.add_task("mutants", total=len(drawn))
+        list(pool.map(run, drawn))
+    killed = noticed["killed"]
+    console.print(
+        f"{killed} of {len(drawn)} mutants noticed ({killed / len(drawn):.0%}), of {len(every)} possible"
+    )
+
+
+if __name__ == "__main__":
+    typer.run(main)
