@@ -1,22 +1,3 @@
-"""Target environments: batched, and registered with Gymnasium together with their abstract counterparts.
+"""`import astra_data.envs` registers the Gymnasium ids; see `astra_data.training.gymnasium_ids`."""
 
-    import astra_data.envs
-    gymnasium.make("astra_data/AntMazeUMaze-v0")
-    gymnasium.make_vec("astra_data/AntMazeUMaze-v0", num_envs=64)
-
-Everything else stays unloaded until an environment is made.
-"""
-
-import gymnasium
-
-_FACES = "astra_data.training.gymnasium"
-
-for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaze-long", 1000)):
-    for _world, _faces in (("AntMaze", "ant_maze"), ("PointMaze", "point_maze")):
-        gymnasium.register(
-            f"astra_data/{_world}{_maze}-v0",
-            entry_point=f"{_FACES}:{_faces}",
-            vector_entry_point=f"{_FACES}:{_faces}_vector",
-            max_episode_steps=_horizon,
-            kwargs={"task": _task},
-        )
+from astra_data.training import gymnasium_ids as gymnasium_ids

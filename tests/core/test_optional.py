@@ -19,7 +19,10 @@ def test_a_module_of_an_extra_is_explained_and_others_are_not() -> None:
     reported = explained(ModuleNotFoundError("No module named 'torch'", name="torch.nn"))
     assert reported is not None
     assert 'pip install "astra-data[sim]"' in str(reported)
-    assert explained(ModuleNotFoundError("No module named 'astra_data.nosuch'", name="astra_data.nosuch")) is None
+    assert (
+        explained(ModuleNotFoundError("No module named 'astra_data.nosuch'", name="astra_data.nosuch"))
+        is None
+    )
 
 
 def test_every_package_is_in_the_extra_that_is_named() -> None:

@@ -1,0 +1,22 @@
+"""Gymnasium ids of the target environments and of the abstract simulators, registered on import.
+
+    import astra_data.envs
+    gymnasium.make("astra_data/AntMazeUMaze-v0")
+    gymnasium.make_vec("astra_data/AntMazeUMaze-v0", num_envs=64)
+
+Everything else stays unloaded until an environment is made.
+"""
+
+import gymnasium
+
+_FACES = "astra_data.training.gymnasium"
+
+for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaze-long", 1000)):
+    for _world, _faces in (("AntMaze", "ant_maze"), ("PointMaze", "point_maze")):
+        gymnasium.register(
+            f"astra_data/{_world}{_maze}-v0",
+            entry_point=f"{_FACES}:{_faces}",
+            vector_entry_point=f"{_FACES}:{_faces}_vector",
+            max_episode_steps=_horizon,
+            kwargs={"task": _task},
+        )
