@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 
 from rich.table import Table
 
-from astra_data.experiments.local_executor import Item
+from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Point
 from astra_data.reports.figures import method_title
 from astra_data.worlds.score import Score

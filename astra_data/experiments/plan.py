@@ -19,7 +19,7 @@ from pydantic import JsonValue
 from astra_data.core.config import Config
 from astra_data.core.naming import base_method, is_plus, place, reference_of
 from astra_data.dataset.edit import share
-from astra_data.experiments.local_executor import Item
+from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Part
 from astra_data.experiments.recipe import METHOD_TABLES, WHOLE, Recipe
 from astra_data.methods import METHODS

@@ -17,8 +17,9 @@ from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
 from astra_data.experiments.display import display
+from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
-from astra_data.experiments.local_executor import Item, Watcher, execute
+from astra_data.experiments.local_executor import execute
 from astra_data.experiments.plan import grounded_as, plan, stage_of
 from astra_data.experiments.points import Part
 from astra_data.experiments.ray_executor import execute_on_cluster

@@ -19,8 +19,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.experiments.board import Board, needed
 from astra_data.experiments.display import display
+from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import Experiment, load_experiment
-from astra_data.experiments.local_executor import Item, Watcher
 from astra_data.experiments.plan import plan, stage_of
 from astra_data.experiments.points import Part, Point
 from astra_data.experiments.recipe import WHOLE

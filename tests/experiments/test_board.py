@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from astra_data.experiments.board import Board
-from astra_data.experiments.local_executor import Item
+from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Point
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS
 
