@@ -59,7 +59,7 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
         }
     ]
     told = capsys.readouterr().out
-    assert "evaluate/nas/percent_050/seed_1  done 1.00  (1 of 1 points, 0 min left)" in told
+    assert "evaluate/nas/percent_050/seed_1  done 1.00  (1 of 1 points)" in told
 
     # A point whose artefacts are removed is not finished any more; the table says what is there.
     sweep(recipe, root=tmp_path, jobs=2)
