@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 from fake_runs import bare_results, write_json
-from typer.testing import CliRunner
 
-from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.points import Point
@@ -180,18 +178,3 @@ def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: p
     assert (began["project"], began["name"], ended) == ("ants", "r follower 50 1", "finished")
     assert began["config"]["dataset_hash"] == "hash1"
     assert logged["success"] == 1.0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--percent", "75"], "the recipe has no size 75; its sizes: 50, 150"),
-        (["--method", "nass"], "the recipe has no method 'nass': did you mean 'nas'?"),
-        (["--address", "head:6379"], "sweep: --address is for --engine ray"),
-        (["--engine", "ray", "--device", "cuda:1"], "expected device cpu or cuda on a cluster, got 'cuda:1'"),
-    ],
-)
-def test_bad_options(recipe: Path, tmp_path: Path, options: list[str], message: str) -> None:
-    result = CliRunner().invoke(cli.app, ["sweep", str(recipe), "--root", str(tmp_path), *options])
-    assert isinstance(result.exception, BadInputError)
-    assert str(result.exception) == message
