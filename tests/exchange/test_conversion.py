@@ -82,9 +82,11 @@ def test_values_that_do_not_fit_are_refused(spec: dict[str, Any], values: Any, t
 
 def test_whole_numbers_and_flags_keep_their_types_where_rows_are_rejected() -> None:
     values, finite = convert({"dtype": "int64"}, [3.0, NAN])
-    assert (values.dtype, values[0], finite) == (np.int64, 3, [True, False])
+    assert values.dtype.name == "int64"
+    assert (int(values[0]), finite) == (3, [True, False])
     values, _ = convert({}, [1, 0, 1], name=TERMINATED)
-    assert (values.dtype, values.tolist()) == (bool, [True, False, True])
+    assert values.dtype.name == "bool"
+    assert values.tolist() == [True, False, True]
 
 
 def test_a_column_that_changes_in_size_is_refused() -> None:

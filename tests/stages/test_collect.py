@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,16 +52,16 @@ def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -
 
 def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated() -> None:
     ends = torch.tensor([True, False])
-    env = SimpleNamespace(
+    env: Any = SimpleNamespace(
         state=torch.zeros(2, 3),
         goal=torch.zeros(2, 2),
         step=lambda action, active: SimpleNamespace(
             reward=torch.zeros(2), terminated=ends, success=torch.zeros(2, dtype=torch.bool)
         ),
     )
-    behavior = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
+    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
     for last, truncated in ((True, ~ends), (False, torch.zeros(2, dtype=torch.bool))):
-        row = _step(env, behavior, ends, last=last)  # type: ignore[arg-type]
+        row = _step(env, behavior, ends, last=last)
         assert torch.equal(row[TERMINATED], ends)
         assert torch.equal(row[TRUNCATED], truncated)
         assert torch.equal(row[DONE], ends | truncated)
