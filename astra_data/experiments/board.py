@@ -5,12 +5,12 @@ from collections.abc import Collection, Mapping
 
 from rich.table import Table
 
-from astra_data.experiments.points import Point
+from astra_data.experiments.points import RunPoint
 from astra_data.reports.figures import method_title
 from astra_data.worlds.score import Score
 
 
-def board(points: Collection[Point], means: Mapping[Point, float], score: Score) -> Table:
+def board(points: Collection[RunPoint], means: Mapping[RunPoint, float], score: Score) -> Table:
     """Draw methods by sizes, or by seeds where there are no sizes.
 
     Args:
@@ -19,7 +19,7 @@ def board(points: Collection[Point], means: Mapping[Point, float], score: Score)
         score: that is shown.
     """
     has_sizes = len({point.percent for point in points}) > 1
-    columns: dict[str, list[Point]] = defaultdict(list)
+    columns: dict[str, list[RunPoint]] = defaultdict(list)
     for point in points:
         columns[f"{point.percent} %" if has_sizes else f"seed {point.seed}"].append(point)
     table = Table(title=progress_text(points, means), title_justify="left")
@@ -32,12 +32,12 @@ def board(points: Collection[Point], means: Mapping[Point, float], score: Score)
     return table
 
 
-def progress_text(points: Collection[Point], means: Mapping[Point, float]) -> str:
+def progress_text(points: Collection[RunPoint], means: Mapping[RunPoint, float]) -> str:
     """Return how many of the points are finished."""
     return f"{sum(point in means for point in points)} of {len(points)} points"
 
 
-def _cell(points: Collection[Point], means: Mapping[Point, float], score: Score) -> str:
+def _cell(points: Collection[RunPoint], means: Mapping[RunPoint, float], score: Score) -> str:
     """Return the score of a point; of several, how many are done, and their mean score."""
     done = [means[point] for point in points if point in means]
     count = "" if len(points) == 1 else f"{len(done)} of {len(points)} "

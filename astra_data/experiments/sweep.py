@@ -23,7 +23,7 @@ from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.plan import plan, stage_of
-from astra_data.experiments.points import Part, Point
+from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
 from astra_data.experiments.run import RUNS, make
 from astra_data.reports.artefacts import EVALUATION, Artefact, Evaluation, read_json
@@ -79,7 +79,7 @@ def sweep(
         AstraDataError: an item failed.
     """
     experiment = load_experiment(recipe_path, root)
-    part = Part.of(experiment.recipe, methods, seeds, percents)
+    part = Selection.of(experiment.recipe, methods, seeds, percents)
     log = _tracked(trackio, experiment.folder.name) if trackio else None
     items = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     points = part.points()
@@ -92,8 +92,8 @@ def sweep(
 
 
 def _left(
-    points: Sequence[Point], items: Sequence[Item], published: Collection[Point]
-) -> tuple[tuple[Point, ...], tuple[Item, ...]]:
+    points: Sequence[RunPoint], items: Sequence[Item], published: Collection[RunPoint]
+) -> tuple[tuple[RunPoint, ...], tuple[Item, ...]]:
     """Return the points that are not published, and what they need, with the report."""
     left = tuple(point for point in points if point not in published)
     if not left:
@@ -116,16 +116,16 @@ class PointTable:
         means: score of each finished point, the mean over its episodes.
     """
 
-    def __init__(self, experiment: Experiment, points: Collection[Point]) -> None:
+    def __init__(self, experiment: Experiment, points: Collection[RunPoint]) -> None:
         """Look at all points of the recipe; show `points`."""
         recipe, self.experiment, self.folder = experiment.recipe, experiment, experiment.folder
-        self.means: dict[Point, float] = {}
+        self.means: dict[RunPoint, float] = {}
         self._headline = recipe.headline
-        self._points, self.shown = Part.of(recipe).points(), tuple(points)
+        self._points, self.shown = Selection.of(recipe).points(), tuple(points)
         self._items = {item.key: item for item in plan(recipe, experiment.path, self.folder)}
-        self._lines: dict[Point, dict[str, Any]] = {}
+        self._lines: dict[RunPoint, dict[str, Any]] = {}
 
-    def write(self) -> dict[Point, dict[str, Any]]:
+    def write(self) -> dict[RunPoint, dict[str, Any]]:
         """Write the lines of all points that are finished now, and return them."""
         for point in self._points:
             # The line of a finished point does not change any more.
@@ -142,7 +142,7 @@ class PointTable:
         replace(partial_file, self.folder / "sweep.csv")
         return lines
 
-    def message(self, point: Point) -> str:
+    def message(self, point: RunPoint) -> str:
         """Return one line for a point that has just finished."""
         score = self._headline.text(self.means[point])
         return f"{point.key}  done {score}  ({progress_text(self.shown, self.means)})"
@@ -150,7 +150,7 @@ class PointTable:
     def __rich__(self) -> Table:
         return board(self.shown, self.means, self._headline)
 
-    def _line(self, point: Point) -> dict[str, Any]:
+    def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
         means = evaluation.target.means()
         stages = {key: key.partition("/")[0] for key in sorted(set(_needed(point.key, self._items)))}

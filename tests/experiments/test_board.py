@@ -3,11 +3,11 @@ from io import StringIO
 from rich.console import Console
 
 from astra_data.experiments.board import board, progress_text
-from astra_data.experiments.points import Point
+from astra_data.experiments.points import RunPoint
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS, Score
 
 
-def drawn(points: list[Point], means: dict[Point, float], score: Score = SUCCESS) -> list[list[str]]:
+def drawn(points: list[RunPoint], means: dict[RunPoint, float], score: Score = SUCCESS) -> list[list[str]]:
     """Return the cells of the table, row by row, as the terminal shows them."""
     file = StringIO()
     Console(file=file, width=100).print(board(points, means, score))
@@ -16,14 +16,14 @@ def drawn(points: list[Point], means: dict[Point, float], score: Score = SUCCESS
 
 
 def test_without_sizes_there_is_a_column_for_each_seed() -> None:
-    points = [Point(method, seed) for method in ("nas", "astra") for seed in (0, 1)]
+    points = [RunPoint(method, seed) for method in ("nas", "astra") for seed in (0, 1)]
     shown = drawn(points, {points[0]: 0.714, points[3]: 1.0})
     assert shown[0] == ["method", "seed 0", "seed 1"]
     assert [row[1:] for row in shown[1:]] == [["done 0.71", ""], ["", "done 1.00"]]
 
 
 def test_with_sizes_a_cell_counts_its_seeds_and_shows_their_mean() -> None:
-    points = [Point("nas", seed, percent) for percent in (25, 50) for seed in (0, 1, 2)]
+    points = [RunPoint("nas", seed, percent) for percent in (25, 50) for seed in (0, 1, 2)]
     shown = drawn(points, {points[0]: 0.5, points[1]: 0.7})
     assert shown[0][1:] == ["25 %", "50 %"]
     assert shown[1][1:] == ["2 of 3 done 0.60", "0 of 3 done"]
@@ -31,11 +31,11 @@ def test_with_sizes_a_cell_counts_its_seeds_and_shows_their_mean() -> None:
 
 
 def test_one_size_of_one_seed_is_a_point_of_its_own() -> None:
-    points = [Point("nas", 3, 50)]
+    points = [RunPoint("nas", 3, 50)]
     assert drawn(points, {points[0]: 0.25})[1][1:] == ["done 0.25"]
 
 
 def test_only_the_points_that_are_shown_are_counted() -> None:
-    points = [Point("nas", seed) for seed in range(3)]
-    means = {points[1]: 0.5, Point("astra", 0): 0.5}
+    points = [RunPoint("nas", seed) for seed in range(3)]
+    means = {points[1]: 0.5, RunPoint("astra", 0): 0.5}
     assert progress_text(points, means) == "1 of 3 points"
