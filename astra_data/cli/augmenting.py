@@ -32,14 +32,6 @@ def augment(
             show_default="translations",
         ),
     ] = None,
-    reflections: Annotated[
-        bool | None,
-        typer.Option(
-            "--reflections/--no-reflections",
-            help="Mirror half of the copies.",
-            show_default="no-reflections",
-        ),
-    ] = None,
     held_out_share: Annotated[
         float | None, typer.Option(help="Share of episodes never to be copied.", show_default="0.1")
     ] = None,
@@ -63,7 +55,7 @@ def augment(
     ] = None,
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
 ) -> None:
-    """Turn, move and mirror episodes into more of them; the dataset must not be paired yet."""
+    """Turn and move episodes into more of them; the dataset must not be paired yet."""
     from astra_data.core.config import validated
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown
@@ -75,7 +67,6 @@ def augment(
         "episodes": episodes,
         "rotations": rotations,
         "translations": translations,
-        "reflections": reflections,
         "held_out_share": held_out_share,
         "keep_originals": keep_originals,
         "margin_m": margin_m,

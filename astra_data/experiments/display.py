@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from astra_data.core.progress import Progress as Notes
-from astra_data.experiments.local_executor import Watcher
+from astra_data.experiments.execution import Watcher
 
 SECONDS_OF_SPEED = 600
 """How far back the estimate of the remaining time looks."""

@@ -5,7 +5,7 @@ point, written anew from the artefacts themselves whenever one is finished.
 """
 
 import csv
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from io import StringIO
@@ -14,17 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.experiments.board import Board, needed
+from astra_data.experiments.board import board, progress_text
 from astra_data.experiments.display import display
+from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import Experiment, load_experiment
-from astra_data.experiments.local_executor import Item, Watcher
 from astra_data.experiments.plan import plan, stage_of
-from astra_data.experiments.points import Part, Point
+from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
-from astra_data.experiments.run import RUNS, finished, make
+from astra_data.experiments.run import RUNS, make
 from astra_data.reports.artefacts import EVALUATION, Artefact, Evaluation, read_json
 
 TIMED = {
@@ -33,7 +34,7 @@ TIMED = {
     "align": "metrics.json",
     "evaluate": EVALUATION,
 }
-"""Stages that work for few points, and the file that tells how long they took."""
+"""Stages that are run for few points at once, and the file with the time that they took."""
 
 COLUMNS = (
     *("method", "percent", "seed", "success", "steps", "return", "failed", "simulated_success"),
@@ -41,7 +42,7 @@ COLUMNS = (
 )
 
 Log = Callable[[dict[str, Any]], None]
-"""Is told the line of each point that is finished."""
+"""Called with the line of each point that is finished."""
 
 
 def sweep(
@@ -78,22 +79,21 @@ def sweep(
         AstraDataError: an item failed.
     """
     experiment = load_experiment(recipe_path, root)
-    part = Part.of(experiment.recipe, methods, seeds, percents)
+    part = Selection.of(experiment.recipe, methods, seeds, percents)
     log = _tracked(trackio, experiment.folder.name) if trackio else None
-    table = Table(experiment)
     items = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     points = part.points()
     if unpublished:
         points, items = _left(points, items, experiment.published())
     wanted = [item for item in items if experiment.maker(stage_of(item)) is experiment]
-    show = partial(_shown, table, points, items, log)
+    show = partial(_shown, PointTable(experiment, points), log)
     make(experiment, wanted, jobs=jobs, device=device, cluster=cluster, show=show)
     return experiment.folder
 
 
 def _left(
-    points: Sequence[Point], items: Sequence[Item], published: Collection[Point]
-) -> tuple[tuple[Point, ...], tuple[Item, ...]]:
+    points: Sequence[RunPoint], items: Sequence[Item], published: Collection[RunPoint]
+) -> tuple[tuple[RunPoint, ...], tuple[Item, ...]]:
     """Return the points that are not published, and what they need, with the report."""
     left = tuple(point for point in points if point not in published)
     if not left:
@@ -108,24 +108,31 @@ def _left(
     return left, tuple(item for item in items if item.key in needs)
 
 
-class Table:
-    """The finished points of a recipe, in `sweep.csv`."""
+class PointTable:
+    """The finished points of a recipe: `sweep.csv`, and a table of those asked for in the terminal.
 
-    def __init__(self, experiment: Experiment) -> None:
-        """Look at all points of the recipe, whichever are made now."""
+    Attributes:
+        shown: the points asked for.
+        means: score of each finished point, the mean over its episodes.
+    """
+
+    def __init__(self, experiment: Experiment, points: Collection[RunPoint]) -> None:
+        """Look at all points of the recipe; show `points`."""
         recipe, self.experiment, self.folder = experiment.recipe, experiment, experiment.folder
-        self.headline = recipe.headline
-        self._points = Part.of(recipe).points()
+        self.means: dict[RunPoint, float] = {}
+        self._headline = recipe.headline
+        self._points, self.shown = Selection.of(recipe).points(), tuple(points)
         self._items = {item.key: item for item in plan(recipe, experiment.path, self.folder)}
-        self._lines: dict[Point, dict[str, Any]] = {}
+        self._lines: dict[RunPoint, dict[str, Any]] = {}
 
-    def write(self) -> dict[Point, dict[str, Any]]:
+    def write(self) -> dict[RunPoint, dict[str, Any]]:
         """Write the lines of all points that are finished now, and return them."""
         for point in self._points:
-            # What is finished does not change any more.
+            # The line of a finished point does not change any more.
             if point not in self._lines and (self.folder / point.key).is_dir():
                 self._lines[point] = self._line(point)
         lines = {point: self._lines[point] for point in self._points if point in self._lines}
+        self.means = {point: line[self._headline.measure] for point, line in lines.items()}
         text = StringIO()
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -135,12 +142,20 @@ class Table:
         replace(partial_file, self.folder / "sweep.csv")
         return lines
 
-    def _line(self, point: Point) -> dict[str, Any]:
+    def message(self, point: RunPoint) -> str:
+        """Return one line for a point that has just finished."""
+        score = self._headline.text(self.means[point])
+        return f"{point.key}  done {score}  ({progress_text(self.shown, self.means)})"
+
+    def __rich__(self) -> Table:
+        return board(self.shown, self.means, self._headline)
+
+    def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
         means = evaluation.target.means()
-        stages = {key: key.partition("/")[0] for key in sorted(set(needed(point.key, self._items)))}
+        stages = {key: key.partition("/")[0] for key in sorted(set(_needed(point.key, self._items)))}
         timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
-        # What a point was made of may have been deleted since.
+        # The artefacts that a point was made of may have been deleted since.
         is_complete = all(file.is_file() for file in timed)
         seconds = [read_json(Artefact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
         simulated = evaluation.simulated
@@ -160,62 +175,41 @@ class Table:
         }
 
 
+def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
+    """Yield `key` and the keys of all artefacts that it is made of.
+
+    An evaluation is made of the policy and its encoder, not of the simulators in which it tests them.
+    """
+    yield key
+    for read in items[key].inputs:
+        if not (key.startswith("evaluate/") and read.startswith("ground/")):
+            yield from _needed(read, items)
+
+
 @contextmanager
-def _shown(
-    table: Table,
-    points: Collection[Point],
-    items: Collection[Item],
-    log: Log | None,
-    total: int,
-    console: Console,
-) -> Iterator[Watcher]:
-    """Show the points above the running items, and keep the table."""
-    lines = table.write().items()
-    means = {point: line[table.headline.measure] for point, line in lines if point in set(points)}
-    to_do = [item.key for item in items if not finished(item, table.experiment)]
-    board = Board(points, items, table.headline, means, to_do)
-    with display(total, console, above=board) as watch:
-        yield _PointWatcher(watch, board, {point.key: point for point in points}, table, log, console)
+def _shown(table: PointTable, log: Log | None, total: int, console: Console) -> Iterator[Watcher]:
+    """Show the points above the running items, and keep `sweep.csv` up to date."""
+    table.write()
+    with display(total, console, above=table) as watch:
+        yield _PointWatcher(watch, table, log, console)
 
 
 class _PointWatcher:
-    """Passes on what it is told, and writes down every point that is finished."""
+    """Passes notifications on, and writes down every point that is finished."""
 
-    def __init__(
-        self,
-        watch: Watcher,
-        board: Board,
-        points: dict[str, Point],
-        table: Table,
-        log: Log | None,
-        console: Console,
-    ) -> None:
-        self._watch, self._board, self._points = watch, board, points
-        self._table, self._log, self._console = table, log, console
-
-    def started(self, key: str) -> None:
-        self._board.started(key)
-        self._watch.started(key)
-
-    def progressed(self, key: str, fraction: float, note: str) -> None:
-        self._board.progressed(key, fraction)
-        self._watch.progressed(key, fraction, note)
+    def __init__(self, watch: Watcher, table: PointTable, log: Log | None, console: Console) -> None:
+        self.started, self.progressed, self.failed = watch.started, watch.progressed, watch.failed
+        self._watch, self._table, self._log, self._console = watch, table, log, console
 
     def finished(self, key: str, seconds: float) -> None:
-        self._board.finished(key, seconds)
         self._watch.finished(key, seconds)
-        if key in self._points:
-            point = self._points[key]
-            line = self._table.write()[point]
-            self._board.done(point, line[self._table.headline.measure])
-            told = f"{key}  {self._board.state(point)}  ({self._board.whole()})"
-            self._console.print(told, markup=False, highlight=False, soft_wrap=True)
-            if self._log:
-                self._log(line)
-
-    def failed(self, key: str) -> None:
-        self._board.failed(key)
-        self._watch.failed(key)
+        point = next((point for point in self._table.shown if point.key == key), None)
+        if point is None:
+            return
+        line = self._table.write()[point]
+        self._console.print(self._table.message(point), markup=False, highlight=False, soft_wrap=True)
+        if self._log:
+            self._log(line)
 
 
 def _tracked(project: str, recipe: str) -> Log:

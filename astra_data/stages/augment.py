@@ -1,4 +1,4 @@
-"""Augment: more episodes from few, by turning, moving and mirroring them on the floor.
+"""Augment: more episodes from few, by turning and moving them on the floor.
 
 What is copied is true of the copy as well, for nothing in the robot's dynamics knows where it is and which
 way it faces, but for three things, which decide how it is done:
@@ -61,8 +61,8 @@ class AugmentConfig(Config):
     "quarter": by multiples of 90 degrees, each as often, for every command stays within its limit."""
     translations: bool = True
     """To anywhere in the maze; otherwise the copy starts where the original did."""
-    reflections: bool = Field(default=False, validate_default=True)
-    """Mirror half of the copies; only where the robot and its controller are their own mirror image."""
+    reflections: bool = Field(default=False, deprecated="copies are not mirrored")
+    """Always false; kept because the seeds of copies depend on it."""
     held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """Share of the episodes that is set aside before, at least one unless it is 0."""
     keep_originals: bool = True
@@ -83,11 +83,18 @@ class AugmentConfig(Config):
             raise ValueError("expected either copies or episodes, got both")
         return episodes
 
+    @field_validator("translations")
+    @classmethod
+    def _changes_something(cls, translations: bool, info: ValidationInfo) -> bool:
+        if not translations and info.data.get("rotations") == "none":
+            raise ValueError("expected rotations or translations, got neither")
+        return translations
+
     @field_validator("reflections")
     @classmethod
-    def _changes_something(cls, reflections: bool, info: ValidationInfo) -> bool:
-        if not reflections and info.data.get("rotations") == "none" and not info.data.get("translations"):
-            raise ValueError("expected rotations, translations or reflections, got none of them")
+    def _is_no_longer_offered(cls, reflections: bool) -> bool:
+        if reflections:
+            raise ValueError("expected false, for copies are not mirrored any more: leave the key out")
         return reflections
 
 
@@ -104,8 +111,8 @@ def augment(
     """Write a version of `dataset` with copies of its training episodes; return its folder.
 
     Every episode's metadata says whether it is `held_out`; a copy's also `source_episode` (uid),
-    `augmentation_first_step` (of the source) and the map from it, p ↦ R(`augmentation_rotation_rad`) M p +
-    (`augmentation_x_m`, `augmentation_y_m`), where M turns y into -y if `augmentation_reflected`.
+    `augmentation_first_step` (of the source) and the map from it, p ↦ R(`augmentation_rotation_rad`) p +
+    (`augmentation_x_m`, `augmentation_y_m`).
 
     Args:
         task: that judges copies; by default the one that the dataset was collected for.
@@ -124,12 +131,11 @@ def augment(
     source = Dataset.open(dataset)
     world = _task_of(source, task)
     plane = world.planar
-    _check(source, world, config)
+    _check(source, world)
     relocation = Relocation(
         world,
         rotations=config.rotations,
         translations=config.translations,
-        reflections=config.reflections,
         margin_m=plane.wall_reach_m if config.margin_m is None else config.margin_m,
         min_steps=config.min_steps,
         tries=config.tries,
@@ -181,7 +187,7 @@ def _task_of(source: Dataset, task: str | None) -> Task:
     return task_named(task or str(collected_for))
 
 
-def _check(source: Dataset, world: Task, config: AugmentConfig) -> None:
+def _check(source: Dataset, world: Task) -> None:
     columns = {column.name: column for column in source.schema}
     faults = [f"no column {name}" for name in _OUTCOMES if name not in columns]
     for expected in world.state_columns:
@@ -195,11 +201,7 @@ def _check(source: Dataset, world: Task, config: AugmentConfig) -> None:
         faults.append("held_out: it has been augmented; augment its parent")
     if world.ball_index is not None:
         faults.append("it has a ball: what becomes of a moved episode is judged by the robot's place alone")
-    if config.reflections and not world.planar.is_mirrorable:
-        faults.append("its controller does not act in mirror images: leave out --reflections")
-    change = PlanarMap(reflected=config.reflections)
-    for column in _moving(source):
-        faults += change.faults(column)
+    faults += [f"{column.name}: its roles are not told" for column in _moving(source) if not column.roles]
     if faults:
         raise BadInputError(f"{source.root} cannot be augmented for {world.name}: {'; '.join(faults)}")
 
@@ -269,7 +271,6 @@ def _copied(
             "augmentation_rotation_rad": change.rotation_rad,
             "augmentation_x_m": change.shift_m[0],
             "augmentation_y_m": change.shift_m[1],
-            "augmentation_reflected": change.reflected,
         },
     )
 

@@ -1,9 +1,30 @@
-"""What the toolkit needs of an abstract simulator."""
+"""What the toolkit needs of an abstract simulator.
+
+A class of your own is an `OwnSimulator`; `astra-data pair --simulator cart.py:Cart` pairs a dataset with it:
+
+    class Cart:
+        abstract_state = Column("abstract.state", size=2, names=("x", "v"))
+        parameters = {"timestep_s": 0.05}
+
+        def __init__(self, num_envs: int) -> None: ...
+
+        @staticmethod
+        def abstraction(state: Array) -> Array: ...                               # φ: (B, S) -> (B, 2)
+
+        def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None: ...
+
+        def step(self, action: Tensor) -> Tensor: ...                             # (B, A) -> (B, 2)
+
+`self.state` holds the present states. A simulator that policies are trained in also needs what
+`TaskSimulator` adds.
+"""
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
+
+from astra_data.dataset.columns import Column
 
 
 class SteppedSimulator(Protocol):
@@ -23,8 +44,32 @@ class SteppedSimulator(Protocol):
         ...
 
 
+class AbstractSimulator(SteppedSimulator, Protocol):
+    """A simulator that datasets can be paired with."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Numbers or texts that a dataset paired with this simulator records about it."""
+        ...
+
+
+class OwnSimulator(AbstractSimulator, Protocol):
+    """A simulator from a file of the user's, with its map from target states; built as `Own(num_envs)`.
+
+    Attributes:
+        abstract_state: the column of abstract states, with names, units, frames and roles.
+    """
+
+    abstract_state: Column
+
+    @staticmethod
+    def abstraction(state: Any) -> Any:  # noqa: ANN401 - numpy arrays of either precision
+        """Map target states (B, S) to abstract states (B, X), numpy in, numpy out."""
+        ...
+
+
 class PlacedSimulator(SteppedSimulator, Protocol):
-    """B abstract states that something else may put where the simulator itself would not have taken them."""
+    """A simulator whose states a correction may move after each step."""
 
     @property
     def blocked(self) -> Tensor:
@@ -36,22 +81,21 @@ class PlacedSimulator(SteppedSimulator, Protocol):
         ...
 
 
+class VariableSimulator(PlacedSimulator, Protocol):
+    """A simulator whose parameters can be set row by row."""
+
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use `parameters` by name, (B, 1) each, from the next step on; those without effect are ignored."""
+        ...
+
+
+class TaskSimulator(VariableSimulator, AbstractSimulator, Protocol):
+    """The abstract simulator of a task."""
+
+
 @runtime_checkable
 class RememberingSimulator(Protocol):
     """A simulator whose next steps depend on more than its states."""
 
     memory: Tensor
-    """What they depend on besides, (B, M); `reset_to` and `settle` forget what was."""
-
-
-class AbstractSimulator(SteppedSimulator, Protocol):
-    """A simulator that datasets can be paired with; bring your own by writing these four."""
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """What a dataset paired with this simulator records about it."""
-        ...
-
-
-class PairedSimulator(PlacedSimulator, AbstractSimulator, Protocol):
-    """The abstract simulator of a task."""
+    """The rest of what they depend on, (B, M); `reset_to` and `settle` start it anew."""

@@ -13,22 +13,14 @@ from astra_data.dataset.columns import Column
 from astra_data.worlds.batched import TargetEnv
 from astra_data.worlds.objective import Objective, PlanarObjective
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.protocols import PairedSimulator
+from astra_data.worlds.protocols import TaskSimulator, VariableSimulator
 from astra_data.worlds.variation import Variation, VariedSimulator
 
 
 class MakeSimulator(Protocol):
     """Builds B abstract simulators."""
 
-    def __call__(self, num_envs: int, *, device: str) -> PairedSimulator:
-        """Build `num_envs` simulators."""
-        ...
-
-
-class MakeVariedSimulator(Protocol):
-    """Builds B abstract simulators whose parameters vary."""
-
-    def __call__(self, num_envs: int, variation: Variation, *, device: str) -> VariedSimulator:
+    def __call__(self, num_envs: int, *, device: str) -> TaskSimulator:
         """Build `num_envs` simulators."""
         ...
 
@@ -38,13 +30,13 @@ class Varied:
     """How the parameters of an abstract simulator vary from episode to episode.
 
     Attributes:
-        make_simulator: builds simulators whose parameters vary.
+        kind: of simulator whose parameters vary; built from a plain one and the ranges.
         randomized: what domain randomization varies, in which ranges.
         wide: what COMPASS varies or identifies, and RMA adapts to; its kind is that of all parameters that
             the simulator has.
     """
 
-    make_simulator: MakeVariedSimulator
+    kind: Callable[[VariableSimulator, Variation], VariedSimulator]
     randomized: Variation
     wide: Variation
 
@@ -55,11 +47,9 @@ class Plane:
 
     Attributes:
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
-        is_mirrorable: whether the robot, its controller included, is its own mirror image.
     """
 
     wall_reach_m: float
-    is_mirrorable: bool
 
 
 @dataclass(frozen=True)
@@ -153,13 +143,14 @@ class Task:
         """Build `num_envs` target environments; `options` are the environment's own."""
         return self.make_target(self.objective, num_envs, **options)
 
-    def simulator(self, num_envs: int, device: str = "cpu") -> PairedSimulator:
+    def simulator(self, num_envs: int, device: str = "cpu") -> TaskSimulator:
         """Build `num_envs` abstract simulators."""
         return self.make_simulator(num_envs, device=device)
 
     def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedSimulator:
-        """Build `num_envs` abstract simulators whose parameters vary."""
-        return self.varied.make_simulator(num_envs, variation, device=device)
+        """Build `num_envs` abstract simulators whose parameters vary; those without a range are plain."""
+        ranges = type(self.varied.wide)(**variation.model_dump())
+        return self.varied.kind(self.simulator(num_envs, device), ranges)
 
 
 def roles(

@@ -1,7 +1,8 @@
 """Variation: how the parameters of simulators differ from episode to episode."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar, Protocol, Self, runtime_checkable
+from typing import Annotated, ClassVar, Self
 
 import torch
 from pydantic import AfterValidator
@@ -9,8 +10,7 @@ from torch import Tensor
 
 from astra_data.core.config import Config
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.plane.geometry import turned
-from astra_data.worlds.protocols import PlacedSimulator
+from astra_data.worlds.protocols import VariableSimulator
 
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
@@ -178,18 +178,58 @@ class AnyVariation(BallVariation, JointVariation):
         return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 
-@runtime_checkable
-class VariedSimulator(PlacedSimulator, Protocol):
-    """B abstract states whose simulator's parameters differ from row to row.
+class VariedSimulator(ABC):
+    """B of a simulator, each with parameters of its own, seen through sensors.
+
+    With plain parameters it is the plain simulator. Noise is drawn from torch's global generator.
 
     Attributes:
+        simulator: the simulator itself, which knows the true states.
         variation: the ranges of the parameters. parameters: (B, P), in the order of its `names`.
-        true_state: what is so, (B, X) float32; `state` is what is shown of it.
     """
 
-    variation: Variation
-    parameters: Tensor
-    true_state: Tensor
+    def __init__(self, simulator: VariableSimulator, variation: Variation) -> None:
+        """Draw parameters of `simulator` from `variation`."""
+        self.simulator = simulator
+        self.variation = variation
+        self.parameters = variation.draw(len(simulator.state), simulator.state.device)
+
+    @property
+    @abstractmethod
+    def state(self) -> Tensor:
+        """The states as the sensors show them, (B, X) float32."""
+
+    @property
+    def true_state(self) -> Tensor:
+        """The states themselves, (B, X) float32."""
+        return self.simulator.state
+
+    @true_state.setter
+    def true_state(self, state: Tensor) -> None:
+        self.simulator.reset_to(state)
+
+    @property
+    def blocked(self) -> Tensor:
+        """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
+        return self.simulator.blocked
+
+    def by_name(self) -> dict[str, Tensor]:
+        """Return the parameters by name, (B, 1) each."""
+        return {
+            name: column.unsqueeze(-1) for name, column in self.variation.by_name(self.parameters).items()
+        }
+
+    @abstractmethod
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
+
+    @abstractmethod
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move from `before` to where `landed` is shown, both (B, X); return the shown states (B, X)."""
+
+    @abstractmethod
+    def step(self, action: Tensor) -> Tensor:
+        """Apply `action` (B, A); return the shown states (B, X)."""
 
 
 RANDOMIZED_ACTIONS = PlanarVariation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
@@ -208,16 +248,9 @@ WIDE_RANGES = PlanarVariation(
 of one of 0.02 s."""
 
 
-def noisy_command(of: Mapping[str, Tensor], action: Tensor) -> Tensor:
-    """Return commands (B, A) with noise by the parameters `of` (B,) each, cut off at ±1.
+def noisy_command(action: Tensor, deviation: Tensor) -> Tensor:
+    """Return commands (B, A) with Gaussian noise of standard deviation `deviation` (B, 1), clipped to ±1.
 
     Noise is drawn from torch's global generator.
     """
-    noise = of["action_noise"].unsqueeze(-1) * torch.randn_like(action)
-    return (action + noise).clamp(-1.0, 1.0)
-
-
-def planar_command(of: Mapping[str, Tensor], action: Tensor) -> Tensor:
-    """Return what becomes of planar commands (B, 2): noisy, turned, scaled, by the parameters `of` (B,)."""
-    steered = turned(noisy_command(of, action), torch.deg2rad(of["heading_bias_deg"]))
-    return (of["friction"] * (1.0 + of["action_scale"])).unsqueeze(-1) * steered
+    return (action + deviation * torch.randn_like(action)).clamp(-1.0, 1.0)

@@ -34,15 +34,15 @@ def test_a_dataset_is_augmented_beside_itself(home: Path) -> None:
 
 def test_every_setting_is_an_option() -> None:
     shown = call("augment", "--help").output
-    for field in AugmentConfig.model_fields:
-        assert f"--{field.replace('_', '-')}" in shown
+    for name, field in AugmentConfig.model_fields.items():
+        assert (f"--{name.replace('_', '-')}" in shown) == (not field.deprecated)
 
 
 @pytest.mark.parametrize(
     ("options", "told"),
     [
         (["--copies", "2", "--episodes", "9"], "augment: episodes: expected either copies or episodes"),
-        (["--rotations", "none", "--no-translations"], "augment: reflections: expected rotations, transl"),
+        (["--rotations", "none", "--no-translations"], "augment: translations: expected rotations or transl"),
         (["--rotations", "half"], "augment: rotations: expected 'quarter', 'any' or 'none', got 'half'"),
         (["--held-out-share", "1"], "augment: held_out_share: expected"),
         ([], "no dataset 'walks'"),

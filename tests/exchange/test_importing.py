@@ -4,13 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
-from typer.testing import CliRunner
 
-from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
-from astra_data.exchange.importing import FORMATS
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -58,21 +54,6 @@ def test_a_first_file_without_rows_changes_nothing(tmp_path: Path) -> None:
     assert report.tally.split_points == {"field": 2}
 
 
-def test_options_override_the_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    path = write_table(tmp_path / "log.data.csv", rows()).rename(tmp_path / "log.data")
-    (tmp_path / "mapping.toml").write_text(MAPPING)
-    arguments = ["import", str(path), "--mapping", str(tmp_path / "mapping.toml"), "--format", "csv"]
-    result = CliRunner().invoke(cli.app, [*arguments, "--name", "renamed", "--fps", "5", "--task", "run"])
-    assert result.exit_code == 0, result.output
-    dataset = Dataset.open(tmp_path / "home/renamed/data-1.0.0")
-    assert "3 episodes, 18 frames from 20 rows" in result.output
-    assert "split points: field 2" in result.output
-    assert dataset.info["fps"] == 5
-    assert dataset.description["stage"] == "import"
-    assert dataset.description["config"]["recordings"][0]["name"] == "log.data"
-
-
 def test_rejected_rows_refuse_the_import(tmp_path: Path) -> None:
     fields = rows()
     fields["command"][[3, 5]] = np.nan
@@ -114,11 +95,6 @@ def test_formats_that_need_seeking_are_not_read_from_archives(tmp_path: Path) ->
         archive.add(path, "a.npz")
     with pytest.raises(BadInputError, match="npz cannot be read from an archive, unpack it"):
         imported(tmp_path, tmp_path / "a.tar")
-
-
-def test_the_help_names_every_format() -> None:
-    told = CliRunner().invoke(cli.app, ["import", "--help"], env={"COLUMNS": "200"}).output
-    assert ", ".join(list(FORMATS)[:-1]) + f" or {list(FORMATS)[-1]}." in told
 
 
 def test_a_mapping_with_a_format_that_does_not_exist_is_told(tmp_path: Path) -> None:

@@ -7,11 +7,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from fake_items import Record, crash, fail, hang, kill_itself, rendezvous, touch
+from fake_items import Record, crash, fail, hang, kill_itself, leave, rendezvous, touch
 
 from astra_data.core.errors import AstraDataError, MissingStageError
 from astra_data.core.lock import held
-from astra_data.experiments.local_executor import Item, execute
+from astra_data.experiments.execution import Item
+from astra_data.experiments.local_executor import execute
 
 PATIENCE_S = 120
 """Enough for a process to start on a machine that is busy with other work."""
@@ -55,6 +56,11 @@ def test_a_killed_process_is_noticed(tmp_path: Path) -> None:
         execute([Item("a", (), kill_itself)], jobs=1, logs=tmp_path, watch=Record())
 
 
+def test_a_process_that_ends_is_noticed(tmp_path: Path) -> None:
+    with pytest.raises(AstraDataError, match=r"^a ended its process with exit code 3$"):
+        execute([Item("a", (), leave)], jobs=1, logs=tmp_path, watch=Record())
+
+
 def test_a_failure_stops_the_others(tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     items = [
@@ -65,12 +71,6 @@ def test_a_failure_stops_the_others(tmp_path: Path) -> None:
     with pytest.raises(MissingStageError):
         execute(items, jobs=2, logs=tmp_path / "logs", watch=Record())
     assert _is_gone(int(pid_file.read_text()))
-
-
-def test_items_that_wait_for_each_other_are_a_bug() -> None:
-    items = [Item("a", ("b",), fail), Item("b", ("a",), fail)]
-    with pytest.raises(ValueError, match="items wait for each other: a, b"):
-        execute(items, jobs=1, logs=Path("unused"), watch=Record())
 
 
 def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
@@ -100,12 +100,13 @@ def _hanging_run(folder: Path) -> subprocess.Popen[bytes]:
     pid_file, script = folder / "pid", folder / "script.py"
     script.write_text(
         "import signal\nimport sys\nfrom functools import partial\nfrom pathlib import Path\n"
-        # Who starts these tests in the background may have it ignored.
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "from fake_items import Record, hang\n"
-        "from astra_data.experiments.local_executor import Item, execute\n"
+        "from astra_data.experiments.execution import Item\n"
+        "from astra_data.experiments.local_executor import execute\n"
         "if __name__ == '__main__':\n"
+        # A shell that starts these tests in the background has it ignored.
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"    here = Path({str(folder)!r})\n"
         "    execute([Item('a', (), partial(hang, here / 'pid'))], jobs=1, logs=here, watch=Record())\n"
     )

@@ -10,7 +10,7 @@ import pytest
 from fake_items import Record, crash, fail, hang, kill_itself, rendezvous, touch
 
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
-from astra_data.experiments.local_executor import Item
+from astra_data.experiments.execution import Item
 from astra_data.experiments.ray_executor import SETTINGS, execute_on_cluster
 from astra_data.experiments.sweep import sweep
 

@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from astra_data.cli import app as cli
-from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError, RecipeError
+from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.run import check, run, run_stage
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
@@ -198,26 +196,3 @@ def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
     run_stage(recipe, "pair", seeds=[0], root=tmp_path)
     with pytest.raises(MissingStageError, match="collect/seed_1 is missing"):
         run_stage(recipe, "pair", root=tmp_path)
-
-
-def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) -> None:
-    def call(*arguments: str) -> str:
-        result = CliRunner().invoke(cli.app, [*arguments, "--root", str(tmp_path)], catch_exceptions=False)
-        assert result.exit_code == 0
-        return result.output
-
-    assert "0 of 9 items are finished" in call("check", str(recipe))
-    assert "collect/seed_0  finished" in call("collect", str(recipe), "--seed", "0")
-    assert "  finished  collect/seed_0\n  to do     pair/seed_0\n" in call("check", str(recipe))
-    with pytest.raises(AstraDataError, match="unknown stage 'x'"):
-        call("run", str(recipe), "--until", "x")
-
-
-def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("astra_data.experiments.run.execute", interrupted)
-    result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
-    assert result.exit_code == 130
-    assert "run the same command again" in result.output

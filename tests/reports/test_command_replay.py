@@ -5,7 +5,7 @@ from astra_data.worlds.registry import TASKS
 
 
 def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -> None:
-    task = TASKS["nao-navigation-surrogate"]
+    task = TASKS["nao-navigation"]
     replay = replay_commands(task)
     steps = len(replay.time_s)
     assert replay.time_s[0] == pytest.approx(task.timestep_s)

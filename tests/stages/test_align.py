@@ -1,11 +1,14 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from small_run import ALIGN
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.target_encoder_file import load_target_encoder
 from astra_data.stages.align import align
 
@@ -33,6 +36,21 @@ def test_the_same_seed_gives_the_same_bytes(
     align(ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
     name = "target_encoder.safetensors"
     assert (out / name).read_bytes() == (aligned / name).read_bytes()
+
+
+def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
+    paired: Path, grounded: Path, aligned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = PairedEpisodes.load(paired)
+    placeless = replace(whole, dropped_place=(0, 1))
+    monkeypatch.setattr(PairedEpisodes, "load", lambda *_: placeless)
+    config, out = ALIGN.model_copy(update={"updates": 1}), tmp_path / "align"
+    align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
+    scale = load_target_encoder(out / "target_encoder.safetensors").state_std
+    assert scale[:2].isinf().all()
+    torch.testing.assert_close(
+        scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:]
+    )
 
 
 class Stopped(Exception):  # noqa: N818 - stands for a kill

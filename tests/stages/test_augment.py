@@ -8,7 +8,8 @@ import pytest
 import torch
 from small_run import TASK, short_task
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.config import validated
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
@@ -32,7 +33,6 @@ from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import TASKS
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
-MIRRORED = AugmentConfig(copies=3, rotations="quarter", reflections=True, min_steps=5)
 
 
 @pytest.fixture(autouse=True)
@@ -45,16 +45,6 @@ def augmented(collected: Path) -> Path:
     with short_task():
         return augment(
             None, CONFIG, dataset=collected, seed=1, out=collected.with_name("turned"), progress=silent
-        )
-
-
-@pytest.fixture(scope="module")
-def mirrored(collected: Path) -> Path:
-    """Let the ant's controller pass for its own mirror image."""
-    with short_task():
-        TASKS[TASK] = replace(TASKS[TASK], plane=replace(TASKS[TASK].planar, is_mirrorable=True))
-        return augment(
-            None, MIRRORED, dataset=collected, seed=1, out=collected.with_name("mirrored"), progress=silent
         )
 
 
@@ -113,40 +103,28 @@ def test_no_copy_of_a_held_out_episode_exists(collected: Path, augmented: Path) 
     assert not sources & held_out
 
 
-@pytest.mark.parametrize("kind", ["augmented", "mirrored"])
-def test_copies_are_their_source_moved_as_they_say(
-    collected: Path, augmented: Path, mirrored: Path, kind: str
-) -> None:
-    reflected = set()
-    root = mirrored if kind == "mirrored" else augmented
-    for copy, cut in copies(Dataset.open(collected), Dataset.open(root)):
-        told = copy.metadata
-        reflected.add(told["augmentation_reflected"])
-        angle = float(told["augmentation_rotation_rad"])
-        mirror = np.diag([1, -1 if told["augmentation_reflected"] else 1, 1])
+def test_copies_are_their_source_moved_as_they_say(collected: Path, augmented: Path) -> None:
+    for copy, cut in copies(Dataset.open(collected), Dataset.open(augmented)):
+        metadata = copy.metadata
+        angle = float(metadata["augmentation_rotation_rad"])
         turn = np.eye(3)
         turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        whole = turn @ mirror
-        shift = np.array([told["augmentation_x_m"], told["augmentation_y_m"], 0.0])
+        shift = np.array([metadata["augmentation_x_m"], metadata["augmentation_y_m"], 0.0])
         for name in (STATE, NEXT_STATE):
             before, after = cut.columns[name].astype(np.float64), copy.columns[name].astype(np.float64)
-            np.testing.assert_allclose(after[:, :3], before[:, :3] @ whole.T + shift, atol=1e-5)
-            np.testing.assert_allclose(after[:, 15:18], before[:, 15:18] @ whole.T, atol=1e-5)
+            np.testing.assert_allclose(after[:, :3], before[:, :3] @ turn.T + shift, atol=1e-5)
+            np.testing.assert_allclose(after[:, 15:18], before[:, 15:18] @ turn.T, atol=1e-5)
             np.testing.assert_allclose(
-                rotation_matrix(after[:, 3:7]), whole @ rotation_matrix(before[:, 3:7]) @ mirror, atol=1e-5
+                rotation_matrix(after[:, 3:7]), turn @ rotation_matrix(before[:, 3:7]), atol=1e-5
             )
-            # The body's rates seen from the world turn the other way in a mirror.
-            rates = [
-                np.einsum("tij,tj->ti", rotation_matrix(s[:, 3:7]), s[:, 18:21]) for s in (before, after)
-            ]
-            np.testing.assert_allclose(rates[1], np.linalg.det(whole) * rates[0] @ whole.T, atol=1e-4)
+            # The rates about the body's axes stay.
+            np.testing.assert_array_equal(after[:, 18:21], before[:, 18:21])
             assert (up_cosine(after[:, 3:7]) > -1).all()
-        np.testing.assert_allclose(copy.columns[ACTION], cut.columns[ACTION] @ whole[:2, :2].T, atol=1e-6)
+        np.testing.assert_allclose(copy.columns[ACTION], cut.columns[ACTION] @ turn[:2, :2].T, atol=1e-6)
         assert np.abs(copy.columns[ACTION]).max() <= 1 + 1e-6
         assert (np.linalg.norm(np.diff(copy.columns[STATE][:, :2], axis=0), axis=1)).sum() == pytest.approx(
             np.linalg.norm(np.diff(cut.columns[STATE][:, :2], axis=0), axis=1).sum(), rel=1e-4
         )
-    assert reflected == ({True, False} if kind == "mirrored" else {False})
 
 
 def test_the_target_does_what_copies_say(collected: Path, augmented: Path) -> None:
@@ -230,9 +208,10 @@ def test_originals_can_be_left_out(collected: Path, tmp_path: Path) -> None:
     assert sum(value is True for value in dataset.metadata["held_out"]) == 1
 
 
-def test_mirror_images_need_a_mirrorable_controller(collected: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="its controller does not act in mirror images"):
-        augment(None, MIRRORED, dataset=collected, seed=0, out=tmp_path / "out", progress=silent)
+def test_mirror_images_are_no_longer_made() -> None:
+    assert validated({"reflections": False}, AugmentConfig, "[augment]") == AugmentConfig()
+    with pytest.raises(RecipeError, match=r"augment\]: reflections: expected false, for copies are not"):
+        validated({"reflections": True}, AugmentConfig, "[augment]")
 
 
 @pytest.mark.parametrize(
@@ -276,9 +255,7 @@ def test_datasets_that_do_not_fit_are_refused(
 
 def test_episodes_with_a_ball_are_refused(tmp_path: Path) -> None:
     kicking = tmp_path / "kicking"
-    collect(
-        "nao-kick-surrogate", CollectConfig(episodes=2, max_steps=4), seed=0, out=kicking, progress=silent
-    )
+    collect("nao-kick", CollectConfig(episodes=2, max_steps=4), seed=0, out=kicking, progress=silent)
     with pytest.raises(BadInputError, match="it has a ball"):
         augment(None, CONFIG, dataset=kicking, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()

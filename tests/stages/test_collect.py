@@ -3,9 +3,12 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from small_run import COLLECT, TASK
 
 from astra_data.core.errors import BadInputError
@@ -23,7 +26,7 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.doctor.check import check
-from astra_data.stages.collect import CollectConfig, collect
+from astra_data.stages.collect import CollectConfig, _step, collect
 from astra_data.training import suboptimal
 from astra_data.worlds.registry import TASKS
 
@@ -45,6 +48,23 @@ def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -
         assert columns[TERMINATED][-1] == (len(episode) < COLLECT.max_steps)
         assert dataset.metadata["success"][index] == columns[SUCCESS].any()
         assert dataset.metadata["return"][index] == pytest.approx(columns[REWARD].sum(), abs=1e-4)
+
+
+def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated() -> None:
+    ends = torch.tensor([True, False])
+    env: Any = SimpleNamespace(
+        state=torch.zeros(2, 3),
+        goal=torch.zeros(2, 2),
+        step=lambda action, active: SimpleNamespace(
+            reward=torch.zeros(2), terminated=ends, success=torch.zeros(2, dtype=torch.bool)
+        ),
+    )
+    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
+    for last, truncated in ((True, ~ends), (False, torch.zeros(2, dtype=torch.bool))):
+        row = _step(env, behavior, ends, last=last)
+        assert torch.equal(row[TERMINATED], ends)
+        assert torch.equal(row[TRUNCATED], truncated)
+        assert torch.equal(row[DONE], ends | truncated)
 
 
 def test_commands_are_held_for_a_while(collected: Path) -> None:

@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from small_run import GOLEMO, GROUND, TRAIN
@@ -99,6 +100,21 @@ def test_where_there_is_nothing_to_explain_r2_is_unknown(grounded: Path, paired:
     assert [figures[name] for name in ("r2_state", "r2_reward", "r2_final_reward")] == [None] * 3
     known = telemetry(model, episodes, weights)["r2_state"]
     assert known is not None and known < 1.0
+
+
+def test_the_gap_is_measured_on_held_out_episodes(grounded: Path, paired: Path) -> None:
+    """One step after a reset, the raw simulator is where pairing saw it land."""
+    _, held_out = PairedEpisodes.load(paired).split(GROUND.held_out_share, 0)
+    missed = (held_out.windows.simulated_next - held_out.windows.next_state).numpy()
+    starts = [
+        (row, step) for row, length in enumerate(held_out.lengths.tolist()) for step in range(0, length, 25)
+    ]
+    wrong = np.array([missed[row, step] for row, step in starts])
+    gap = json.loads((grounded / "gap.json").read_text())
+    assert gap["replays"] == len(starts)
+    for quantity, entries in (("position_m", [0, 1]), ("velocity_m_s", [2, 3])):
+        expected = np.linalg.norm(wrong[:, entries], axis=1).mean()
+        assert gap["raw"][quantity]["mean"][0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_residual_is_the_scatter_on_held_out_episodes(grounded: Path, paired: Path) -> None:

@@ -96,6 +96,25 @@ def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(columns[ABSTRACT_SIMULATED_NEXT_STATE], expected)
 
 
+def test_the_largest_reset_error_of_all_blocks_is_recorded(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "settling.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
+        "class Settling(Glider):\n"
+        "    error = 0.08\n"
+        "    def reset_to(self, state, rows=None):\n"
+        "        super().reset_to(state + self.error, rows)\n"
+        "        self.error /= 2\n"
+    )
+    # A block for each of the eight episodes.
+    monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
+    config = PairConfig(reset_tolerance=0.1)
+    simulator = f"{tmp_path}/settling.py:Settling"
+    pair(simulator, config, dataset=collected, out=tmp_path / "out", progress=silent)
+    assert Dataset.open(tmp_path / "out").description["reset_error"] == pytest.approx(0.08, abs=1e-5)
+
+
 @pytest.mark.parametrize(
     ("simulator", "told"),
     [

@@ -7,7 +7,7 @@ from astra_data.training.simulator_env import DataStarts, SimulatorWorld, policy
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.plane.varied_point_mass import VariedPointMass
+from astra_data.worlds.plane.states import VariedPlanar
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 
@@ -239,7 +239,7 @@ def test_caution_scales_the_penalties() -> None:
 
 def test_parameters_of_the_episode_are_told_where_asked_for() -> None:
     variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
-    simulator = VariedPointMass(U_MAZE, 4, variation, timestep_s=0.05)
+    simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
     assert SimulatorWorld(TASK, simulator).observation_size == 8
     telling = SimulatorWorld(TASK, simulator, tells_parameters=True)
     assert (telling.observation_size, telling.parameter_count) == (8 + 7, 7)

@@ -106,4 +106,4 @@ def test_names_tell_rewards_apart(name: str, metres: float) -> None:
 
 def test_only_the_kicking_tasks_have_a_ball() -> None:
     balls = {name: task.ball_index for name, task in TASKS.items() if task.ball_index is not None}
-    assert balls == {"nao-kick": 4, "nao-kick-surrogate": 4}
+    assert balls == {"nao-kick": 4}

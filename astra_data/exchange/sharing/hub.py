@@ -62,7 +62,7 @@ class HubStore:
         return RemoteFolder(filesystem, f"datasets/{self._repo}@{commit}", f"{self._repo}@{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Add `dataset`: its files, then the card, then the tag "v3.0", then the tag that marks it as there.
+        """Add `dataset`: its files and card, then the tag "v3.0", then the tag that marks it as complete.
 
         Raises:
             BadInputError: the repository holds another dataset or a newer version.
@@ -72,15 +72,14 @@ class HubStore:
         self._refuse_mixing(dataset, version)
         with _told(self._repo) as api:
             progress(0.0, "files")
-            commit = self._commit_files(api, dataset, card)
-            progress(0.9, "card")
-            commit = self._commit_card(api, dataset, card, commit)
+            commit = self._commit(api, dataset, card)
+            progress(0.9, "tags")
             tags = api.list_repo_refs(self._repo, repo_type=KIND).tags
             if layout.CODEBASE_VERSION in [tag.name for tag in tags]:
                 api.delete_tag(self._repo, tag=layout.CODEBASE_VERSION, repo_type=KIND)
             for tag in (layout.CODEBASE_VERSION, version.tag):
                 api.create_tag(self._repo, tag=tag, revision=commit, repo_type=KIND)
-        progress(1.0, "tags")
+        progress(1.0, version.tag)
 
     def _refuse_mixing(self, dataset: Dataset, version: Version) -> None:
         known = self.versions()
@@ -95,11 +94,14 @@ class HubStore:
                 f"{version.tag} can no longer be added. Push it to another place."
             )
 
-    def _commit_files(self, api: "HfApi", dataset: Dataset, card: Path) -> str:
-        """Make data/ and meta/ those of `dataset`."""
+    def _commit(self, api: "HfApi", dataset: Dataset, card: Path) -> str:
+        """Replace data/, meta/ and the card by those of `dataset`, in one commit; return its id.
+
+        `upload_folder` would do it in several commits, of which the first might leave a mixture behind.
+        """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
 
-        # A commit that somebody else adds from here on makes this one fail.
+        # If somebody else commits from here on, this commit fails.
         head = api.repo_info(self._repo, repo_type=KIND).sha
         there = api.list_repo_files(self._repo, revision=head, repo_type=KIND)
         if layout.INFO_PATH in there and SUMS_PATH not in there:
@@ -113,24 +115,11 @@ class HubStore:
             [
                 *(CommitOperationAdd(path, dataset.root / path) for path in files),
                 *(CommitOperationDelete(path, is_folder=False) for path in old),
-                CommitOperationAdd(SUMS_PATH, card / SUMS_PATH),
+                *(CommitOperationAdd(path.name, path) for path in sorted(card.iterdir())),
             ],
             repo_type=KIND,
             parent_commit=head,
             commit_message=f"Add {dataset.reference}",
-        )
-        return str(commit.oid)
-
-    def _commit_card(self, api: "HfApi", dataset: Dataset, card: Path, parent: str) -> str:
-        from huggingface_hub import CommitOperationAdd  # noqa: PLC0415 - slow to import
-
-        pages = [path for path in sorted(card.iterdir()) if path.name != SUMS_PATH]
-        commit = api.create_commit(
-            self._repo,
-            [CommitOperationAdd(path.name, path) for path in pages],
-            repo_type=KIND,
-            parent_commit=parent,
-            commit_message=f"Describe {dataset.reference}",
         )
         return str(commit.oid)
 

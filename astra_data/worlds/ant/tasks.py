@@ -10,7 +10,7 @@ from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.worlds.plane.navigation import Navigation, RewardKind
 from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.plane.varied_point_mass import VariedPointMass
+from astra_data.worlds.plane.states import VariedPlanar
 from astra_data.worlds.task import Plane, Task, Varied, roles
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
@@ -78,9 +78,8 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         action_limit=1.0,
         simulator_id="point_mass",
         facts={"integrator": "RK4", "leg_scale": 1.0},
-        varied=Varied(partial(VariedPointMass, maze, timestep_s=TIMESTEP_S), RANDOMIZED_ACTIONS, WIDE_RANGES),
-        # The body is its own mirror image, the learned low-level controller is not.
-        plane=Plane(wall_reach_m=WALL_REACH_M, is_mirrorable=False),
+        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
+        plane=Plane(wall_reach_m=WALL_REACH_M),
     )
 
 

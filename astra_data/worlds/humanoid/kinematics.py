@@ -29,6 +29,8 @@ The extended one leaves out:
 * Flight, slipping and double support: one foot always stands, the other never brakes. The floor is nowhere.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -88,15 +90,15 @@ class HumanoidKinematics(FreeStates):
         """What a dataset paired with this simulator records about it."""
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
 
-    def vary(self, friction: Tensor, timestep_scale: Tensor) -> None:
-        """Give each humanoid joints of its own, and a control step of its own.
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use other joints and control steps from the next step on.
 
         Args:
-            friction: factors (B,) on the joints' damping d.
-            timestep_scale: factors (B,) on the control step.
+            parameters: (B, 1) each: "friction", a factor on the joints' damping d; "timestep_scale", a factor
+                on the control step.
         """
-        self._approach = STIFFNESS / (DAMPING + friction.unsqueeze(-1) * self._damping)
-        self._timestep_s = TIMESTEP_S * timestep_scale.unsqueeze(-1)
+        self._approach = STIFFNESS / (DAMPING + parameters["friction"] * self._damping)
+        self._timestep_s = TIMESTEP_S * parameters["timestep_scale"]
 
     def step(self, action: Tensor) -> Tensor:
         """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, X)."""

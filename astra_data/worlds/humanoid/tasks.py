@@ -1,7 +1,6 @@
 """The humanoid's tasks: Gymnasium's humanoid walks, and three simulators that know less and less of it."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -109,7 +108,7 @@ def _task(
         simulator_id=f"humanoid_{name}",
         photograph=photograph,
         facts={"stiffness": STIFFNESS, "damping": DAMPING, **CommandRanges().parameters},
-        varied=Varied(partial(VariedHumanoid, kind), RANDOMIZED_ACTIONS, WIDE_RANGES),
+        varied=Varied(VariedHumanoid, RANDOMIZED_ACTIONS, WIDE_RANGES),
     )
 
 

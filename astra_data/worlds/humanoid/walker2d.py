@@ -22,6 +22,7 @@ It leaves out:
 * The memory of MuJoCo's solver from step to step.
 """
 
+from collections.abc import Mapping
 from copy import copy
 
 import mujoco
@@ -99,20 +100,21 @@ class HumanoidWalker2d(FreeStates):
         """What a dataset paired with this simulator records about it."""
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
 
-    def vary(self, friction: Tensor, timestep_scale: Tensor) -> None:
-        """Give each walker legs of its own, and a control step of its own.
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use other joints and control steps from the next step on.
 
         Args:
-            friction: factors (B,) on the damping of the joints.
-            timestep_scale: factors (B,) on the control step: as many physics steps, each so much longer. At
-                5/3 that puts poses off by 0.3 % and rates by 1.2 % of what they change by in a step.
+            parameters: (B, 1) each: "friction", a factor on the damping of the joints; "timestep_scale", a
+                factor on the control step, which keeps its number of physics steps. At 5/3 the longer physics
+                steps put poses off by 0.3 % and rates by 1.2 % of what they change by in a step.
         """
         plain = self._model
         if self._models[0] is plain:
             self._models = [copy(plain) for _ in self.state]
-        for model, factor, scale in zip(
-            self._models, friction.tolist(), timestep_scale.tolist(), strict=True
-        ):
+        friction, timestep_scale = (
+            parameters[name][:, 0].tolist() for name in ("friction", "timestep_scale")
+        )
+        for model, factor, scale in zip(self._models, friction, timestep_scale, strict=True):
             model.dof_damping[:] = factor * plain.dof_damping
             model.opt.timestep = scale * plain.opt.timestep
 

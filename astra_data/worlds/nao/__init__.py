@@ -1,10 +1,9 @@
 """A simulated stand-in for the NAO V6: its body, its legs' kinematics, its walk, B robots at once."""
 
 from astra_data.worlds.nao.body import nao_model
-from astra_data.worlds.nao.robot import BatchedNao
-from astra_data.worlds.nao.robots import Senses
+from astra_data.worlds.nao.robot import BatchedNao, Senses
 from astra_data.worlds.nao.steps import Gait, StepPlanner, WalkLimits
-from astra_data.worlds.nao.traits import IDENTICAL, Traits, Variation
+from astra_data.worlds.nao.traits import IDENTICAL, Traits, TraitSpread
 from astra_data.worlds.nao.walk import WalkEngine, WalkStyle
 
 __all__ = [
@@ -13,8 +12,8 @@ __all__ = [
     "Gait",
     "Senses",
     "StepPlanner",
+    "TraitSpread",
     "Traits",
-    "Variation",
     "WalkEngine",
     "WalkLimits",
     "WalkStyle",

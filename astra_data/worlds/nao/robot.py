@@ -1,7 +1,7 @@
 """B walking NAOs: commanded velocities in, what the robots feel and where they truly are out."""
 
-from dataclasses import replace
-from typing import Any, override
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,8 @@ from astra_data.worlds.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.worlds.nao.body import TICK_S, nao_model
 from astra_data.worlds.nao.kinematics import TO_MOTORS, leg_angles
 from astra_data.worlds.nao.links import HIP_OFFSET_Z_M
-from astra_data.worlds.nao.robots import Robots, Senses
 from astra_data.worlds.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, put_rows
-from astra_data.worlds.nao.traits import Traits, Variation
+from astra_data.worlds.nao.traits import Traits, TraitSpread
 from astra_data.worlds.nao.walk import WalkEngine, WalkStyle
 from astra_data.worlds.plane.ball import BALL_RADIUS_M
 from astra_data.worlds.plane.mazes import Maze
@@ -26,10 +25,35 @@ _MIDDLE_M = 0.03
 """A ball that is less far aside is either foot's: from step to step the torso sways as far."""
 
 
-class BatchedNao(Robots):
+@dataclass(frozen=True)
+class Senses:
+    """What B robots feel at the end of a control step.
+
+    Attributes:
+        angles: measured joint angles, (B, 11) in rad (`worlds.nao.kinematics.JOINTS`).
+        gyro: measured rates about x, y, z, (B, 3) in rad/s.
+        tilt: roll and pitch of the torso, (B, 2) in rad.
+        pressure: on the soles in N; left and right foot, front left, front right, back left, back right
+            point, (B, 2, 4).
+        phase: fraction of the step done, (B,).
+        left_swings: which foot is in the air, (B,) bool.
+        planned: velocity of the present step, m/s, m/s, rad/s, (B, 3).
+    """
+
+    angles: Floats
+    gyro: Floats
+    tilt: Floats
+    pressure: Floats
+    phase: Floats
+    left_swings: Bools
+    planned: Floats
+
+
+class BatchedNao:
     """B NAOs, each on a floor of its own.
 
     Attributes:
+        gait: where the robots are in their steps.
         traits: what sets them apart.
         bodies: their physics.
     """
@@ -41,7 +65,7 @@ class BatchedNao(Robots):
         seed: int,
         maze: Maze | None = None,
         ball: bool = False,
-        variation: Variation | None = None,
+        spread: TraitSpread | None = None,
         limits: WalkLimits | None = None,
         style: WalkStyle | None = None,
         num_threads: int | None = None,
@@ -53,24 +77,24 @@ class BatchedNao(Robots):
             seed: of the gyroscopes' noise and the first traits.
             maze: walls, by default none.
             ball: give each robot a ball.
-            variation: ranges of the traits.
+            spread: ranges of the traits.
             limits: of the walk.
             style: of the walk.
             num_threads: by default one per core.
         """
         self.num_robots = num_robots
-        self.variation = variation or Variation()
+        self.spread = spread or TraitSpread()
         self.has_ball = ball
         self._limits, style = limits or WalkLimits(), style or WalkStyle()
         self._seed, self._steps = seed, 0
         rng = np.random.default_rng(seed)
-        self.traits = Traits.draw(self.variation, num_robots, rng)
+        self.traits = Traits.draw(self.spread, num_robots, rng)
         self.gait = Gait.standing(num_robots, self._limits)
         self._engine = WalkEngine(StepPlanner(self.traits.quality, self._limits), style)
         self.bodies = BatchedBodies(
             nao_model(maze, ball=ball),
             self.traits,
-            longest_delay_ticks=self.variation.delay_ticks[1],
+            longest_delay_ticks=self.spread.delay_ticks[1],
             style=style,
             num_threads=num_threads or cores(),
         )
@@ -96,7 +120,7 @@ class BatchedNao(Robots):
         """
         if ball is not None and not self.has_ball:
             raise BadInputError("These robots have no balls to place; build BatchedNao with ball=True.")
-        put_rows(self.traits, rows, Traits.draw(self.variation, len(rows), rng))
+        put_rows(self.traits, rows, Traits.draw(self.spread, len(rows), rng))
         standing = Gait.standing(len(rows), self._limits)
         put_rows(self.gait, rows, standing)
         angles = leg_angles(self._engine.feet(standing)).angles
@@ -132,7 +156,7 @@ class BatchedNao(Robots):
         rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
         targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))
         noise = np.random.default_rng([self._seed, self._steps]).normal(
-            0.0, self.variation.gyro_noise_rad_s, (self.num_robots, TICKS, 3)
+            0.0, self.spread.gyro_noise_rad_s, (self.num_robots, TICKS, 3)
         )
         self._steps += 1
         self.gait = targets.reached(self.bodies.step(rows, targets, noise))
@@ -147,43 +171,43 @@ class BatchedNao(Robots):
         return np.asarray(kick[:, None] & sides)
 
     @property
-    @override
     def fallen(self) -> Bools:
+        """Which robots lie on the floor, (B,)."""
         return self.bodies.fallen
 
     @property
-    @override
     def touching(self) -> Bools:
+        """Which robots touched a wall in their last control step, (B,)."""
         return self.bodies.touching
 
     @property
-    @override
     def pose(self) -> Floats:
+        """True x, y of the torsos in m and their heading in rad, (B, 3)."""
         rotation = rotation_matrix(self.bodies.qpos[:, 3:7])
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         return np.concatenate([self.bodies.qpos[:, :2], yaw[:, None]], axis=1)
 
     @property
-    @override
     def velocity(self) -> Floats:
+        """True velocity of the torsos on the floor, x, y in m/s, turn in rad/s, (B, 3)."""
         turn = np.einsum(
             "bi,bi->b", rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2], self.bodies.qvel[:, 3:6]
         )
         return np.concatenate([self.bodies.qvel[:, :2], turn[:, None]], axis=1)
 
     @property
-    @override
     def ball(self) -> Floats:
+        """The balls' true x, y in m, (B, 2)."""
         return self.bodies.qpos[:, _BALL : _BALL + 2]
 
     @property
-    @override
     def ball_velocity(self) -> Floats:
+        """The balls' true velocity in m/s, (B, 2)."""
         return self.bodies.qvel[:, _BALL - 1 : _BALL + 1]
 
     @property
-    @override
     def senses(self) -> Senses:
+        """What the robots feel now."""
         bodies, left_first = self.bodies, [7, *range(8, 13), *range(14, 19)]
         return Senses(
             angles=bodies.qpos[:, left_first] - self.traits.joint_offset_rad,
@@ -199,8 +223,18 @@ class BatchedNao(Robots):
         up = rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2]
         return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
 
-    @override
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all that `load_state_dict` needs to go on exactly from here."""
+        return {name: value.copy() for name, value in self._arrays().items()} | {"steps": self._steps}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state`, taken from robots that were built alike."""
+        for name, value in self._arrays().items():
+            value[:] = state[name]
+        self._steps = int(state["steps"])
+
     def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all that changes from step to step, by name, to be written to."""
         bodies = self.bodies
         parts = ("state", "sent", "held", "waited", "tilting", "gyro", "pressure", "fallen", "touching")
         own = {name: getattr(bodies, name) for name in parts}

@@ -1,7 +1,6 @@
 """NAOs that follow planar velocity commands, in a maze or after a ball. They are simulated stand-ins."""
 
 import json
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,7 +12,6 @@ from astra_data.worlds.abstraction import NAO_STATE_SIZE
 from astra_data.worlds.batched import Step
 from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
 from astra_data.worlds.nao.robot import CONTROL_STEP_S, BatchedNao
-from astra_data.worlds.nao.surrogate import SurrogateNao
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.plane.ball import asks_to_kick
 from astra_data.worlds.plane.geometry import wrapped
@@ -59,7 +57,6 @@ class NaoEnv:
         num_envs: int,
         *,
         seed: int,
-        level: Literal["mujoco", "surrogate"] = "mujoco",
         ball: bool = False,
         leg_scale: float = 1.0,
         start_anywhere: bool = False,
@@ -72,7 +69,6 @@ class NaoEnv:
             objective: maze, goal and reward.
             num_envs: B.
             seed: of everything random.
-            level: walking bodies in MuJoCo, or steps without physics.
             ball: whether there is a ball, which abstract states then end with.
             leg_scale: 1; a NAO's legs are as they are.
             start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
@@ -86,8 +82,7 @@ class NaoEnv:
             raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
         self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
         self.has_ball, self.action_size = ball, objective.action_size
-        kind = BatchedNao if level == "mujoco" else SurrogateNao
-        self.robots = kind(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
+        self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
         errors = errors or PerceptionErrors()
         self.localisation = Localisation(num_envs, errors, CONTROL_STEP_S)
         self.sight = BallSight(num_envs, errors, CONTROL_STEP_S)

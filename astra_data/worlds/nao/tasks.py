@@ -2,11 +2,11 @@
 
 Where the paper is silent: a control step is 16 ticks of the robot's 12 ms, 0.192 s, for at 0.25 m/s a robot
 that is to go 9 to 13 m in 500 steps cannot be controlled faster than at 10 Hz; the maze, its starts, the
-field and the rewards are ours. `-surrogate` follows the name of the same task without physics.
+field and the rewards are ours.
 """
 
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.worlds.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
@@ -19,25 +19,18 @@ from astra_data.worlds.plane.kicking import Kicking
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.plane.varied_ball_agent import VariedBallAgent
-from astra_data.worlds.plane.varied_point_mass import VariedPointMass
+from astra_data.worlds.plane.states import VariedPlanar
 from astra_data.worlds.task import Plane, Task, Varied, roles
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
-
-Level = Literal["mujoco", "surrogate"]
 
 _RADIUS_M = 0.1
 """Of the disc that the robot is at walls in its simulators: as in AntMaze, and less than the robot's 0.14."""
 _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
-_KICK = {"kick_reach_m": 0.35, "kick_m_s": 1.0}
-"""The first is that of the paper's group's published simulator of an attacking NAO (AbstractSim 2023). A foot
-really reaches 0.22 m far."""
-_CONTACT: dict[Level, dict[str, Any]] = {
-    "mujoco": _KICK | {"reach_m": 0.22, "knock_m_s": 0.7},
-    "surrogate": _KICK | {"reach_m": 0.19, "knock_m_s": 0.7},
-}
-"""Of the robot with its ball. Walking bodies touch it with feet and shins, at a median of 0.22 m between the
-centres in episodes of random commands; it leaves at a median of 0.7 m/s. The surrogate has its own reach."""
+_CONTACT: dict[str, Any] = {"kick_reach_m": 0.35, "kick_m_s": 1.0, "reach_m": 0.22, "knock_m_s": 0.7}
+"""Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an
+attacking NAO (AbstractSim 2023); a foot really reaches 0.22 m far. Walking bodies touch the ball with feet
+and shins, at a median of 0.22 m between the centres in episodes of random commands; it leaves at a median of
+0.7 m/s."""
 
 KICK_RANGES = BallVariation(
     **WIDE_RANGES.model_dump(),
@@ -133,28 +126,25 @@ def _abstract(*, ball: bool) -> Column:
     return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **told)
 
 
-def _task(name: str, level: Level, *, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
+def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
     """Return a task of what is `own` to it and what all of the NAO's tasks share."""
     return Task(
-        name=name if level == "mujoco" else f"{name}-{level}",
-        make_target=partial(NaoEnv, level=level, ball=ball),
+        make_target=partial(NaoEnv, ball=ball),
         beyond=nao_beyond,
         state_columns=_columns(ball=ball),
         abstract_state=_abstract(ball=ball),
         quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
         timestep_s=CONTROL_STEP_S,
         action_limit=1.0,
-        facts={"stand_in": level, "tick_s": TICK_S},
-        # A robot's joints are off by what is its own.
-        plane=Plane(wall_reach_m=0.3, is_mirrorable=False),
+        facts={"stand_in": "mujoco", "tick_s": TICK_S},
+        plane=Plane(wall_reach_m=0.3),
         **own,
     )
 
 
-def _navigation(level: Level) -> Task:
-    return _task(
-        "nao-navigation",
-        level,
+NAO_TASKS = (
+    _task(
+        name="nao-navigation",
         ball=False,
         instruction="walk through the maze to the goal",
         objective=Navigation(
@@ -173,26 +163,18 @@ def _navigation(level: Level) -> Task:
             ends_at_walls=True,
         ),
         make_simulator=partial(PointMass, S_MAZE, **_BODY),
-        varied=Varied(partial(VariedPointMass, S_MAZE, **_BODY), RANDOMIZED_ACTIONS, WIDE_RANGES),
+        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
         abstraction=nao_to_point_mass,
         simulator_id="point_mass",
-    )
-
-
-def _kicking(level: Level) -> Task:
-    return _task(
-        "nao-kick",
-        level,
+    ),
+    _task(
+        name="nao-kick",
         ball=True,
         instruction="kick the ball into the goal",
         objective=Kicking(FIELD, horizon=156),
-        make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT[level]),
-        varied=Varied(
-            partial(VariedBallAgent, FIELD, **_BODY, **_CONTACT[level]), RANDOMIZED_ACTIONS, KICK_RANGES
-        ),
+        make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT),
+        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, KICK_RANGES),
         abstraction=nao_to_ball_agent,
         simulator_id="ball_agent",
-    )
-
-
-NAO_TASKS = tuple(make(level) for make in (_navigation, _kicking) for level in get_args(Level))
+    ),
+)

@@ -11,8 +11,8 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Variation:
-    """Ranges that a robot's traits are drawn from; ours where no source is told."""
+class TraitSpread:
+    """Ranges that a robot's traits are drawn from; ours where no source is named."""
 
     joint_offset_deg: float = 0.35
     """Standard deviation of each joint's zero; it makes a robot veer. With 0.7 some turn the wrong way."""
@@ -28,7 +28,7 @@ class Variation:
     """Factor on the top speeds, least and most: B-Human's limits of a worn and of a new robot."""
 
 
-IDENTICAL = Variation(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))
+IDENTICAL = TraitSpread(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))
 """All robots alike, without noise."""
 
 
@@ -51,12 +51,12 @@ class Traits:
     quality: Floats
 
     @classmethod
-    def draw(cls, variation: Variation, count: int, rng: np.random.Generator) -> "Traits":
+    def draw(cls, spread: TraitSpread, count: int, rng: np.random.Generator) -> "Traits":
         """Draw the traits of `count` robots."""
         return cls(
-            joint_offset_rad=np.radians(rng.normal(0.0, variation.joint_offset_deg, (count, len(JOINTS)))),
-            stiffness=1.0 - rng.uniform(0.0, variation.stiffness_loss, count),
-            delay_ticks=rng.integers(*variation.delay_ticks, count, endpoint=True, dtype=np.intp),
-            friction=rng.uniform(*variation.friction, count),
-            quality=rng.uniform(*variation.quality, count),
+            joint_offset_rad=np.radians(rng.normal(0.0, spread.joint_offset_deg, (count, len(JOINTS)))),
+            stiffness=1.0 - rng.uniform(0.0, spread.stiffness_loss, count),
+            delay_ticks=rng.integers(*spread.delay_ticks, count, endpoint=True, dtype=np.intp),
+            friction=rng.uniform(*spread.friction, count),
+            quality=rng.uniform(*spread.quality, count),
         )

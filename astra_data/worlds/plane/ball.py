@@ -31,13 +31,23 @@ def asks_to_kick(command: Tensor) -> Tensor:
 def roll(
     position: Tensor, velocity: Tensor, period_s: Tensor | float, deceleration_m_s2: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """Return position and velocity (B, 2) after rolling for `period_s` with even friction, until it lies."""
-    speed = velocity.norm(dim=-1)
+    """Roll balls for `period_s`, slowed by an even friction until they lie.
+
+    Args:
+        position: where the balls are, (B, 2) in m.
+        velocity: of the balls, (B, 2) in m/s.
+        period_s: how long, (B, 1) or one for all.
+        deceleration_m_s2: of a rolling ball, (B, 1) or one for all.
+
+    Returns:
+        positions and velocities (B, 2) of the balls.
+    """
+    speed = velocity.norm(dim=-1, keepdim=True)
     slower = (speed - deceleration_m_s2 * period_s).clamp_min(0.0)
     rolling_s = (speed - slower) / deceleration_m_s2
-    direction = velocity / speed.clamp_min(1e-9).unsqueeze(-1)
+    direction = velocity / speed.clamp_min(1e-9)
     way = 0.5 * (speed + slower) * rolling_s
-    return position + direction * way.unsqueeze(-1), direction * slower.unsqueeze(-1)
+    return position + direction * way, direction * slower
 
 
 def knock(

@@ -1,5 +1,7 @@
 """The abstract simulator of kicking: a planar point mass that kicks a rolling ball, or walks into it."""
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -58,33 +60,52 @@ class BallAgent(PlanarStates):
             kick_m_s: speed of a ball that is kicked.
             device: torch device.
         """
-        super().__init__(maze, num_envs, self.state_size, radius_m=radius_m, device=device)
-        self.parameters = {
-            "timestep_s": timestep_s,
-            "radius_m": radius_m,
-            "speed_m_s": speed_m_s,
+        super().__init__(
+            maze,
+            num_envs,
+            self.state_size,
+            timestep_s=timestep_s,
+            radius_m=radius_m,
+            speed_m_s=speed_m_s,
+            device=device,
+        )
+        self.parameters |= {
             "reach_m": reach_m,
             "knock_m_s": knock_m_s,
             "kick_reach_m": kick_reach_m,
             "kick_m_s": kick_m_s,
         }
         self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+        self._deceleration_m_s2: Tensor | float = ROLLING_M_S2
+        self._contact_turn_rad: Tensor | float = 0.0
+
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use the parameters of a `BallVariation` by name, (B, 1) each, from the next step on."""
+        super().vary(parameters)
+        self._deceleration_m_s2 = ROLLING_M_S2 * parameters["ball_friction"]
+        self._contact_turn_rad = torch.deg2rad(parameters["contact_direction_deg"][:, 0])
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 3), clipped to ±1 per axis; return the new state (B, 8)."""
-        of, kicks = self.parameters, asks_to_kick(action)
+        of, turn, kicks = self.parameters, self._contact_turn_rad, asks_to_kick(action)
         position, _, ball, velocity = self.state.split(2, dim=-1)
-        way = ~kicks * action[:, :2].clamp(-1.0, 1.0) * of["speed_m_s"] * of["timestep_s"]
+        way = ~kicks * self.commanded_velocity(action[:, :2]) * self.period_s
         moved, self.blocked = self.free.slide(position, position + way)
         ball, velocity = knock(
-            position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"]
+            position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"], turn_rad=turn
         )
         velocity = kick_away(
-            moved, ball, velocity, kicks, reach_m=of["kick_reach_m"], speed_m_s=of["kick_m_s"]
+            moved,
+            ball,
+            velocity,
+            kicks,
+            reach_m=of["kick_reach_m"],
+            speed_m_s=of["kick_m_s"],
+            turn_rad=turn,
         )
         self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
-        ball, velocity = roll(ball, velocity, of["timestep_s"], ROLLING_M_S2)
-        self.state = torch.cat([moved, (moved - position) / of["timestep_s"], ball, velocity], dim=-1)
+        ball, velocity = roll(ball, velocity, self.period_s, self._deceleration_m_s2)
+        self.state = torch.cat([moved, (moved - position) / self.period_s, ball, velocity], dim=-1)
         return self.state
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:

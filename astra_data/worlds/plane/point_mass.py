@@ -31,13 +31,31 @@ class PointMass(PlanarStates):
         speed_m_s: float = 1.0,
         device: str = "cpu",
     ) -> None:
-        super().__init__(maze, num_envs, self.state_size, radius_m=radius_m, device=device)
-        self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
+        """Build B of them.
+
+        Args:
+            maze: walls around them.
+            num_envs: B.
+            timestep_s: control period.
+            radius_m: distance that the mass keeps from walls.
+            speed_m_s: top speed along each axis.
+            device: torch device.
+        """
+        super().__init__(
+            maze,
+            num_envs,
+            self.state_size,
+            timestep_s=timestep_s,
+            radius_m=radius_m,
+            speed_m_s=speed_m_s,
+            device=device,
+        )
 
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2), clipped to ±1 per axis; return the new state (B, 4)."""
-        timestep_s, position = self.parameters["timestep_s"], self.state[:, :2]
-        way = action.clamp(-1.0, 1.0) * self.parameters["speed_m_s"] * timestep_s
-        moved, self.blocked = self.free.slide(position, position + way)
-        self.state = torch.cat([moved, (moved - position) / timestep_s], dim=-1)
+        position = self.state[:, :2]
+        moved, self.blocked = self.free.slide(
+            position, position + self.commanded_velocity(action) * self.period_s
+        )
+        self.state = torch.cat([moved, (moved - position) / self.period_s], dim=-1)
         return self.state

@@ -43,7 +43,6 @@ class Relocation:
     Attributes:
         rotations: by multiples of 90 degrees, by any angle, or none.
         translations: to anywhere; otherwise a stretch starts where it did.
-        reflections: mirror every second one, at random.
         margin_m: clearance from the walls, kept by every step before and after it is moved.
         min_steps: shortest stretch.
         tries: turns that are drawn, with 64 places for each, before a stretch is given up.
@@ -52,7 +51,6 @@ class Relocation:
     task: Task
     rotations: Rotations
     translations: bool
-    reflections: bool
     margin_m: float
     min_steps: int
     tries: int
@@ -84,7 +82,7 @@ class Relocation:
             fits = self._is_free((path + shifts[:, None]).astype(np.float32)).all(axis=1)
             if fits.any():
                 x, y = shifts[fits.argmax()]
-                return PlanarMap(turn.rotation_rad, (float(x), float(y)), turn.reflected), steps
+                return PlanarMap(turn.rotation_rad, (float(x), float(y))), steps
         return None
 
     def _is_free(self, points: Array) -> Array:
@@ -97,8 +95,7 @@ class Relocation:
 
     def _draw_turn(self, rng: np.random.Generator) -> PlanarMap:
         angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}
-        reflected = self.reflections and bool(rng.integers(2))
-        return PlanarMap(float(angle[self.rotations]), reflected=reflected)
+        return PlanarMap(float(angle[self.rotations]))
 
     def _draw_shifts(self, start: Array, path: Array, rng: np.random.Generator) -> Array:
         """Draw shifts (n, 2) that keep `path` (T, 2) inside the maze, as far as it fits there."""

@@ -1,13 +1,15 @@
-"""What the planar abstract simulators have in common: states among walls, that can be set and corrected."""
+"""States among the walls of a maze, and how parameters and sensors of planar simulators vary."""
 
-from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from astra_data.worlds.plane.free_space import FreeSpace
+from astra_data.worlds.plane.geometry import turned
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.variation import Variation
+from astra_data.worlds.protocols import VariableSimulator
+from astra_data.worlds.variation import Variation, VariedSimulator, noisy_command
 
 
 class PlanarStates:
@@ -17,13 +19,42 @@ class PlanarStates:
         state: (B, X) float32.
         free: where the disc's centre may be.
         blocked: (B,) bool, a wall stopped the disc in the last step, or in its correction.
+        period_s: control period, one for all or (B, 1).
     """
 
-    def __init__(self, maze: Maze, num_envs: int, state_size: int, *, radius_m: float, device: str) -> None:
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        state_size: int,
+        *,
+        timestep_s: float,
+        radius_m: float,
+        speed_m_s: float,
+        device: str,
+    ) -> None:
+        """Put B discs of radius `radius_m` at rest at the origin; commands of 1 stand for `speed_m_s`."""
+        self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
         self.num_envs = num_envs
         self.state = torch.zeros(num_envs, state_size, device=device)
         self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.period_s: Tensor | float = timestep_s
+        self._gain: Tensor | None = None
+        self._heading_bias_rad = torch.zeros(())
+
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use the parameters of a `PlanarVariation` by name, (B, 1) each, from the next step on."""
+        self.period_s = self.parameters["timestep_s"] * parameters["timestep_scale"]
+        self._gain = parameters["friction"] * (1.0 + parameters["action_scale"])
+        self._heading_bias_rad = torch.deg2rad(parameters["heading_bias_deg"][:, 0])
+
+    def commanded_velocity(self, command: Tensor) -> Tensor:
+        """Return the velocity (B, 2) in m/s that `command` (B, 2) asks for, clipped to ±1 per axis first."""
+        clipped = command.clamp(-1.0, 1.0)
+        if self._gain is not None:
+            clipped = self._gain * turned(clipped, self._heading_bias_rad)
+        return clipped * self.parameters["speed_m_s"]
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
@@ -35,8 +66,8 @@ class PlanarStates:
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Slide the discs from `before` towards `landed`, both (B, X); all else is that of `landed`.
 
-        What the step did itself still counts as a touch: otherwise policies lean on walls that the correction
-        draws them away from.
+        A wall that stopped the step itself still counts as touched: otherwise policies lean on walls that the
+        correction draws them away from.
         """
         position, stopped = self.free.slide(before[:, :2], landed[:, :2])
         self.blocked = self.blocked | stopped
@@ -44,43 +75,48 @@ class PlanarStates:
         return self.state
 
 
-class VariedStates(PlanarStates, ABC):
-    """The same with parameters that differ from row to row, and sensors between the states and who sees them.
+class VariedPlanar(VariedSimulator):
+    """B point masses, with balls or without, each with the parameters of a `PlanarVariation`.
 
-    Attributes:
-        variation: the ranges of the parameters. parameters: (B, P), in the order of its `names`.
-        state: what is shown, (B, X) float32. true_state: what is so, likewise.
+    Commanded velocities get noise; sensors show positions and velocities with uniform noise. A state that was
+    set, or corrected, is shown as it is.
     """
 
-    def __init__(
-        self,
-        maze: Maze,
-        num_envs: int,
-        state_size: int,
-        variation: Variation,
-        *,
-        radius_m: float,
-        device: str,
-    ) -> None:
-        super().__init__(maze, num_envs, state_size, radius_m=radius_m, device=device)
-        self.variation = variation
-        self.true_state = self.state
-        self.parameters = variation.draw(num_envs, device)
+    def __init__(self, simulator: VariableSimulator, variation: Variation) -> None:
+        super().__init__(simulator, variation)
+        self._shown = simulator.state
 
-    @abstractmethod
-    def step(self, action: Tensor) -> Tensor:
-        """Apply `action` (B, A); return what is shown of the new state (B, X)."""
+    @property
+    def state(self) -> Tensor:
+        """The states as the sensors show them, (B, X) float32."""
+        return self._shown
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
-        super().reset_to(state, rows)
-        self.true_state = state.clone() if rows is None else self.true_state.index_copy(0, rows, state)
+        """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
+        self.simulator.reset_to(state, rows)
+        self._shown = self.true_state if rows is None else self._shown.index_copy(0, rows, state)
 
-    def show(self, widths: list[Tensor]) -> Tensor:
-        """Show the true states with uniform noise of half `widths` (B,), one for each two entries.
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
+        self._shown = self.simulator.settle(before, landed)
+        return self._shown
 
-        Noise is drawn from torch's global generator. Returns what is shown, (B, X).
-        """
-        shown = torch.rand_like(self.true_state) * 2.0 - 1.0
-        self.state = self.true_state + shown * torch.stack(widths, dim=-1).repeat_interleave(2, dim=-1)
-        return self.state
+    def step(self, action: Tensor) -> Tensor:
+        """Apply commands `action` (B, A), which begin with a velocity; return the shown states (B, X)."""
+        parameters = self.by_name()
+        velocity, rest = action.tensor_split([2], dim=-1)
+        command = torch.cat([noisy_command(velocity, parameters["action_noise"]), rest], dim=-1)
+        self.simulator.vary(parameters)
+        true = self.simulator.step(command)
+        half_widths = [
+            parameters[name].expand(-1, 2)
+            for name in (
+                "position_noise_m",
+                "velocity_noise_m_s",
+                "ball_position_noise_m",
+                "ball_velocity_noise_m_s",
+            )
+            if name in parameters
+        ]
+        self._shown = true + (torch.rand_like(true) * 2.0 - 1.0) * torch.cat(half_widths, dim=-1)
+        return self._shown

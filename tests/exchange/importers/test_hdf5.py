@@ -1,10 +1,11 @@
 import json
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from recordings import MAPPING, imported, rows
+from recordings import MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
@@ -189,3 +190,10 @@ def test_a_shape_that_the_file_does_not_hold_is_told(tmp_path: Path) -> None:
             file.create_dataset(name, (2**50,), float, chunks=(2**10,))
     with pytest.raises(BadInputError, match=r"field 'x' claims the shape .*; field 'y' claims"):
         imported(tmp_path, tmp_path / "log.h5")
+
+
+def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_table(tmp_path / "log.h5", rows())
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(BadInputError, match=r'h5py .*not installed: .* pip install "astra-data\[hdf5\]"'):
+        imported(tmp_path, path)

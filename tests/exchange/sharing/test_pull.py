@@ -181,13 +181,3 @@ def test_what_is_no_whole_dataset_is_refused(
         pull(source(shared), out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert not hidden(tmp_path / "out")
-
-
-def test_altered_values_are_not_pushed(tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "mine")
-    description = json.loads((dataset.root / "meta/astra/dataset.json").read_text())
-    text = json.dumps(description | {"content_hash": "0" * 64})
-    (dataset.root / "meta/astra/dataset.json").write_text(text)
-    with pytest.raises(Exception, match="was altered: the content hash is"):
-        push(dataset.root, f"file://{tmp_path}/shared")
-    assert not (tmp_path / "shared").exists()

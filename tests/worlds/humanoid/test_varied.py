@@ -38,7 +38,7 @@ def moving(kind: Kind, count: int) -> Tensor:
 
 
 def varied(kind: Kind, state: Tensor, variation: JointVariation) -> VariedHumanoid:
-    simulator = VariedHumanoid(kind, len(state), variation)
+    simulator = VariedHumanoid(kind(len(state)), variation)
     simulator.reset_to(state)
     return simulator
 

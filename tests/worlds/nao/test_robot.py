@@ -58,7 +58,7 @@ def test_without_a_command_it_stands() -> None:
     "command", [(0.2, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.15, 0.0), (0.0, 0.0, 0.8)]
 )
 def test_it_walks_as_told(command: tuple[float, float, float]) -> None:
-    nao = BatchedNao(1, seed=0, variation=IDENTICAL, num_threads=1)
+    nao = BatchedNao(1, seed=0, spread=IDENTICAL, num_threads=1)
     poses = []
     for _ in range(25):
         nao.step(np.array([command]))
@@ -113,7 +113,7 @@ def test_measured_angles_hide_the_joints_offsets() -> None:
 
 def test_walls_are_felt_and_stop_it() -> None:
     # The wall's face is at x = -6; the robot's toes are 0.1 m ahead of it.
-    nao = BatchedNao(2, seed=0, maze=U_MAZE, variation=IDENTICAL, num_threads=1)
+    nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
     nao.reset(np.arange(2), np.array([[-5.7, 4.0, np.pi], [-4.0, 4.0, np.pi]]), np.random.default_rng(0))
     felt = np.zeros(2, dtype=bool)
     for _ in range(15):
@@ -139,7 +139,7 @@ def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
 def test_a_kick_sends_the_ball_ahead() -> None:
     speeds = {}
     for kick in (True, False):
-        nao = BatchedNao(2, seed=0, ball=True, variation=IDENTICAL, num_threads=1)
+        nao = BatchedNao(2, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
         ball = np.array([[0.19, 0.05], [0.19, -0.05]])
         nao.reset(np.arange(2), np.zeros((2, 3)), np.random.default_rng(0), ball)
         fastest: Floats = np.zeros(2)
@@ -155,7 +155,7 @@ def test_a_kick_sends_the_ball_ahead() -> None:
 
 
 def test_a_ball_dead_ahead_is_kicked_too() -> None:
-    nao = BatchedNao(1, seed=0, ball=True, variation=IDENTICAL, num_threads=1)
+    nao = BatchedNao(1, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
     nao.reset(np.arange(1), np.zeros((1, 3)), np.random.default_rng(0), np.array([[0.17, 0.0]]))
     for _ in range(8):
         nao.step(np.zeros((1, 3)), kick=np.array([True]))

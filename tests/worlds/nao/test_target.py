@@ -10,30 +10,25 @@ from astra_data.worlds.nao.perception import NO_ERRORS
 from astra_data.worlds.nao.target import Floats, NaoEnv
 from astra_data.worlds.registry import TASKS
 
-LEVELS = ("surrogate", "mujoco")
 
-
-def env(task: str = "nao-navigation", count: int = 3, level: str = "surrogate", **options: Any) -> NaoEnv:  # noqa: ANN401 - handed on
-    name = task if level == "mujoco" else f"{task}-{level}"
-    made = TASKS[name].target(count, seed=0, num_threads=1, **options)
+def env(task: str = "nao-navigation", count: int = 3, **options: Any) -> NaoEnv:  # noqa: ANN401 - handed on
+    made = TASKS[task].target(count, seed=0, num_threads=1, **options)
     assert isinstance(made, NaoEnv)
     made.reset()
     return made
 
 
-@pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("task", ["nao-navigation", "nao-kick"])
-def test_states_have_their_columns_and_abstractions(task: str, level: str) -> None:
-    name = task if level == "mujoco" else f"{task}-{level}"
-    one = env(task, level=level)
-    columns = TASKS[name].state_columns
+def test_states_have_their_columns_and_abstractions(task: str) -> None:
+    one = env(task)
+    columns = TASKS[task].state_columns
     assert one.state.shape == (3, columns[0].size)
     assert columns[0].names is not None
     assert len(columns[0].names) == columns[0].size
     assert one.reset().shape == (3, one.observation_size)
-    abstract = TASKS[name].abstraction(one.state)
-    assert abstract.shape == one.truth.shape == (3, TASKS[name].abstract_state.size)
-    assert TASKS[name].beyond(one.state).shape[1] == columns[0].size - abstract.shape[1]
+    abstract = TASKS[task].abstraction(one.state)
+    assert abstract.shape == one.truth.shape == (3, TASKS[task].abstract_state.size)
+    assert TASKS[task].beyond(one.state).shape[1] == columns[0].size - abstract.shape[1]
     # Beliefs are near the truth.
     assert (abstract - one.truth).abs().max() < 0.5
 
@@ -92,9 +87,8 @@ def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
     np.testing.assert_allclose(one.sight.position, ball, atol=0.1)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_a_kick_reaches_a_foot_far_and_moves_no_robot(level: str) -> None:
-    one = env("nao-kick", 8, level, errors=NO_ERRORS)
+def test_a_kick_reaches_a_foot_far_and_moves_no_robot() -> None:
+    one = env("nao-kick", 8, errors=NO_ERRORS)
     place, angle = np.zeros((8, 3)), np.linspace(-np.pi, np.pi, 8)
     place[:, 2] = angle
     distance = np.array([0.17, 0.3] * 4)[:, None]
@@ -141,21 +135,19 @@ def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
     assert success.tolist() == [True, False]
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed(level: str) -> None:
-    one, other = (env("nao-kick", 2, level) for _ in range(2))
+def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed() -> None:
+    one, other = (env("nao-kick", 2) for _ in range(2))
     action = torch.tensor([[0.7, 0.2, 0.0], [-0.5, 0.9, 1.0]])
     for _ in range(3):
         assert torch.equal(one.step(action).observation, other.step(action).observation)
-    fresh = env("nao-kick", 2, level)
+    fresh = env("nao-kick", 2)
     fresh.load_state_dict(one.state_dict())
     for _ in range(3):
         assert torch.equal(one.step(action).observation, fresh.step(action).observation)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_robots_can_be_stood_where_a_state_believes_them(level: str) -> None:
-    one = env("nao-kick", 2, level)
+def test_robots_can_be_stood_where_a_state_believes_them() -> None:
+    one = env("nao-kick", 2)
     state = one.state.double().numpy()
     one.step(torch.ones(2, 3))
     one.reset_to(np.arange(2), state)

@@ -5,8 +5,8 @@ import torch
 
 from astra_data.worlds.plane.ball_agent import BallAgent
 from astra_data.worlds.plane.mazes import FIELD
-from astra_data.worlds.plane.varied_ball_agent import VariedBallAgent
-from astra_data.worlds.variation import BallVariation, PlanarVariation
+from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.variation import BallVariation
 
 OPTIONS: dict[str, Any] = {
     "timestep_s": 0.2,
@@ -78,12 +78,13 @@ def test_a_correction_is_taken_over_as_far_as_there_is_room() -> None:
 
 def test_plain_parameters_are_the_plain_simulator() -> None:
     torch.manual_seed(0)
-    varied = VariedBallAgent(FIELD, 50, PlanarVariation(), **OPTIONS)
-    plain = one(50)
-    varied.reset_to(plain.state)
-    for _ in range(60):
-        action = torch.randn(50, 3)
+    varied, plain = VariedPlanar(one(50), BallVariation()), one(50)
+    for step in range(60):
+        before, action = plain.state, torch.randn(50, 3)
         torch.testing.assert_close(varied.step(action), plain.step(action))
+        if step % 5 == 0:
+            landed = plain.state + 0.05 * torch.randn(50, 8)
+            torch.testing.assert_close(varied.settle(before, landed), plain.settle(before, landed))
         assert torch.equal(varied.blocked, plain.blocked)
 
 
@@ -97,14 +98,14 @@ def test_plain_parameters_are_the_plain_simulator() -> None:
     ids=["friction", "direction", "speed"],
 )
 def test_parameters_do_what_their_names_say(variation: BallVariation, entry: int, expected: float) -> None:
-    simulator = VariedBallAgent(FIELD, 1, variation, **OPTIONS)
+    simulator = VariedPlanar(one(), variation)
     simulator.reset_to(torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]))
     state = simulator.step(AHEAD)
     assert state[0, entry].item() == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_direction_of_a_kick_varies_too() -> None:
-    simulator = VariedBallAgent(FIELD, 1, BallVariation(contact_direction_deg=(90.0, 90.0)), **OPTIONS)
+    simulator = VariedPlanar(one(), BallVariation(contact_direction_deg=(90.0, 90.0)))
     simulator.reset_to(START)
     state = simulator.step(torch.tensor([[1.0, 0.0, 1.0]]))
     assert state[0, 6:].tolist() == pytest.approx([0.0, 1.5 - 0.3 * 0.2], abs=1e-5)
@@ -113,7 +114,7 @@ def test_the_direction_of_a_kick_varies_too() -> None:
 def test_noise_of_sensors_only_shows() -> None:
     torch.manual_seed(0)
     variation = BallVariation(ball_position_noise_m=(0.1, 0.1), ball_velocity_noise_m_s=(0.2, 0.2))
-    simulator = VariedBallAgent(FIELD, 5000, variation, **OPTIONS)
+    simulator = VariedPlanar(one(5000), variation)
     simulator.reset_to(START.expand(5000, 8))
     simulator.step(torch.zeros(5000, 3))
     error = (simulator.state - simulator.true_state).abs().amax(0)

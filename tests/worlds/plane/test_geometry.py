@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import ACTION, STATE, Array, Column
+from astra_data.dataset.columns import ACTION, Array, Column
 from astra_data.worlds.ant.body import ant_model, rotation_matrix
 from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.batched_mujoco import BatchedPhysics
@@ -23,7 +23,7 @@ from astra_data.worlds.task import Task
 
 angles = st.floats(-10, 10)
 metres = st.floats(-20, 20)
-maps = st.builds(PlanarMap, angles, st.tuples(metres, metres), st.booleans())
+maps = st.builds(PlanarMap, angles, st.tuples(metres, metres))
 properties = settings(max_examples=20, deadline=None)
 
 TASK = TASKS["antmaze-umaze"]
@@ -42,7 +42,7 @@ def matrix(change: PlanarMap) -> Array:
     """Write a map as a matrix (4, 4) of space."""
     cos, sin = np.cos(change.rotation_rad), np.sin(change.rotation_rad)
     whole = np.eye(4)
-    whole[:2, :2] = np.array([[cos, -sin], [sin, cos]]) @ np.diag([1, -1 if change.reflected else 1])
+    whole[:2, :2] = [[cos, -sin], [sin, cos]]
     whole[:2, 3] = change.shift_m
     return whole
 
@@ -77,42 +77,17 @@ def test_bodies_turn_as_a_matrix_says(change: PlanarMap) -> None:
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     moved = change.quaternions(quaternions)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 1, atol=1e-12)
-    mirror = np.diag([1, -1 if change.reflected else 1, 1])
-    expected = matrix(change)[:3, :3] @ rotation_matrix(quaternions) @ mirror
+    expected = matrix(change)[:3, :3] @ rotation_matrix(quaternions)
     np.testing.assert_allclose(rotation_matrix(moved), expected, atol=1e-12)
-
-
-@properties
-@given(maps, maps)
-def test_maps_compose_and_invert_as_matrices_do(second: PlanarMap, first: PlanarMap) -> None:
-    np.testing.assert_allclose(matrix(second @ first), matrix(second) @ matrix(first), atol=1e-9)
-    np.testing.assert_allclose(matrix(first.inverse()), np.linalg.inv(matrix(first)), atol=1e-9)
-
-
-@pytest.mark.parametrize("column", COLUMNS.values(), ids=COLUMNS)
-@properties
-@given(second=maps, first=maps)
-def test_columns_of_every_task_compose_and_come_back(
-    column: Column, second: PlanarMap, first: PlanarMap
-) -> None:
-    values = random_values(column, 4)
-    at_once = (second @ first).of_column(column, values)
-    after_another = second.of_column(column, first.of_column(column, values))
-    for role, group in column.roles:
-        one, other = at_once[:, group], after_another[:, group]
-        if role == "quaternion":  # q and -q are one rotation
-            other = other * np.sign((one * other).sum(axis=1, keepdims=True))
-        np.testing.assert_allclose(one, other, atol=1e-9)
-    restored = first.inverse().of_column(column, first.of_column(column, values))
-    np.testing.assert_allclose(np.abs(restored), np.abs(values), atol=1e-9)
 
 
 @pytest.mark.parametrize("column", COLUMNS.values(), ids=COLUMNS)
 def test_columns_of_every_task_tell_all(column: Column) -> None:
-    assert PlanarMap(reflected=True).faults(column) == []
-    told = column.astra or {}
-    assert {len(told[key]) for key in ("unit", "frame", "role")} == {column.size}
-    for frame, role in zip(told["frame"], told["role"], strict=True):
+    words = column.astra or {}
+    assert {len(words[key]) for key in ("unit", "frame", "role")} == {column.size}
+    # Datasets also record what each value becomes in a mirror image of the robot.
+    assert column.mirror is not None
+    for frame, role in zip(words["frame"], words["role"], strict=True):
         # What is measured in the body does not turn with the world.
         assert role == "invariant" or frame == "world"
 
@@ -125,14 +100,9 @@ def test_values_keep_their_type_and_lone_headings_their_shape() -> None:
     np.testing.assert_allclose(moved, [0.5 - np.pi, np.pi - 0.5], rtol=1e-6)
 
 
-def test_a_column_that_does_not_say_how_it_moves_is_refused() -> None:
-    values = np.zeros((2, 2), np.float32)
-    with pytest.raises(BadInputError, match="action: its roles are not told"):
-        PlanarMap().of_column(Column(ACTION, size=2), values)
-    silent = Column(STATE, size=2, astra={"role": ["heading", "invariant"]})
-    with pytest.raises(BadInputError, match="mirror image of its invariant values is not told"):
-        PlanarMap(reflected=True).of_column(silent, values)
-    assert not PlanarMap(rotation_rad=1.0).faults(silent)
+def test_a_column_without_roles_is_refused() -> None:
+    with pytest.raises(BadInputError, match="column action has no roles: expected one for each of its"):
+        PlanarMap().of_column(Column(ACTION, size=2), np.zeros((2, 2), np.float32))
 
 
 @properties
@@ -188,17 +158,6 @@ def walking(count: int, steps: int) -> Array:
 
 WALKING = walking(3, 12)
 TORQUES = np.random.default_rng(5).uniform(-1, 1, (3, 8))
-ACTUATORS = tuple(f"{joint}_{leg}" for leg in (4, 1, 2, 3) for joint in ("hip", "ankle"))
-MIRRORED = [f"{joint}_{leg}" for leg in (1, 4, 3, 2) for joint in ("hip", "ankle")]
-TORQUE_COLUMN = Column(
-    "torque",
-    size=8,
-    names=ACTUATORS,
-    astra={
-        "role": ["invariant"] * 8,
-        "mirror": [f"-{name}" if name.startswith("hip") else name for name in MIRRORED],
-    },
-)
 
 
 def physics_step(state: Array, torques: Array) -> Array:
@@ -210,7 +169,7 @@ def physics_step(state: Array, torques: Array) -> Array:
 
 def ant_error(change: PlanarMap, column: Column, state: Array) -> float:
     """Return how far a step of the moved ant is from the moved step of the ant."""
-    moved = physics_step(change.of_column(column, state), change.of_column(TORQUE_COLUMN, TORQUES))
+    moved = physics_step(change.of_column(column, state), TORQUES)
     return float(np.abs(moved - change.of_column(column, physics_step(state, TORQUES))).max())
 
 
@@ -232,33 +191,23 @@ def test_the_ant_on_the_ground_does_not_feel_any_map(change: PlanarMap) -> None:
     assert ant_error(small(change), STATE_COLUMN, WALKING) < 1e-4
 
 
-def with_words(column: Column, key: str, changes: dict[str, str]) -> Column:
-    astra: dict[str, Any] = dict(column.astra or {})
-    if key == "role":
-        del astra["mirror"]
-    names = column.names or ()
-    astra[key] = [changes.get(name, word) for name, word in zip(names, astra[key], strict=True)]
-    return replace(column, astra=astra)
-
-
 @pytest.mark.parametrize(
-    ("key", "changes"),
+    "changes",
     [
-        ("role", {"wx": "vector", "wy": "vector"}),
-        ("role", {"vx": "invariant", "vy": "invariant"}),
-        ("role", {"qw": "invariant", "qx": "invariant", "qy": "invariant", "qz": "invariant"}),
-        ("mirror", {"wx": "wx", "wy": "-wy"}),
-        ("mirror", {"wz": "wz"}),
-        ("mirror", {f"hip_{leg}": f"hip_{5 - leg}" for leg in range(1, 5)}),
-        ("mirror", {f"ankle_{leg}": f"-ankle_{5 - leg}" for leg in range(1, 5)}),
-        ("mirror", {f"hip_{leg}": f"-hip_{leg}" for leg in range(1, 5)}),
-        ("mirror", {f"ankle_{leg}_rate": f"ankle_{leg}_rate" for leg in range(1, 5)}),
+        {"wx": "vector", "wy": "vector"},
+        {"vx": "invariant", "vy": "invariant"},
+        {"qw": "invariant", "qx": "invariant", "qy": "invariant", "qz": "invariant"},
     ],
 )
-def test_wrong_words_are_felt(key: str, changes: dict[str, str]) -> None:
-    wrong = with_words(STATE_COLUMN, key, changes)
-    change = PlanarMap(2.0, (1.0, -2.0), reflected=key == "mirror")
-    assert ant_error(change, wrong, airborne(WALKING)) > 1e-3
+def test_wrong_roles_are_felt(changes: dict[str, str]) -> None:
+    astra: dict[str, Any] = {
+        "role": [
+            changes.get(name, word)
+            for name, word in zip(STATE_COLUMN.names or (), (STATE_COLUMN.astra or {})["role"], strict=True)
+        ]
+    }
+    wrong = replace(STATE_COLUMN, astra=astra)
+    assert ant_error(PlanarMap(2.0, (1.0, -2.0)), wrong, airborne(WALKING)) > 1e-3
 
 
 @settings(max_examples=8, deadline=None)
@@ -278,9 +227,16 @@ def test_the_walking_ant_follows_the_turned_command(rotation: float) -> None:
     np.testing.assert_allclose(moved, change.of_column(STATE_COLUMN, stepped(WALKING, command)), atol=1e-4)
 
 
-def test_mujoco_sees_the_mirror_image() -> None:
-    """Every body of the mirrored ant is where a mirror would show it."""
-    change = PlanarMap(0.7, (1.0, -2.0), reflected=True)
+def mirrored(column: Column, state: Array) -> Array:
+    """Return the mirror image of ants in the xz plane, by what the column records of it."""
+    assert column.mirror is not None
+    source, sign = column.mirror
+    image = state[:, source] * sign
+    image[:, [1, 4, 6, 16]] *= -1  # y, qx, qz, vy
+    return image
+
+
+def test_mujoco_sees_the_mirror_image_that_columns_record() -> None:
     model = ant_model()
 
     def places(state: Array) -> Array:
@@ -291,6 +247,13 @@ def test_mujoco_sees_the_mirror_image() -> None:
 
     swapped = [0, *(1 + 3 * leg + part for leg in (3, 2, 1, 0) for part in range(3))]
     for state in WALKING:
-        seen = places(change.of_column(STATE_COLUMN, state[None])[0])
-        expected = np.c_[places(state), np.ones(13)] @ matrix(change).T
-        np.testing.assert_allclose(seen[swapped], expected[:, :3], atol=1e-12)
+        seen = places(mirrored(STATE_COLUMN, state[None])[0])
+        np.testing.assert_allclose(seen[swapped], places(state) * [1, -1, 1], atol=1e-12)
+
+
+def test_a_mirror_image_in_the_air_moves_as_the_mirror_image_of_the_ant() -> None:
+    state = airborne(WALKING)
+    # Controls are of hip and ankle of legs 4, 1, 2, 3; hips turn the other way, ankles are mirror images.
+    torques = TORQUES.reshape(-1, 4, 2)[:, [1, 0, 3, 2]] * [-1, 1]
+    image = physics_step(mirrored(STATE_COLUMN, state), torques.reshape(-1, 8))
+    np.testing.assert_allclose(image, mirrored(STATE_COLUMN, physics_step(state, TORQUES)), atol=1e-7)

@@ -3,6 +3,11 @@ import torch
 
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
+from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.variation import PlanarVariation
+
+START = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])
+ACTION = torch.tensor([[0.6, -0.8]])
 
 
 def point_mass(num_envs: int) -> PointMass:
@@ -67,3 +72,65 @@ def test_a_batch_steps_as_its_rows_do() -> None:
         assert torch.equal(single.step(action[row : row + 1])[0], after[row])
         assert bool(single.blocked[0]) == bool(together.blocked[row])
     assert 0 < int(together.blocked.sum()) < 64
+
+
+def one_step(variation: PlanarVariation, count: int = 1, action: torch.Tensor = ACTION) -> VariedPlanar:
+    simulator = VariedPlanar(point_mass(count), variation)
+    simulator.reset_to(START.expand(count, 4))
+    simulator.step(action.expand(count, 2))
+    return simulator
+
+
+def test_plain_parameters_are_the_plain_point_mass_to_the_bit() -> None:
+    torch.manual_seed(0)
+    varied, plain = VariedPlanar(point_mass(50), PlanarVariation()), point_mass(50)
+    for simulator in (varied, plain):
+        simulator.reset_to(START.expand(50, 4))
+    for _ in range(200):
+        action = torch.randn(50, 2)
+        assert torch.equal(varied.step(action), plain.step(action))
+        assert torch.equal(varied.blocked, plain.blocked)
+
+
+def test_the_plain_point_mass_does_these_operations_in_this_order() -> None:
+    """Recorded datasets hold its float32 states: no rounding may change."""
+    torch.manual_seed(1)
+    simulator = PointMass(U_MAZE, 100, timestep_s=0.192, speed_m_s=0.25)
+    position = torch.tensor(U_MAZE.free_centres()[:1], dtype=torch.float32).expand(100, 2)
+    simulator.reset_to(torch.cat([position, torch.zeros(100, 2)], dim=-1))
+    for _ in range(50):
+        action = 2 * torch.randn(100, 2)
+        state = simulator.step(action)
+        moved, _ = simulator.free.slide(position, position + action.clamp(-1.0, 1.0) * 0.25 * 0.192)
+        assert torch.equal(state, torch.cat([moved, (moved - position) / 0.192], dim=-1))
+        position = moved
+
+
+def test_each_parameter_does_what_its_name_says() -> None:
+    plain = one_step(PlanarVariation())
+    assert torch.equal(plain.state[0, 2:], plain.true_state[0, 2:])
+    for variation, velocity, moved in (
+        (PlanarVariation(friction=(0.5, 0.5)), [0.3, -0.4], [0.015, -0.02]),
+        (PlanarVariation(action_scale=(0.5, 0.5)), [0.9, -1.2], [0.045, -0.06]),
+        (PlanarVariation(heading_bias_deg=(90.0, 90.0)), [0.8, 0.6], [0.04, 0.03]),
+        (PlanarVariation(timestep_scale=(2.0, 2.0)), [0.6, -0.8], [0.06, -0.08]),
+    ):
+        state = one_step(variation).state[0]
+        torch.testing.assert_close(state[2:], torch.tensor(velocity), atol=1e-4, rtol=0)
+        torch.testing.assert_close(state[:2] - START[0, :2], torch.tensor(moved), atol=1e-5, rtol=0)
+
+
+def test_commands_are_cut_off_before_they_are_scaled() -> None:
+    state = one_step(PlanarVariation(action_scale=(0.1, 0.1)), action=torch.tensor([[3.0, 0.0]])).state
+    torch.testing.assert_close(state[0, 2:], torch.tensor([1.1, 0.0]), atol=1e-4, rtol=0)
+
+
+def test_noise_on_commands_moves_and_noise_of_sensors_only_shows() -> None:
+    torch.manual_seed(0)
+    noisy = one_step(PlanarVariation(action_noise=(0.1, 0.1)), 20_000, 0.5 * ACTION)
+    assert torch.equal(noisy.state, noisy.true_state)
+    torch.testing.assert_close(noisy.state[:, 2:].std(0), torch.full((2,), 0.1), atol=0.005, rtol=0)
+    shown = one_step(PlanarVariation(position_noise_m=(0.03, 0.03), velocity_noise_m_s=(0.02, 0.02)), 20_000)
+    assert (shown.true_state == shown.true_state[:1]).all()
+    error = (shown.state - shown.true_state).abs().amax(0)
+    torch.testing.assert_close(error, torch.tensor([0.03, 0.03, 0.02, 0.02]), atol=1e-4, rtol=0.01)

@@ -15,7 +15,6 @@ def relocation(**changes: Any) -> Relocation:  # noqa: ANN401
     settings: dict[str, Any] = {
         "rotations": "quarter",
         "translations": True,
-        "reflections": False,
         "margin_m": 1.3,
         "min_steps": 5,
         "tries": 100,
@@ -81,7 +80,7 @@ def test_turns_that_lengthen_a_command_beyond_its_limit_are_drawn_again() -> Non
 
 def test_without_translation_a_stretch_starts_where_it_did() -> None:
     path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
-    for change, steps in draws(10, path, translations=False, reflections=True):
+    for change, steps in draws(10, path, translations=False):
         np.testing.assert_allclose(moved(change, path)[steps.start], [-4.0, 4.0], atol=1e-6)
 
 
@@ -89,7 +88,6 @@ def test_without_rotation_the_bearing_stays() -> None:
     path = straight((-4.0, 4.0), (-3.5, 4.0), 20)
     for change, _ in draws(10, path, rotations="none"):
         assert change.rotation_rad == 0.0
-        assert not change.reflected
 
 
 def test_what_fits_nowhere_is_given_up() -> None:

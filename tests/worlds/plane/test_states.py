@@ -1,19 +1,31 @@
 import torch
 
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.states import PlanarStates, VariedStates
-from astra_data.worlds.variation import PlanarVariation
+from astra_data.worlds.plane.states import PlanarStates, VariedPlanar
+from astra_data.worlds.variation import BallVariation, PlanarVariation
 
 HERE = torch.tensor([[-4.0, 5.85, 0.0, 0.0, 7.0]]).expand(3, 5)
 
 
-class Resting(VariedStates):
+def planar(count: int, size: int) -> PlanarStates:
+    return PlanarStates(U_MAZE, count, size, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0, device="cpu")
+
+
+class Resting(PlanarStates):
+    """Remembers its commands, and stays where it is."""
+
     def step(self, action: torch.Tensor) -> torch.Tensor:
-        return self.show([torch.full((3,), 0.1), torch.full((3,), 0.2)])
+        self.action = action
+        return self.state
+
+
+def resting(count: int, size: int, variation: PlanarVariation) -> tuple[Resting, VariedPlanar]:
+    inner = Resting(U_MAZE, count, size, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0, device="cpu")
+    return inner, VariedPlanar(inner, variation)
 
 
 def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
-    states = PlanarStates(U_MAZE, 3, 5, radius_m=0.1, device="cpu")
+    states = planar(3, 5)
     states.reset_to(HERE)
     handed_out = states.state
     states.blocked[:] = True
@@ -24,7 +36,7 @@ def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
 
 
 def test_corrections_slide_along_walls_and_keep_all_else() -> None:
-    states = PlanarStates(U_MAZE, 3, 5, radius_m=0.1, device="cpu")
+    states = planar(3, 5)
     landed = HERE.clone()
     landed[0, 1], landed[1, 0], landed[:, 2:] = 5.95, -3.95, 0.5
     settled = states.settle(HERE, landed)
@@ -36,11 +48,62 @@ def test_corrections_slide_along_walls_and_keep_all_else() -> None:
     assert settled is states.state
 
 
-def test_sensors_show_what_is_not_so() -> None:
+def test_commands_are_clipped_then_turned_then_scaled() -> None:
+    states = planar(2, 4)
+    command = torch.tensor([[3.0, 0.0], [0.5, -0.25]])
+    torch.testing.assert_close(states.commanded_velocity(command), torch.tensor([[2.0, 0.0], [1.0, -0.5]]))
+    plain = {"friction": 1.0, "action_scale": 0.0, "heading_bias_deg": 0.0, "timestep_scale": 1.0}
+    columns = {name: torch.full((2, 1), value) for name, value in plain.items()}
+    columns["friction"][1], columns["action_scale"][1], columns["heading_bias_deg"][0] = 0.5, 0.2, 90.0
+    columns["timestep_scale"][1] = 3.0
+    states.vary(columns)
+    torch.testing.assert_close(
+        states.commanded_velocity(command), torch.tensor([[0.0, 2.0], [0.6, -0.3]]), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(states.period_s, torch.tensor([[0.1], [0.3]]))
+
+
+def test_sensors_show_other_states_than_the_true_ones() -> None:
     torch.manual_seed(0)
-    states = Resting(U_MAZE, 3, 4, PlanarVariation(friction=(0.5, 1.5)), radius_m=0.1, device="cpu")
-    states.reset_to(HERE[:, :4])
-    shown = torch.stack([states.step(torch.zeros(3, 2)) for _ in range(500)]) - states.true_state
-    assert torch.equal(states.true_state, HERE[:, :4])
-    largest = shown.abs().amax((0, 1))
-    torch.testing.assert_close(largest, torch.tensor([0.1, 0.1, 0.2, 0.2]), atol=0, rtol=0.02)
+    noise = BallVariation(
+        position_noise_m=(0.1, 0.1),
+        velocity_noise_m_s=(0.2, 0.2),
+        ball_position_noise_m=(0.3, 0.3),
+        ball_velocity_noise_m_s=(0.4, 0.4),
+    )
+    inner, varied = resting(3, 8, noise)
+    here = torch.rand(3, 8)
+    varied.reset_to(here)
+    assert torch.equal(varied.state, here)
+    shown = torch.stack([varied.step(torch.zeros(3, 3)) for _ in range(500)]) - here
+    assert torch.equal(varied.true_state, here) and torch.equal(inner.state, here)
+    expected = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.4, 0.4])
+    torch.testing.assert_close(shown.amax((0, 1)), expected, atol=0, rtol=0.03)
+    torch.testing.assert_close(shown.amin((0, 1)), -expected, atol=0, rtol=0.03)
+    # A row that is set is shown as it is; the others as before.
+    before = varied.state
+    varied.reset_to(torch.zeros(1, 8), torch.tensor([1]))
+    assert torch.equal(varied.state, torch.stack([before[0], torch.zeros(8), before[2]]))
+    assert torch.equal(varied.true_state, torch.stack([here[0], torch.zeros(8), here[2]]))
+
+
+def test_noise_is_for_velocities_and_not_for_the_wish_to_kick() -> None:
+    torch.manual_seed(0)
+    inner, varied = resting(20_000, 8, BallVariation(action_noise=(0.1, 0.1)))
+    varied.step(torch.tensor([[0.5, -0.5, 3.0]]).expand(20_000, 3))
+    torch.testing.assert_close(inner.action.mean(0), torch.tensor([0.5, -0.5, 3.0]), atol=0.005, rtol=0)
+    torch.testing.assert_close(inner.action.std(0), torch.tensor([0.1, 0.1, 0.0]), atol=0.005, rtol=0)
+
+
+def test_a_correction_is_of_the_true_state_and_is_shown_as_it_is() -> None:
+    _, varied = resting(3, 4, PlanarVariation(position_noise_m=(0.1, 0.1)))
+    here = HERE[:, :4]
+    varied.reset_to(here)
+    varied.step(torch.zeros(3, 2))
+    landed = here.clone()
+    landed[0, 1] = 5.95
+    settled = varied.settle(here, landed)
+    assert varied.blocked.tolist() == [True, False, False]
+    assert torch.equal(varied.state, settled) and torch.equal(varied.true_state, settled)
+    varied.true_state = landed
+    assert torch.equal(varied.true_state, landed) and torch.equal(varied.state, settled)

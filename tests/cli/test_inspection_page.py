@@ -1,0 +1,60 @@
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
+from astra_data.dataset.columns import Column
+from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
+
+
+def plane(counts: list[list[int]]) -> Map:
+    """A map whose first row of `counts` is the lowest."""
+    return Map(np.array(counts), np.array([-1.0, 2.0]), 0.5)
+
+
+def test_bars_grow_with_their_counts_and_only_nothing_is_empty() -> None:
+    assert sparkline(np.array([0, 1, 50, 100])) == " ▁▄█"
+    assert sparkline(np.array([0, 1, 10**9])) == " ▁█"
+    assert sparkline(np.zeros(3, np.int64)) == "   "
+
+
+def test_the_top_of_a_map_comes_first_and_a_character_is_two_cells_high() -> None:
+    assert shaded(plane([[0, 4], [0, 0], [0, 0], [9, 0]])) == "█\n ▓"
+    assert shaded(plane([[1, 0, 0], [0, 0, 0], [0, 0, 1]])) == "  █\n█"
+
+
+def test_shades_follow_the_square_root_of_the_visits() -> None:
+    # 100 visits are the darkest of four shades; 36 give 0.6 of the root, 4 give 0.2.
+    assert shaded(plane([[0, 4, 36, 100], [0, 0, 0, 0]])) == " ░▓█"
+
+
+@pytest.mark.parametrize("success", [None, 1])
+def test_a_page_sums_up_the_dataset(success: int | None) -> None:
+    column = Column("action", size=2, names=("vx", "vy"), astra={"unit": ["m/s", "m/s"]})
+    counts = np.zeros((2, BINS), np.int64)
+    spread = Spread(
+        column, low=np.array([-1.0, 0.0]), high=np.array([1.0, 0.123456]), mean=np.zeros(2), counts=counts
+    )
+    inspection = Inspection(
+        reference="fake@data-1.0.0",
+        lengths=np.array([600, 1200, 1800]),
+        fps=20,
+        success=success,
+        spreads=(spread,),
+        positions=plane([[1, 0], [0, 0]]),
+        velocities=None,
+    )
+    file = StringIO()
+    Console(file=file, width=120).print(inspection_page(inspection))
+    lines = file.getvalue().splitlines()
+    assert lines[0] == "fake@data-1.0.0: 3 episodes, 3,600 steps, 3.0 min"
+    assert lines[1].startswith("lengths 600 to 1800, median 1200  ")
+    assert ("success 1 of 3 episodes (0.33)" in lines) == (success is not None)
+    table = lines[lines.index("action (2) float32") + 1 :]
+    assert table[0].split() == ["value", "unit", "min", "mean", "max", "spread"]
+    assert table[1].split() == ["vx", "m/s", "-1", "0", "1"]
+    assert table[2].split() == ["vy", "m/s", "0", "0", "0.1235"]
+    assert table[3] == "positions, x -1.0 to 0.0 m, y 2.0 to 3.0 m"
+    assert table[4] == "█"

@@ -1,0 +1,96 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli import app as cli
+from astra_data.cli.recipes import refuse
+from astra_data.core.errors import AstraDataError, BadInputError
+
+pytestmark = pytest.mark.usefixtures("fake_recipe")
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "r.toml"
+    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[plus]\nsteps = 5\n')
+    return path
+
+
+def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) -> None:
+    def call(*arguments: str) -> str:
+        result = CliRunner().invoke(cli.app, [*arguments, "--root", str(tmp_path)], catch_exceptions=False)
+        assert result.exit_code == 0
+        return result.output
+
+    assert "0 of 9 items are finished" in call("check", str(recipe))
+    assert "collect/seed_0  finished" in call("collect", str(recipe), "--seed", "0")
+    assert "  finished  collect/seed_0\n  to do     pair/seed_0\n" in call("check", str(recipe))
+    with pytest.raises(AstraDataError, match="unknown stage 'x'"):
+        call("run", str(recipe), "--until", "x")
+
+
+@pytest.mark.parametrize(
+    ("stage", "takes"),
+    [
+        ("ground", {"method", "seeds", "jobs", "device"}),
+        ("train", {"method", "seeds", "jobs", "device"}),
+        ("align", {"method", "seeds", "jobs", "device"}),
+        ("evaluate", {"method", "seeds", "jobs"}),
+        ("report", {"seeds", "publish", "add"}),
+        ("pair", {"seeds", "jobs"}),
+        ("subset", {"seeds", "jobs"}),
+    ],
+)
+def test_a_command_passes_its_options_to_its_stage(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, takes: set[str]
+) -> None:
+    asked: list[Any] = []
+
+    def run_stage(*arguments: object, **options: object) -> Path:
+        asked.append((*arguments, options))
+        return tmp_path / "made"
+
+    monkeypatch.setattr("astra_data.experiments.run.run_stage", run_stage)
+    words = {
+        "method": (["--method", "astra"], "astra"),
+        "seeds": (["--seed", "4", "--seed", "7"], [4, 7]),
+        "jobs": (["--jobs", "3"], 3),
+        "device": (["--device", "cuda:1"], "cuda:1"),
+        "publish": (["--publish"], True),
+        "add": (["--add"], True),
+    }
+    given = [word for name in sorted(takes) for word in words[name][0]]
+    result = CliRunner().invoke(cli.app, [stage, str(recipe), "--root", str(tmp_path), *given])
+    assert result.output == f"finished: {tmp_path / 'made'}\n"
+    defaults = {"method": None, "seeds": (), "jobs": None, "device": "cpu", "publish": False, "add": False}
+    expected = defaults | {name: words[name][1] for name in takes} | {"root": tmp_path}
+    assert asked == [(recipe, stage, expected)]
+
+
+def test_faults_of_all_recipes_are_told(recipe: Path, tmp_path: Path) -> None:
+    broken = [tmp_path / "a.toml", tmp_path / "b.toml"]
+    for path in broken:
+        path.write_text(recipe.read_text().replace("[plus]", "[pluss]"))
+    paths = [broken[0], recipe, broken[1]]
+    result = CliRunner().invoke(cli.app, ["check", *map(str, paths), "--root", str(tmp_path)])
+    assert f"{recipe}: 0 of 9 items are finished" in result.output
+    assert isinstance(result.exception, AstraDataError)
+    assert [str(path) in str(result.exception) for path in paths] == [True, False, True]
+
+
+def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("astra_data.experiments.run.execute", interrupted)
+    result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
+    assert result.exit_code == 130
+    assert "run the same command again" in result.output
+
+
+def test_options_that_a_recipe_sets_itself_are_refused() -> None:
+    refuse({"episodes": None}, "collect")
+    with pytest.raises(BadInputError, match=r"in \[sweep\]: leave out --of, --min-steps$"):
+        refuse({"of": 3, "min_steps": 0, "name": None}, "subset", "sweep")

@@ -1,0 +1,35 @@
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import (
+    ACTION,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    TERMINATED,
+)
+from astra_data.exchange.exporters import export
+
+
+def test_d4rl_is_flat(dataset: Dataset, tmp_path: Path) -> None:
+    export(dataset, tmp_path / "set.hdf5", format="d4rl")
+    names = {
+        "observations": STATE,
+        "actions": ACTION,
+        "rewards": REWARD,
+        "next_observations": NEXT_STATE,
+        "terminals": TERMINATED,
+        "infos/goal": GOAL,
+    }
+    expected = dataset.columns(list(names.values()))
+    with h5py.File(tmp_path / "set.hdf5") as file:
+        for key, name in names.items():
+            np.testing.assert_array_equal(file[key][()], expected[name])
+            assert file[key].dtype == expected[name].dtype
+        ends = np.flatnonzero(file["terminals"][()] | file["timeouts"][()])
+        assert not (file["terminals"][()] & file["timeouts"][()]).any()
+    np.testing.assert_array_equal(ends, np.cumsum(dataset.lengths) - 1)

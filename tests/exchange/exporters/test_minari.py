@@ -1,0 +1,60 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import COLUMNS, fake_columns, writer
+from fake_transitions import NEXT, write_transitions
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import (
+    ACTION,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    TERMINATED,
+    TRUNCATED,
+    Episode,
+)
+from astra_data.exchange.exporters import export
+
+
+@pytest.mark.parametrize("has_goal", [True, False])
+def test_minari_loads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_goal: bool) -> None:
+    import minari  # noqa: PLC0415 - slow
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    dataset = write_transitions(tmp_path / "set", has_goal=has_goal)
+    monkeypatch.chdir(tmp_path)
+    export(dataset, Path("minari/fake/random-v2"), format="minari")
+    loaded = minari.load_dataset("fake/random-v2")
+    assert (loaded.total_episodes, loaded.total_steps) == (5, 55)
+    assert loaded.spec.dataset_id == "fake/random-v2"
+    for found, expected in zip(loaded.iterate_episodes(), dataset.episodes(), strict=True):
+        values = expected.columns
+        states = found.observations["observation"] if has_goal else found.observations
+        np.testing.assert_array_equal(states[:-1], values[STATE])
+        np.testing.assert_array_equal(states[1:], values[NEXT_STATE])
+        if has_goal:
+            np.testing.assert_array_equal(found.observations["desired_goal"][1:], values[GOAL])
+            assert loaded.observation_space["desired_goal"].shape == (2,)
+        np.testing.assert_array_equal(found.actions, values[ACTION])
+        np.testing.assert_array_equal(found.rewards, values[REWARD])
+        np.testing.assert_array_equal(found.terminations, values[TERMINATED])
+        np.testing.assert_array_equal(found.truncations, values[TRUNCATED])
+    assert [metadata.get("seed") for metadata in loaded.storage.get_episode_metadata(range(2))] == [None, 3]
+
+
+def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
+    with writer(tmp_path / "set", columns=[*COLUMNS, NEXT]) as open_writer:
+        columns = fake_columns(4, seed=1)
+        open_writer.add(Episode(1, columns | {NEXT_STATE: columns[STATE] + 1}))
+    apart = Dataset.open(tmp_path / "set")
+    with pytest.raises(BadInputError, match="a next state is not the state of the next step"):
+        export(apart, tmp_path / "random-v0", format="minari")
+    with pytest.raises(BadInputError, match="no id of Minari"):
+        export(apart, tmp_path / "no id!", format="minari")
+    with pytest.raises(BadInputError, match="no id of Minari; end --out with a name and a version"):
+        export(apart, tmp_path / "without-version", format="minari")
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]

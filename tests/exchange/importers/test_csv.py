@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import MAPPING, STEPS, imported, rows, write_table
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.importers import csv
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import Source
+
+STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
+
+
+def test_text_tells_episodes_apart(tmp_path: Path) -> None:
+    fields = rows()
+    names = np.array(["first", "2", "last"])[fields["trial"].astype(int)]
+    dataset, _ = imported(tmp_path, write_table(tmp_path / "log.csv", fields | {"trial": names}))
+    assert dataset.lengths.tolist() == list(STEPS)
+
+
+def test_csv_whose_later_blocks_look_different(tmp_path: Path) -> None:
+    # Two blocks of 1 MB: whole numbers and labels that look like numbers first, then others.
+    n = 60_000
+    lines = [f"{i},1,0,0,0,1,2,{'0' * 20}\n" for i in range(n)]
+    lines += [f"{i}.5,,0.5,0,0,1,b,zzz\n" for i in range(n)]
+    path = tmp_path / "log.csv"
+    path.write_text("x,y,command,reward,fell,gait,trial,unused\n" + "".join(lines))
+    dataset, report = imported(tmp_path, path, 'not_finite = "drop"\n' + MAPPING)
+    assert report.tally.rejected_rows == n
+    assert report.tally.rejected_first == f"log.csv row {n}"
+    assert dataset.lengths.tolist() == [n - 1]
+
+
+def test_tabs_separate_in_tsv(tmp_path: Path) -> None:
+    text = write_table(tmp_path / "log.csv", rows()).read_text()
+    (tmp_path / "log.tsv").write_text(text.replace(",", "\t"))
+    dataset, _ = imported(tmp_path, tmp_path / "log.tsv")
+    assert len(dataset) == 3
+
+
+def test_a_doubled_field_in_csv_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.csv", rows())
+    path.write_text(path.read_text().replace("unused", "x", 1))
+    with pytest.raises(BadInputError, match="has x more than once"):
+        imported(tmp_path, path)
+
+
+@pytest.mark.parametrize("last", ["", "0.5"])
+def test_integers_that_floats_would_alter_are_told(tmp_path: Path, last: str) -> None:
+    stamps = np.array(["1700000000050000002"] * 19 + [last])
+    path = write_table(tmp_path / "log.csv", rows() | {"stamp": stamps})
+    told = r"numbers of 2\^53 or more came as floats" if not last else "expected whole numbers"
+    with pytest.raises(BadInputError, match=f"gait: {told}"):
+        imported(tmp_path, path, 'not_finite = "drop"\n' + STAMPED)
+    assert not (tmp_path / "out").exists()
+
+
+def test_cells_are_numbers_flags_or_nothing(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("whole,float,flag,gap\n9007199254740993,0.5,true,1\n-2,1e3,false,\n")
+    columns = {name: {"fields": (name,)} for name in ("whole", "float", "flag", "gap")}
+    mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
+    source = Source(tmp_path / "log.csv", None, tmp_path / "log.csv")
+    (block,) = csv.read(source, mapping)
+    assert block.values["whole"].tolist() == [2**53 + 1, -2]
+    assert block.values["float"].tolist() == [0.5, 1000.0]
+    assert block.values["flag"].tolist() == [1.0, 0.0]
+    np.testing.assert_array_equal(block.values["gap"], [1.0, np.nan])
+
+
+def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.csv", rows())
+    path.write_text(path.read_text().replace("True", "perhaps"))
+    with pytest.raises(BadInputError, match=r"log.csv row 0: field 'fell' and below: expected numbers"):
+        imported(tmp_path, path)

@@ -1,0 +1,61 @@
+import json
+from pathlib import Path
+
+import pytest
+from fake_dataset import write_fake
+from shared_files import contents
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError
+from astra_data.dataset import Dataset
+from astra_data.exchange.sharing.push import push
+
+pytestmark = pytest.mark.usefixtures("quick_figure")
+
+
+def test_a_push_names_where_it_put_the_version_and_how_far_it_is(fake: Dataset, tmp_path: Path) -> None:
+    seen: list[float] = []
+    place = f"file://{tmp_path}/shared"
+    source = push(fake.root, place, progress=lambda fraction, note: seen.append(fraction))
+    assert source == f"{place}/fake@data-1.0.0"
+    assert seen == sorted(seen)
+    assert (seen[0], seen[-1]) == (0.0, 1.0)
+    files = contents(tmp_path / "shared/fake/data-1.0.0")
+    assert files.keys() == contents(fake.root).keys() | {"README.md", "README-coverage.png", "SHA256SUMS"}
+
+
+def test_a_second_push_sends_nothing(fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, f"file://{tmp_path}/shared")
+    before = contents(tmp_path / "shared")
+    seen: list[float] = []
+    push(fake.root, f"file://{tmp_path}/shared", progress=lambda fraction, note: seen.append(fraction))
+    assert not seen
+    assert contents(tmp_path / "shared") == before
+
+
+def test_notes_are_in_the_card_and_their_faults_are_told_before_anything_is_sent(
+    fake: Dataset, tmp_path: Path
+) -> None:
+    notes = tmp_path / "notes.toml"
+    notes.write_text('sumary = "It runs."\n')
+    with pytest.raises(RecipeError, match="did you mean 'summary'"):
+        push(fake.root, f"file://{tmp_path}/shared", notes=notes)
+    assert not (tmp_path / "shared").exists()
+    notes.write_text('summary = "It runs."\n')
+    push(fake.root, f"file://{tmp_path}/shared", notes=notes)
+    assert "It runs." in (tmp_path / "shared/fake/data-1.0.0/README.md").read_text()
+
+
+def test_private_is_refused_where_the_storage_decides(fake: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="private is for the Hugging Face Hub"):
+        push(fake.root, f"file://{tmp_path}/shared", private=True)
+    assert not (tmp_path / "shared").exists()
+
+
+def test_altered_values_are_not_pushed(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "mine")
+    description = json.loads((dataset.root / "meta/astra/dataset.json").read_text())
+    text = json.dumps(description | {"content_hash": "0" * 64})
+    (dataset.root / "meta/astra/dataset.json").write_text(text)
+    with pytest.raises(CorruptDatasetError, match="was altered: the content hash is"):
+        push(dataset.root, f"file://{tmp_path}/shared")
+    assert not (tmp_path / "shared").exists()

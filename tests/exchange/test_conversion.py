@@ -1,0 +1,150 @@
+"""Fields become columns: order of the operations, types, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import MAPPING, imported, rows, write_table
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.exchange.conversion import Converter, column_of
+from astra_data.exchange.mapping import ColumnMapping, ImportMapping
+from astra_data.exchange.recording import Block
+
+NAN = np.nan
+
+
+def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Converter:  # noqa: ANN401 - keys of a mapping
+    specs = {name: ColumnMapping.model_validate(spec) for name, spec in columns.items()}
+    return Converter(ImportMapping(name="n", task="t", fps=10, columns=specs, **more))
+
+
+def convert(spec: dict[str, Any], values: list[Any], name: str = "c") -> tuple[Array, list[bool]]:
+    """Return column `name` of one field with `values`, and which rows are finite."""
+    columns, finite = converter({name: {"fields": ("f",), **spec}}).convert(
+        Block({"f": np.array(values)}, "log")
+    )
+    return columns[name], finite.tolist()
+
+
+def test_take_scale_offset_and_clip_follow_each_other() -> None:
+    spec = {"take": (2, 0), "scale": (2.0, 10.0), "offset": (1.0, -1.0), "clip": (-5.0, 20.0)}
+    values, finite = convert(spec, [[1, 7, 3], [4, 7, 100], [-9, 7, 0]])
+    # (3 · 2 + 1, 1 · 10 - 1), (201 cut to 20, 39 cut to 20), (1, -91 cut to -5)
+    assert values.tolist() == [[7, 9], [20, 20], [1, -5]]
+    assert values.dtype == np.float32
+    assert finite == [True] * 3
+
+
+def test_fields_stand_side_by_side_each_row_flattened() -> None:
+    block = Block({"a": np.arange(8.0).reshape(2, 2, 2), "b": np.array([10.0, 20.0])}, "log")
+    columns, _ = converter({"c": {"fields": ("b", "a")}}).convert(block)
+    assert columns["c"].tolist() == [[10, 0, 1, 2, 3], [20, 4, 5, 6, 7]]
+
+
+def test_what_is_not_finite_is_not_clipped_but_rejected() -> None:
+    values, finite = convert({"clip": (-1.0, 1.0)}, [5.0, NAN, np.inf, -0.5])
+    assert finite == [True, False, False, True]
+    assert values[[0, 3]].tolist() == [1, -0.5]
+
+
+def test_what_does_not_fit_float32_is_rejected() -> None:
+    values, finite = convert({}, [1e300, 2.0])
+    assert (finite, values[1]) == ([False, True], 2.0)
+
+
+def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
+    made = converter({"c": {"fields": ("f",)}}, time="t", split={"ends": ("e",)})
+    fields = {"f": np.zeros(4), "t": np.array([0, NAN, 2, 3]), "e": np.array([0, 0, np.inf, 0])}
+    _, finite = made.convert(Block(fields, "log"))
+    assert finite.tolist() == [True, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("spec", "values", "told"),
+    [
+        ({"dtype": "bool"}, [0, 1, 2], "c: expected true and false, or 1 and 0"),
+        ({"dtype": "int64"}, [1.0, 1.5], "c: expected whole numbers"),
+        ({"dtype": "int64"}, np.array([2**63], np.uint64), r"c: expected whole numbers below 2\^63"),
+        ({"take": (2,)}, [[1, 2]], r"take \[2\]: f hold 2 values, counted from 0"),
+        ({"scale": (1.0, 2.0, 3.0)}, [[1, 2]], "scale has 3 numbers for 2 values"),
+        ({"offset": (1.0, 2.0)}, [1], "offset has 2 numbers for 1 values"),
+        ({}, ["a"], "field 'f': expected numbers, got <U1"),
+        ({}, np.zeros((2, 0)), r"field 'f' has no values, its shape is \(2, 0\)"),
+    ],
+)
+def test_values_that_do_not_fit_are_refused(spec: dict[str, Any], values: Any, told: str) -> None:  # noqa: ANN401
+    with pytest.raises(BadInputError, match=f"^log: {told}"):
+        convert(spec, values)
+
+
+def test_whole_numbers_and_flags_keep_their_types_where_rows_are_rejected() -> None:
+    values, finite = convert({"dtype": "int64"}, [3.0, NAN])
+    assert values.dtype.name == "int64"
+    assert (int(values[0]), finite) == (3, [True, False])
+    values, _ = convert({}, [1, 0, 1], name=TERMINATED)
+    assert values.dtype.name == "bool"
+    assert values.tolist() == [True, False, True]
+
+
+def test_a_column_that_changes_in_size_is_refused() -> None:
+    made = converter({"c": {"fields": ("f",)}})
+    made.convert(Block({"f": np.zeros((2, 3))}, "log"))
+    with pytest.raises(BadInputError, match="c: 2 values, before there were 3"):
+        made.convert(Block({"f": np.zeros((2, 2))}, "log"))
+
+
+def test_sizes_that_contradict_each_other_are_all_listed() -> None:
+    columns = {
+        STATE: {"fields": ("two",)},
+        NEXT_STATE: {"fields": ("three",)},
+        REWARD: {"fields": ("two",)},
+        TERMINATED: {"fields": ("flags",)},
+    }
+    jump = {"jump": {"column": STATE, "values": (0, 2), "above": 1.0}}
+    fields = {"two": np.zeros((1, 2)), "three": np.zeros((1, 3)), "flags": np.zeros((1, 2))}
+    with pytest.raises(BadInputError) as caught:
+        converter(columns, split=jump).convert(Block(fields, "log"))
+    for fault in (
+        f"{NEXT_STATE} has 3 values, {STATE} 2",
+        f"{REWARD}: 2 values, expected 1",
+        f"{TERMINATED}: 2 values, expected 1",
+        f"split.jump.values [0, 2]: {STATE} has 2 values, counted from 0",
+    ):
+        assert fault in str(caught.value)
+
+
+def test_next_states_and_ends_are_derived_where_they_are_left_out() -> None:
+    made = converter({STATE: {"fields": ("f",), "names": ("x",), "unit": ("m",)}})
+    made.convert(Block({"f": np.zeros(2)}, "log"))
+    columns = {column.name: column for column in made.columns}
+    assert list(columns) == [STATE, NEXT_STATE, TERMINATED, TRUNCATED, DONE]
+    assert columns[NEXT_STATE].names == ("x",)
+    assert columns[NEXT_STATE].astra == {"unit": ["m"]}
+    whole = converter({STATE: {"fields": ("f",)}, NEXT_STATE: {"fields": ("f",)}})
+    whole.convert(Block({"f": np.zeros(2)}, "log"))
+    assert [column.name for column in whole.columns][:2] == [STATE, NEXT_STATE]
+    assert len(whole.columns) == 5
+
+
+def test_one_unit_holds_for_every_value() -> None:
+    spec = ColumnMapping(fields=("f",), unit=("m",), frame=("world", "body"))
+    assert column_of("c", spec, 2).astra == {"unit": ["m", "m"], "frame": ["world", "body"]}
+
+
+@pytest.mark.parametrize("spec", ['fields = ["stamp", "x"]', 'fields = ["stamp"]\nscale = [1.0]'])
+def test_integers_that_become_floats_on_their_way_are_told(tmp_path: Path, spec: str) -> None:
+    fields = rows() | {"stamp": np.full(20, 2**60 + 1), "x": np.zeros(20)}
+    with pytest.raises(BadInputError, match=r"gait: numbers of 2\^53 or more came as floats"):
+        imported(
+            tmp_path, write_table(tmp_path / "log.npz", fields), MAPPING.replace('fields = ["gait"]', spec)
+        )
+
+
+def test_large_integers_need_a_dtype_that_holds_them(tmp_path: Path) -> None:
+    fields = rows() | {"stamp": np.full(20, 2**60 + 1)}
+    mapping = MAPPING.replace('fields = ["gait"]\ndtype = "int64"', 'fields = ["stamp"]')
+    with pytest.raises(BadInputError, match=r"gait: integers beyond 2\^53 do not fit float32; set dtype"):
+        imported(tmp_path, write_table(tmp_path / "log.npz", fields), mapping)

@@ -1,0 +1,94 @@
+import os
+from collections.abc import Collection
+from functools import partial
+from pathlib import Path
+
+import pytest
+from fake_items import crash, fail, touch
+
+from astra_data.core.errors import MissingStageError
+from astra_data.experiments.execution import Item, Reporter, pickled, run_in_order, run_item
+
+
+class Workshop:
+    """Finishes the oldest running item whenever it is waited for."""
+
+    def __init__(self) -> None:
+        self.running: list[str] = []
+        self.most = 0
+        self.begun: list[str] = []
+
+    def begin(self, item: Item) -> None:
+        self.begun.append(item.key)
+        self.running.append(item.key)
+        self.most = max(self.most, len(self.running))
+
+    def wait(self) -> Collection[str]:
+        return [self.running.pop(0)]
+
+
+def no_call() -> None:
+    raise AssertionError("never called")
+
+
+@pytest.mark.parametrize(("jobs", "most"), [(1, 1), (2, 2), (None, 3)])
+def test_items_begin_when_their_inputs_are_finished_and_a_job_is_free(jobs: int | None, most: int) -> None:
+    names = {"last": ("a", "b", "c"), "a": ("outside",), "b": (), "c": ()}
+    items = [Item(key, inputs, no_call) for key, inputs in names.items()]
+    workshop = Workshop()
+    run_in_order(items, jobs, workshop.begin, workshop.wait)
+    assert workshop.begun == ["a", "b", "c", "last"]
+    assert workshop.most == most
+
+
+def test_nothing_finishing_yet_is_waited_for() -> None:
+    answers = iter([[], [], ["a"]])
+    begun: list[Item] = []
+    run_in_order([Item("a", (), no_call)], 1, begun.append, lambda: next(answers))
+    assert [item.key for item in begun] == ["a"]
+    assert next(answers, None) is None
+
+
+def test_items_that_wait_for_each_other_are_a_bug() -> None:
+    workshop = Workshop()
+    items = [Item("a", ("b",), no_call), Item("b", ("a",), no_call), Item("c", (), no_call)]
+    with pytest.raises(ValueError, match="items wait for each other: a, b"):
+        run_in_order(items, 1, workshop.begin, workshop.wait)
+    assert workshop.begun == ["c"]
+
+
+def prepared() -> None:
+    os.write(1, b"prepared\n")
+
+
+def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    work = pickled(Item("a", (), partial(touch, tmp_path / "made", ())), None)
+    seconds = run_item("a", work, tmp_path / "logs/a.txt", lambda note: None)
+    assert isinstance(seconds, float)
+    assert (tmp_path / "made").exists()
+    assert not (tmp_path / "logs/a.txt").exists()
+    error = run_item("b", pickled(Item("b", (), crash), prepared), tmp_path / "logs/b.txt", lambda note: None)
+    log = (tmp_path / "logs/b.txt").read_text()
+    assert str(error) == f"b crashed: ValueError: a bug (traceback: {tmp_path / 'logs/b.txt'})"
+    assert log == "prepared\n"
+    os.write(1, b"ours again\n")
+    assert "ours again\n" in capfd.readouterr().out
+
+
+def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
+    error = run_item("a/b", pickled(Item("a/b", (), fail), None), tmp_path / "log", lambda note: None)
+    assert type(error) is MissingStageError
+    assert str(error) == "a/b: nothing to eat"
+
+
+def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 5.0
+    monkeypatch.setattr("astra_data.experiments.execution.time.monotonic", lambda: now)
+    sent: list[tuple[float, str]] = []
+    report = Reporter(sent.append)
+    for step in range(12):
+        now = 5.0 + step * 0.03
+        report(step / 10, "")
+    assert [fraction for fraction, _ in sent] == [0.0, 0.4, 0.8]
