@@ -89,7 +89,7 @@ class Evaluation(Artefact):
         return self
 
 
-class Point(BaseModel):
+class CurvePoint(BaseModel):
     """One moment of a training."""
 
     model_config = ConfigDict(frozen=True)
@@ -107,7 +107,7 @@ class CurveFile(Artefact):
     steps_per_second: float | None = None
     simulator_steps_per_second: float | None = None
     updates_per_second: float | None = None
-    points: list[Point] = Field(min_length=1)
+    points: list[CurvePoint] = Field(min_length=1)
 
 
 class Metrics(Artefact):

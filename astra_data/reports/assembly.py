@@ -29,7 +29,7 @@ from astra_data.reports.runs import Runs
 from astra_data.reports.schema import (
     BandMeans,
     Cost,
-    Dataset,
+    DatasetOrigin,
     GapMeans,
     Learning,
     MethodResults,
@@ -133,7 +133,7 @@ def _read(
         wall_seconds=seconds(files, "wall_seconds"),
         cpu_seconds=seconds(files, "cpu_seconds"),
         datasets=[
-            Dataset(
+            DatasetOrigin(
                 stage=stage, seed=seed, name=file.name, version=file.version, content_hash=file.content_hash
             )
             for stage, of_seeds in datasets.items()

@@ -10,7 +10,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.reports.comparing import improvement, summarised, validity
 from astra_data.reports.figures import method_title
 from astra_data.reports.origins import Named, dataset_uses, merged_origins
-from astra_data.reports.schema import Cost, Dataset, GapMeans, MethodResults, Results
+from astra_data.reports.schema import Cost, DatasetOrigin, GapMeans, MethodResults, Results
 
 PER_SEED = (
     *("success", "failed", "wall_contact", "steps", "returns", "distance"),
@@ -80,8 +80,8 @@ def _check_alike(sources: Sequence[Results]) -> None:
             )
 
 
-def _datasets(sources: Sequence[Results]) -> list[Dataset]:
-    datasets: dict[tuple[str, int], Dataset] = {}
+def _datasets(sources: Sequence[Results]) -> list[DatasetOrigin]:
+    datasets: dict[tuple[str, int], DatasetOrigin] = {}
     for one in (dataset for source in sources for dataset in source.datasets):
         known = datasets.setdefault((one.stage, one.seed), one)
         if known.content_hash != one.content_hash:

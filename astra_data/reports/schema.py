@@ -16,13 +16,13 @@ Number = Annotated[float, BeforeValidator(_nan_for_null)]
 """JSON knows no NaN: it is written as null and read back."""
 
 
-class Part(BaseModel):
+class Section(BaseModel):
     """A frozen part of the results."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Machine(Part):
+class Machine(Section):
     """A machine that something was made on."""
 
     cpu: str
@@ -32,7 +32,7 @@ class Machine(Part):
     """Where the networks ran on one."""
 
 
-class Origin(Part):
+class Origin(Section):
     """What some stages' artefacts say of their making; None or empty where they do not say."""
 
     commit: str | None
@@ -43,7 +43,7 @@ class Origin(Part):
     """"report" for what is drawn and simulated by the report itself."""
 
 
-class Dataset(Part):
+class DatasetOrigin(Section):
     """A dataset that the recipe wrote."""
 
     stage: str
@@ -53,7 +53,7 @@ class Dataset(Part):
     content_hash: str
 
 
-class DatasetUse(Part):
+class DatasetUse(Section):
     """The dataset of each seed, as the evaluations of rows recorded it."""
 
     versions: list[str | None]
@@ -61,7 +61,7 @@ class DatasetUse(Part):
     methods: list[str]
 
 
-class Learning(Part):
+class Learning(Section):
     """One seed's training."""
 
     steps: list[float]
@@ -69,7 +69,7 @@ class Learning(Part):
     """The headline of the training episodes that ended, wherever in the task they began."""
 
 
-class BandMeans(Part):
+class BandMeans(Section):
     """An error at each horizon, averaged over seeds."""
 
     mean: list[Number]
@@ -77,7 +77,7 @@ class BandMeans(Part):
     high: list[Number]
 
 
-class GapMeans(Part):
+class GapMeans(Section):
     """Open-loop error by horizon for each quantity, averaged over seeds."""
 
     seeds: list[int]
@@ -87,7 +87,7 @@ class GapMeans(Part):
     raw: dict[str, BandMeans]
 
 
-class Cost(Part):
+class Cost(Section):
     """The time that one seed of a stage takes, on average."""
 
     wall_seconds: float
@@ -95,7 +95,7 @@ class Cost(Part):
     """Of all threads; None where it was not recorded."""
 
 
-class Validity(Part):
+class Validity(Section):
     """How well the return in a simulator foretells that in the target, over policies: rows and seeds."""
 
     policies: int
@@ -104,7 +104,7 @@ class Validity(Part):
     spearman: Correlation | None
 
 
-class MethodResults(Part):
+class MethodResults(Section):
     """One row. Each measure is a list over seeds of means over episodes in the target."""
 
     title: str
@@ -155,7 +155,7 @@ class MethodResults(Part):
         }
 
 
-class Results(Part):
+class Results(Section):
     """All that the page and the figures show."""
 
     format: Literal[1] = 1
@@ -173,7 +173,7 @@ class Results(Part):
     """By stage over all rows and seeds, and "total"; stages that record no time are left out."""
     cpu_seconds: dict[str, float]
     """The same of all threads."""
-    datasets: list[Dataset]
+    datasets: list[DatasetOrigin]
     evaluated_with: list[DatasetUse]
     seeds: list[int] = Field(default_factory=list)
     """Of which rows may have finished only some."""
