@@ -53,21 +53,21 @@ def assemble(
     paper_success: Mapping[str, float] | None = None,
     published: Results | None = None,
 ) -> Results:
-    """Read the artefacts under `root` of every row, for those of the seeds `asked` for that it has finished.
+    """Read the artefacts under `root` of every row, for the seeds in `asked` that it has finished.
 
-    Of one size of the dataset, `percent`, where there are several; added to what is `published`, if that is
-    given.
+    `percent` selects the dataset size, if there are several. Results in `published` are merged in, unless
+    there are newer ones under `root`.
 
     Raises:
-        MissingStageError: no row has an evaluation, nor is any published; or a row has other artefacts for
-            some of its finished seeds only.
-        BadInputError: an artefact is malformed, or rows were evaluated or made of data differently.
+        MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artefacts
+            for some of its finished seeds.
+        BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
     read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
     settings = dict(settings or {})
     sources = []
     if published:
-        # It may be that of the recipe that this one is based on.
+        # The published results may be of the recipe that this one is based on.
         own = {"recipe": recipe, "command": command, "settings": settings}
         sources.append(published.model_copy(update=own))
     if read.any_finished or not published:
@@ -80,7 +80,7 @@ def assemble(
 def _read(
     read: Runs, task: str, command: str, scores: tuple[Score, ...], settings: dict[str, JsonValue]
 ) -> Results:
-    """Return what the artefacts say, before rows are summarised and compared."""
+    """Return the results under one root, before rows are summarised and compared."""
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
     episodes = check_alike(evaluations, task)

@@ -1,4 +1,4 @@
-"""What the artefacts of all stages took, and how fast they were made."""
+"""Time and speed of all stages, from their artefacts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -14,10 +14,10 @@ THROUGHPUT = {
     "align": ("windows_per_second",),
     "evaluate": ("target_steps_per_second",),
 }
-"""The figures in which each stage gives its speed."""
+"""The keys under which each stage records its speed."""
 
 Files = Mapping[str, Mapping[str, Sequence[Artefact]]]
-"""Stage → row, or grounding that rows share, or "all" → one artefact per seed."""
+"""Stage → row, shared grounding, or "all" → one artefact per seed."""
 
 
 def seconds(files: Files, clock: Literal["wall_seconds", "cpu_seconds"]) -> dict[str, float]:

@@ -13,7 +13,7 @@ from astra_data.reports.sizes import SizesResults
 
 Found = Results | SizesResults
 Page = Callable[[Mapping[str, str]], str]
-"""Returns the page with the figures of these names and files."""
+"""Name → file name of each figure → the page."""
 
 FIGURES = (
     *("success", "steps", "return", "trajectories", "strips", "mismatch"),
@@ -23,10 +23,10 @@ FIGURES = (
 
 
 def read_published(path: Path) -> Found:
-    """Return the results in a JSON file.
+    """Read results from a JSON file.
 
     Raises:
-        BadInputError: there are none, or they are not as they are written now.
+        BadInputError: the file is missing, or has another layout.
     """
     if not path.is_file():
         raise BadInputError(f"expected published results in {path}, found none: leave out what asks for them")
@@ -43,7 +43,7 @@ def published_figures(folder: Path, recipe: str) -> dict[str, bytes]:
 
 
 def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:
-    """Write to `folder` under the recipe's name, in place of what was there before."""
+    """Write page, JSON and `images` to `folder` under the recipe's name, replacing earlier ones."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in FIGURES:
         (folder / f"{found.recipe}_{name}.png").unlink(missing_ok=True)

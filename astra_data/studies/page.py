@@ -95,12 +95,12 @@ def _shown_s(case: Mapping[str, Any]) -> float:
 
 
 def _shown(case: Mapping[str, Any]) -> str:
-    """Return that horizon as the results name it."""
+    """Return that horizon as the key of the results."""
     return f"{_shown_s(case):.3g}"
 
 
 def _case(case: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the page shows of a case: numbers, and the lines of its three tables."""
+    """Return the numbers of a case on the page, and the lines of its three tables."""
     size, shown = case["sizes"][-1], _shown(case)
     at_shown = {model: horizons[shown] for model, horizons in size["models"].items()}
     return {
