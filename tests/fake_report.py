@@ -7,7 +7,7 @@ import numpy as np
 from fake_runs import FakeRecipe
 
 from astra_data.reports.command_replay import CommandReplay
-from astra_data.reports.page import HOW_TO_READ
+from astra_data.reports.files import FIGURES as ALL_FIGURES
 from astra_data.stages.report import ReportConfig, report
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.score import SUCCESS
@@ -17,7 +17,7 @@ REPLAY = CommandReplay(
 )
 
 LASTING_FIGURES = {"steps", "return", "learning_steps"}
-FIGURES = {*HOW_TO_READ} - LASTING_FIGURES - {"strips"}
+FIGURES = {*ALL_FIGURES} - LASTING_FIGURES - {"strips", "data_efficiency"}
 
 CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
 

@@ -1,17 +1,20 @@
-"""What a recipe's runs amount to.
+"""Results of a recipe: artefacts of its runs → tables, figures and a page.
 
-artefacts     read the JSON that the other stages left behind, strictly
-runs          find those files for all rows and seeds
+artefacts     JSON files that the other stages write, strictly validated
+runs          where those files are, for all rows and seeds
 schema        Results: what results.json holds
-costs         what the artefacts took
+seed_table    Results as a tidy table: one line per row and seed
+costs         times and speeds of the artefacts
 assembly      artefacts → Results
 merging       Results of several places → one
-comparing     rows → their summaries, and how they compare
-origins       where results come from, each said once
+comparing     summaries over seeds, comparisons of rows, predictive validity
+statistics    interquartile means, bootstrap intervals, correlations
+origins       code, machine and datasets, each once
+command_replay   identical commands in simulator and target
 drawing       Results → figures
 page          Results → Markdown
-sizes         Results of each size of the dataset, and their page
-files         results, pages and figures → a folder
-cost_and_origin   the sections of pages on cost and origin
-formatting    their numbers and tables
+sizes         Results at each dataset size, and their page
+cost_and_origin   text on cost and origin
+formatting    numbers, tables and templates of the pages
+files         results, page and figures → a folder
 """

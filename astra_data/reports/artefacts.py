@@ -1,4 +1,4 @@
-"""Read what the other stages left behind: a missing key is an error, an extra one is not."""
+"""Files that the other stages write: a missing key is an error, an extra one is not."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,29 +18,29 @@ TRAJECTORIES = "trajectories.safetensors"
 
 
 class Artefact(BaseModel):
-    """A file that a stage wrote, with how it was made where it says so."""
+    """A file that a stage wrote, with its time and origin if recorded."""
 
     model_config = ConfigDict(frozen=True)
 
     wall_seconds: float | None = None
-    """How long the stage ran, in s."""
+    """Run time of the stage, in s."""
     cpu_seconds: float | None = None
-    """Of all its threads, in s."""
+    """CPU time of all its threads, in s."""
     git_commit: str | None = None
-    """Of the code, ending in "-dirty" where it was changed since."""
+    """Ends in "-dirty" if there were uncommitted changes."""
     packages: dict[str, str | None] = Field(default_factory=dict)
     machine: Machine | None = None
 
 
 class Outcomes(BaseModel):
-    """How a policy's episodes went, one number per episode."""
+    """Outcomes of a policy's episodes, one number per episode."""
 
     model_config = ConfigDict(frozen=True)
 
     success: list[float]
     """1 where the goal was reached, else 0."""
     failed: list[float]
-    """1 where it ended badly, else 0."""
+    """1 where the episode ended in failure, else 0."""
     wall_contact: list[float]
     """Share of the episode's steps in contact with a wall."""
     steps: list[float]
@@ -67,13 +67,13 @@ class Evaluation(Artefact):
     target_steps_per_second: float | None = None
     target: Outcomes
     simulated: Outcomes | None = None
-    """In the simulator that the policy was trained in; None for a row that was in none."""
+    """In the simulator that the policy was trained in; None if it was trained in none."""
     raw: Outcomes | None = None
     """In the raw simulator; None for a policy that cannot act on abstract states."""
     grounded: Outcomes | None = None
-    """In the grounded simulator for reference, where there is one; None likewise."""
+    """In the reference grounded simulator; None if there is none, or likewise."""
     encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
-    """Mean of each measure by encoder, where there is more than one."""
+    """Mean of each measure by encoder, if there is more than one."""
 
     @model_validator(mode="after")
     def _one_number_per_episode(self) -> Self:
@@ -89,16 +89,16 @@ class Evaluation(Artefact):
         return self
 
 
-class Point(BaseModel):
-    """One moment of a training."""
+class CurvePoint(BaseModel):
+    """One point of a learning curve."""
 
     model_config = ConfigDict(frozen=True)
 
     steps: float
     success: float | None
-    """Of the training episodes that ended; None where none had."""
+    """Success rate of the training episodes that ended; None without any."""
     episode_steps: float | None = None
-    """Their mean length; None where none had, or where it was not recorded."""
+    """Their mean length in control steps; None without any, or if not recorded."""
 
 
 class CurveFile(Artefact):
@@ -107,7 +107,7 @@ class CurveFile(Artefact):
     steps_per_second: float | None = None
     simulator_steps_per_second: float | None = None
     updates_per_second: float | None = None
-    points: list[Point] = Field(min_length=1)
+    points: list[CurvePoint] = Field(min_length=1)
 
 
 class Metrics(Artefact):
@@ -189,7 +189,7 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
 
 
 def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
-    """Return the episodes per row and seed of all rows.
+    """Return the number of episodes per row and seed, the same for all.
 
     Raises:
         BadInputError: rows were evaluated differently.
@@ -217,7 +217,7 @@ def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) 
 
 
 def way_to_success(path: Path, evaluation: Evaluation) -> float:
-    """Return the robot's mean way in m in the episodes at `path` that succeeded, NaN for none."""
+    """Return the robot's mean path length in m over the successful episodes at `path`; NaN without any."""
     robot = read_tensors(path, ("target.position",))["target.position"][..., :2]
     ways = np.nansum(np.linalg.norm(np.diff(robot, axis=1), axis=-1), axis=1)
     succeeded = ways[np.array(evaluation.target.success, dtype=bool)]

@@ -21,21 +21,19 @@ from astra_data.reports.artefacts import (
     way_to_success,
 )
 from astra_data.reports.comparing import SHARED_WORLDS
-from astra_data.reports.costs import Files, row_cost, seconds, throughput
-from astra_data.reports.figures import ROLES, method_title
+from astra_data.reports.costs import Files, seconds, seed_cost, throughput
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
 from astra_data.reports.schema import (
     BandMeans,
-    Cost,
-    Dataset,
+    DatasetOrigin,
     GapMeans,
     Learning,
-    MethodResults,
     Origin,
     Results,
 )
+from astra_data.reports.seed_table import Line, row_of
 from astra_data.worlds.score import SUCCESS, Score
 
 
@@ -55,21 +53,21 @@ def assemble(
     paper_success: Mapping[str, float] | None = None,
     published: Results | None = None,
 ) -> Results:
-    """Read the artefacts under `root` of every row, for those of the seeds `asked` for that it has finished.
+    """Read the artefacts under `root` of every row, for the seeds in `asked` that it has finished.
 
-    Of one size of the dataset, `percent`, where there are several; added to what is `published`, if that is
-    given.
+    `percent` selects the dataset size, if there are several. Results in `published` are merged in, unless
+    there are newer ones under `root`.
 
     Raises:
-        MissingStageError: no row has an evaluation, nor is any published; or a row has other artefacts for
-            some of its finished seeds only.
-        BadInputError: an artefact is malformed, or rows were evaluated or made of data differently.
+        MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artefacts
+            for some of its finished seeds.
+        BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
     read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
     settings = dict(settings or {})
     sources = []
     if published:
-        # It may be that of the recipe that this one is based on.
+        # The published results may be of the recipe that this one is based on.
         own = {"recipe": recipe, "command": command, "settings": settings}
         sources.append(published.model_copy(update=own))
     if read.any_finished or not published:
@@ -82,7 +80,7 @@ def assemble(
 def _read(
     read: Runs, task: str, command: str, scores: tuple[Score, ...], settings: dict[str, JsonValue]
 ) -> Results:
-    """Return what the artefacts say, before rows are summarised and compared."""
+    """Return the results under one root, before rows are summarised and compared."""
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
     episodes = check_alike(evaluations, task)
@@ -92,8 +90,10 @@ def _read(
     alignments = read.optional("align", "metrics.json", Metrics)
     datasets = {stage: read.datasets(stage) for stage in ("collect", "pair", "subset")}
     gap_means = {owner: _gap_means(of_seeds) for owner, of_seeds in gaps.items()}
-    rows = {}
+    rows, uses = {}, {}
     for method, of_seeds in evaluations.items():
+        encoders = [{name: sorted(of) for name, of in file.encoders.items()} for file in of_seeds.values()]
+        _require_alike(encoders, "encoders")
         grounding = read.owner("ground", method)
         made: dict[str, Mapping[int, Artefact]] = {
             "ground": metrics.get(grounding, {}),
@@ -101,20 +101,24 @@ def _read(
             "align": alignments.get(read.owner("align", method), {}),
             "evaluate": of_seeds,
         }
-        rows[method] = _row(
-            method,
-            of_seeds,
-            grounding,
-            [
-                way_to_success(read.path("evaluate", method, seed, TRAJECTORIES), file)
-                for seed, file in of_seeds.items()
-            ],
-            gap_means.get(grounding),
-            [_learning(curve, scores[0]) for curve in curves.get(method, {}).values()],
-            row_cost(
-                {stage: [found[seed] for seed in of_seeds if seed in found] for stage, found in made.items()}
-            ),
-        )
+        lines = [
+            Line(
+                method=method,
+                seed=seed,
+                values=_values(
+                    file,
+                    way_to_success(read.path("evaluate", method, seed, TRAJECTORIES), file),
+                    curves.get(method, {}).get(seed),
+                    scores[0],
+                ),
+                grounding=grounding if grounding in gap_means else None,
+                cost=seed_cost({stage: found[seed] for stage, found in made.items() if seed in found}),
+                dataset=(file.dataset_version, file.dataset_hash),
+            )
+            for seed, file in of_seeds.items()
+        ]
+        uses[method] = [line.dataset for line in lines]
+        rows[method] = row_of(lines, gap_means)
     files: Files = {
         "collect": {"all": list(datasets["collect"].values())},
         "pair": {"all": list(datasets["pair"].values())},
@@ -133,18 +137,13 @@ def _read(
         wall_seconds=seconds(files, "wall_seconds"),
         cpu_seconds=seconds(files, "cpu_seconds"),
         datasets=[
-            Dataset(
+            DatasetOrigin(
                 stage=stage, seed=seed, name=file.name, version=file.version, content_hash=file.content_hash
             )
             for stage, of_seeds in datasets.items()
             for seed, file in of_seeds.items()
         ],
-        evaluated_with=dataset_uses(
-            {
-                method: [(file.dataset_version, file.dataset_hash) for file in of_seeds.values()]
-                for method, of_seeds in evaluations.items()
-            }
-        ),
+        evaluated_with=dataset_uses(uses),
         episodes=episodes,
         leg_scale=next(file.leg_scale for of_seeds in evaluations.values() for file in of_seeds.values()),
         methods=rows,
@@ -156,44 +155,25 @@ def _listed[T: Artefact](files: Mapping[str, Mapping[int, T]]) -> dict[str, list
     return {row: list(of_seeds.values()) for row, of_seeds in files.items()}
 
 
-def _row(
-    method: str,
-    of_seeds: Mapping[int, Evaluation],
-    grounding: str,
-    distances: Sequence[float],
-    gap: GapMeans | None,
-    learning: list[Learning],
-    cost: dict[str, Cost],
-) -> MethodResults:
-    evaluations = list(of_seeds.values())
-    means = [file.target.means() for file in evaluations]
-    measures = {name: [seed[name] for seed in means] for name in means[0]}
-    returns = {world: _in_world(evaluations, world, "return") for world in SHARED_WORLDS}
-    measured = [{name: sorted(of) for name, of in file.encoders.items()} for file in evaluations]
-    _require_alike(measured, "encoders")
-    encoders = {
-        encoder: {measure: [file.encoders[encoder][measure] for file in evaluations] for measure in first}
-        for encoder, first in evaluations[0].encoders.items()
+def _values(
+    evaluation: Evaluation, distance: float, curve: CurveFile | None, score: Score
+) -> dict[str, object]:
+    """Return the value of each field in `PER_SEED`."""
+    means = evaluation.target.means()
+    simulated = {} if evaluation.simulated is None else evaluation.simulated.means()
+    shared = {world: getattr(evaluation, world) for world in SHARED_WORLDS}
+    return {
+        **{measure: means[measure] for measure in ("success", "failed", "wall_contact", "steps")},
+        "returns": means["return"],
+        "distance": distance,
+        "simulated_success": simulated.get("success"),
+        "simulated_steps": simulated.get("steps"),
+        "simulator_returns": {
+            world: outcomes.means()["return"] for world, outcomes in shared.items() if outcomes is not None
+        },
+        "encoders": evaluation.encoders,
+        "learning": None if curve is None else _learning(curve, score),
     }
-    return MethodResults(
-        title=method_title(method),
-        role=ROLES.get(method),
-        seeds=list(of_seeds),
-        success=measures["success"],
-        failed=measures["failed"],
-        wall_contact=measures["wall_contact"],
-        steps=measures["steps"],
-        returns=measures["return"],
-        distance=list(distances),
-        simulated_success=_in_world(evaluations, "simulated", "success"),
-        simulated_steps=_in_world(evaluations, "simulated", "steps"),
-        simulator_returns={world: values for world, values in returns.items() if values is not None},
-        encoders=encoders,
-        grounding=grounding if gap else None,
-        gap=gap,
-        learning=learning,
-        cost=cost,
-    )
 
 
 def _learning(curve: CurveFile, score: Score) -> Learning:
@@ -202,12 +182,6 @@ def _learning(curve: CurveFile, score: Score) -> Learning:
         steps=[point.steps for point in curve.points],
         score=[float("nan") if value is None else value for value in reached],
     )
-
-
-def _in_world(evaluations: Sequence[Evaluation], world: str, measure: str) -> list[float] | None:
-    """Return the means of a measure, or None unless every seed was tested in that world."""
-    outcomes = [outcome for file in evaluations if (outcome := getattr(file, world)) is not None]
-    return [outcome.means()[measure] for outcome in outcomes] if len(outcomes) == len(evaluations) else None
 
 
 def _require_alike(values: Sequence[object], what: str) -> None:

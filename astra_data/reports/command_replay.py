@@ -10,12 +10,12 @@ from astra_data.worlds.task import Task
 
 _ROBOTS = 60
 _COMMANDS = (((0.8, 0.0), 2.0), ((0.0, 0.8), 1.0), ((-0.8, 0.0), 2.0), ((0.0, -0.8), 1.0), ((0.0, 0.0), 2.0))
-"""Velocity, ±1 per axis, and how long it is held in s: a closed loop within one maze cell, then a stop."""
+"""Velocity (±1 per axis) and its duration in s: a closed loop within one maze cell, then a stop."""
 
 
 @dataclass(frozen=True)
 class CommandReplay:
-    """What T steps of the same commands do in both worlds.
+    """T steps of the same commands in the abstract simulator and in the target.
 
     Attributes:
         time_s: (T,). command: ±1 per axis, (T, 2). simulated: [x, y, vx, vy] after each step, (T, 4).

@@ -1,4 +1,4 @@
-"""What rows amount to over their seeds, alone and beside each other."""
+"""Summaries of rows over their seeds, and comparisons between rows."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ from astra_data.reports.statistics import Comparison, correlation, probability_o
 from astra_data.worlds.score import Score
 
 SHARED_WORLDS = ("raw", "grounded")
-"""Simulators that all rows are tested in."""
+"""Simulators in which all rows are tested."""
 
 
 def summarised(row: MethodResults, replicates: int) -> MethodResults:
@@ -26,9 +26,9 @@ def summarised(row: MethodResults, replicates: int) -> MethodResults:
 def improvement(
     rows: Mapping[str, MethodResults], score: Score, replicates: int
 ) -> dict[str, dict[str, Comparison]]:
-    """Compare ASTRA with every other row that is trained as it is, with the [plus] settings or without.
+    """Compare ASTRA with every row that is trained alike: with the [plus] settings, or without.
 
-    Rows that were in no simulator are compared with both, for the settings are none of theirs.
+    Rows that are trained in no simulator have no [plus] settings and are compared with both.
     """
     scores = {method: np.array(row.measures()[score.measure]) for method, row in rows.items()}
     compared = {method: row for method, row in rows.items() if row.role in (None, "floor")}

@@ -1,33 +1,37 @@
-"""Sections of the page: what the results cost, and where they come from."""
+"""What results cost and where they come from, as text."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from astra_data.reports.figures import method_title
-from astra_data.reports.formatting import duration, short, table
+from astra_data.reports.formatting import duration, short
 from astra_data.reports.schema import Origin, Results
 
 COSTED = ("ground", "train", "align", "evaluate")
-"""Stages that are done for a row."""
+"""Stages that run once for each row and seed."""
 
 
-def cost(results: Results) -> str:
-    """Return the section on time and speed."""
-    stages = []
+def stage_costs(results: Results) -> list[list[str]]:
+    """Return lines of wall time, CPU time and speed by stage, and of the whole recipe."""
+    lines = []
     for stage in ("collect", "pair", *COSTED):
         speeds = results.throughput.get(stage, {})
         shown = [f"{_rates(rows)} {_unit(figure)}" for figure, rows in speeds.items() if rows]
         wall, cpu = (spent.get(stage) for spent in (results.wall_seconds, results.cpu_seconds))
         if shown or wall is not None:
-            stages.append([stage, duration(wall), duration(cpu), "; ".join(shown)])
+            lines.append([stage, duration(wall), duration(cpu), "; ".join(shown)])
     total = (results.wall_seconds["total"], results.cpu_seconds["total"] or None)
-    stages.append(["whole recipe", *map(duration, total), ""])
-    rows = []
+    return [*lines, ["whole recipe", *map(duration, total), ""]]
+
+
+def row_costs(results: Results) -> list[list[str]]:
+    """Return lines of each row's wall time by stage, and its wall and CPU time in all."""
+    lines = []
     for row in results.methods.values():
         spent = [row.cost[stage] for stage in COSTED if stage in row.cost]
         cpu_seconds = [stage.cpu_seconds for stage in spent if stage.cpu_seconds is not None]
-        rows.append(
+        lines.append(
             [
                 row.title,
                 *(duration(row.cost[stage].wall_seconds if stage in row.cost else None) for stage in COSTED),
@@ -35,18 +39,7 @@ def cost(results: Results) -> str:
                 duration(sum(cpu_seconds) if spent and len(cpu_seconds) == len(spent) else None),
             ]
         )
-    return (
-        "## Cost\n\n"
-        + table(["stage", "wall time", "CPU time", "speed"], stages)
-        + "\n\nTimes are summed over rows and seeds, which run side by side, with artefacts that rows share "
-        "counted once; a dash where a stage recorded none. CPU time: of all threads. Speed: of one item "
-        "beside the others, averaged over seeds. Simulator steps/s: the world alone; training steps/s: world "
-        "and learning.\n\n"
-        + table(["method", *COSTED, "wall time", "CPU time"], rows)
-        + "\n\nOne seed of each row, averaged over its seeds, with the grounding and alignment that it uses, "
-        "though other rows may share them. What all rows share, `collect` and `pair`, is not in it, nor the "
-        "policy of another row that it may go on from."
-    )
+    return lines
 
 
 def _rates(rows: Mapping[str, list[float]]) -> str:
@@ -63,41 +56,38 @@ def _unit(figure: str) -> str:
     return f"{'training ' if steps == 'steps' else ''}{steps}/s"
 
 
-def origin(results: Results) -> str:
-    """Return the section on code, machine and datasets."""
-    lines = [provenance(results.origins)]
+def dataset_lines(results: Results) -> list[str]:
+    """Return a sentence on each dataset that the recipe wrote, and on those that its evaluations name."""
+    lines = []
     hashes_of: dict[tuple[str, str, str], list[str]] = {}
     for dataset in results.datasets:
         key = (dataset.stage, dataset.name, dataset.version)
         hashes_of.setdefault(key, []).append(f"`{dataset.content_hash}` (seed {dataset.seed})")
     for (stage, name, version), contents in hashes_of.items():
-        lines.append(f"- Dataset of `{stage}`: {name} {version}, content {', '.join(contents)}.")
+        lines.append(f"Dataset of `{stage}`: {name} {version}, content {', '.join(contents)}.")
     for use in results.evaluated_with:
         rows = ", ".join(results.methods[method].title for method in use.methods)
         versions = ", ".join(dict.fromkeys(version for version in use.versions if version is not None))
         hashes = ", ".join(dict.fromkeys(f"`{digest}`" for digest in use.hashes if digest is not None))
         named = f"{versions or 'no dataset'}{f' ({hashes})' if hashes else ''}"
-        lines.append(f"- Dataset named by the evaluations of {rows}: {named}.")
-    return "## Where this comes from\n\n" + "\n".join(lines)
+        lines.append(f"Dataset named by the evaluations of {rows}: {named}.")
+    return lines
 
 
-def provenance(origins: Sequence[Origin]) -> str:
-    """Return lines on code, machine and versions."""
-    return (
-        f"- Code: {_by_stage(origins, _commit)}.\n"
-        f"- Machine: {_by_stage(origins, machine)}.\n"
-        f"- Versions: {_by_stage(origins, _versions)}."
-    )
+def provenance(origins: Sequence[Origin]) -> dict[str, str]:
+    """Return the text on code, machine and versions."""
+    texts = {"code": _commit, "machine": machine, "versions": _versions}
+    return {what: _by_stage(origins, text) for what, text in texts.items()}
 
 
 def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:
-    """Return what all origins say, or each text with the stages that it holds for."""
+    """Return the text that all origins share, or each text with its stages."""
     stages: dict[str, list[str]] = {}
     for origin in origins:
         stages.setdefault(text(origin), []).extend(origin.stages)
     if len(stages) == 1:
         return next(iter(stages))
-    return "; ".join(f"{said} ({', '.join(dict.fromkeys(of))})" for said, of in stages.items())
+    return "; ".join(f"{shared} ({', '.join(dict.fromkeys(of))})" for shared, of in stages.items())
 
 
 def _commit(origin: Origin) -> str:
@@ -108,7 +98,7 @@ def _commit(origin: Origin) -> str:
 
 
 def machine(origin: Origin) -> str:
-    """Return what is known of a machine."""
+    """Return processor, cores, memory and GPU of an origin's machine."""
     made_on = origin.machine
     if made_on is None:
         return "not recorded"

@@ -1,9 +1,7 @@
-"""What the artefacts of all stages took, and how fast they were made."""
+"""Time and speed of all stages, from their artefacts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
-
-import numpy as np
 
 from astra_data.methods import METHODS
 from astra_data.reports.artefacts import Artefact
@@ -17,10 +15,10 @@ THROUGHPUT = {
     "align": ("windows_per_second",),
     "evaluate": ("target_steps_per_second",),
 }
-"""The figures in which each stage gives its speed."""
+"""The keys under which each stage records its speed."""
 
 Files = Mapping[str, Mapping[str, Sequence[Artefact]]]
-"""Stage → row, or grounding that rows share, or "all" → one artefact per seed."""
+"""Stage → row, shared grounding, or "all" → one artefact per seed."""
 
 
 def seconds(files: Files, clock: Literal["wall_seconds", "cpu_seconds"]) -> dict[str, float]:
@@ -33,17 +31,13 @@ def seconds(files: Files, clock: Literal["wall_seconds", "cpu_seconds"]) -> dict
     return summed | {"total": sum(summed.values())}
 
 
-def row_cost(files: Mapping[str, Sequence[Artefact]]) -> dict[str, Cost]:
-    """Return the mean cost of a seed by stage, for the stages whose `files` all record a time."""
-    costs = {}
-    for stage, of_seeds in files.items():
-        wall, cpu = ([getattr(file, clock) for file in of_seeds] for clock in ("wall_seconds", "cpu_seconds"))
-        if wall and None not in wall:
-            costs[stage] = Cost(
-                wall_seconds=float(np.mean(wall)),
-                cpu_seconds=None if None in cpu else float(np.mean(cpu)),
-            )
-    return costs
+def seed_cost(files: Mapping[str, Artefact]) -> dict[str, Cost]:
+    """Return the cost by stage of what one seed is made of; a stage that recorded no time is left out."""
+    return {
+        stage: Cost(wall_seconds=file.wall_seconds, cpu_seconds=file.cpu_seconds)
+        for stage, file in files.items()
+        if file.wall_seconds is not None
+    }
 
 
 def throughput(files: Files) -> dict[str, dict[str, dict[str, list[float]]]]:

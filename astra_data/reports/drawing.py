@@ -15,9 +15,9 @@ from astra_data.dataset.reader import Dataset
 from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.reports.figures import (
     Curve,
-    Foretold,
     OpenLoop,
     Panel,
+    SimulatorReturns,
     Strip,
     Visits,
     data_efficiency,
@@ -36,17 +36,17 @@ from astra_data.worlds.score import SUCCESS, Score
 Floats = NDArray[np.float64]
 
 _TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
-"""When pictures of an episode are taken, beside its last moment."""
+"""When pictures of an episode are taken, besides its end."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """How a task's states are seen.
+    """Renders a task's target states.
 
     Attributes:
         photograph: pictures (K, height, width, 3) of target states (K, S).
-        timestep_s: between two states.
-        longest_s: of an episode.
+        timestep_s: time between two states.
+        longest_s: time limit of an episode.
     """
 
     photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]]
@@ -63,15 +63,15 @@ def figures_of(
     trajectory_methods: Sequence[str],
     trajectory_episodes: int,
 ) -> dict[str, Figure]:
-    """Return the figures of a page that are drawn of results, by their names on it.
+    """Return the figures of a page by name.
 
     Args:
         results: all numbers in them.
-        root: the recipe's folder of runs; without the trajectories of a row that is to be drawn there, there
-            is no figure of trajectories.
-        maze: the task's; without one there is no figure of trajectories either.
-        camera: takes pictures of the first episodes, where there are any and this machine can draw them.
-        trajectory_methods: rows whose trajectories are drawn; all where none of them is in the results.
+        root: the recipe's folder of runs; if a row to be drawn has no trajectories there, the figure of
+            trajectories is left out.
+        maze: the task's; without one the figure of trajectories is left out, too.
+        camera: renders the first episodes, if the task has one and this machine can render.
+        trajectory_methods: rows whose trajectories are drawn; all rows if none of these is in the results.
         trajectory_episodes: how many of each row.
     """
     figures = {score.measure: _bars(results, score) for score in results.scores}
@@ -90,7 +90,7 @@ def figures_of(
     if gaps:
         figures["gap"] = open_loop_error(gaps)
     if results.predictive_validity:
-        figures["validity"] = predictive_validity(_foretold(results))
+        figures["validity"] = predictive_validity(_simulator_returns(results))
     return figures
 
 
@@ -110,7 +110,7 @@ def _bars(results: Results, score: Score) -> Figure:
 
 
 def _with_trajectories(root: Path, results: Results, rows: Sequence[str]) -> dict[str, Path]:
-    """Return the folder of the first seed of each row that has trajectories; none where a row has none."""
+    """Return row → folder of its first seed with trajectories; empty if any row has none."""
     found = {}
     for row in rows:
         folders = (root / "evaluate" / row / place(seed) for seed in results.methods[row].seeds)
@@ -137,7 +137,7 @@ def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
 
 
 def _pictures(folders: Mapping[str, Path], camera: Camera) -> dict[str, Figure]:
-    """Return the figure "strips" of the first episode of each row; none where nothing can be drawn."""
+    """Return the figure "strips" of the first episode of each row; empty if this machine cannot render."""
     times_s = [time_s for time_s in _TIMES_S if time_s < camera.longest_s] + [camera.longest_s]
     found = {}
     for row, folder in folders.items():
@@ -164,9 +164,9 @@ def _curves(results: Results) -> dict[str, list[Curve]]:
     }
 
 
-def _foretold(results: Results) -> list[Foretold]:
+def _simulator_returns(results: Results) -> list[SimulatorReturns]:
     return [
-        Foretold(
+        SimulatorReturns(
             title=f"{simulator} simulator".capitalize(),
             returns={
                 method: np.array([row.simulator_returns[simulator], row.returns])
@@ -193,7 +193,7 @@ def _gaps(results: Results) -> dict[str, OpenLoop]:
 
 
 def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
-    """Return the headline over sizes, and what they cover where the datasets of a seed are all at `root`."""
+    """Draw the headline score over dataset sizes, with coverage maps if a seed has all datasets at `root`."""
     first = found.sizes[0].results
     score = first.headline
     rows = {method: [size.results.methods[method] for size in found.sizes] for method in first.methods}
@@ -209,7 +209,7 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
         score,
         [size.percent for size in found.sizes],
         {method: [np.array(row.measures()[score.measure]) for row in of] for method, of in rows.items()},
-        # Where there is a single seed, None becomes NaN.
+        # With a single seed, None becomes NaN.
         {
             method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T
             for method, sizes in summaries.items()
@@ -219,7 +219,7 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
 
 
 def _subsets(found: SizesResults, root: Path) -> list[Path]:
-    """Return the datasets of all sizes of the first seed that has them all, or none."""
+    """Return the datasets of all sizes of the first seed that has all of them; empty without one."""
     for seed in found.sizes[0].results.seeds:
         folders = [root / "subset" / place(seed, size.percent) for size in found.sizes]
         if all(folder.is_dir() for folder in folders):

@@ -8,21 +8,25 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.page import HOW_TO_READ
 from astra_data.reports.schema import Results
-from astra_data.reports.sizes import HOW_TO_READ as HOW_TO_READ_SIZES
 from astra_data.reports.sizes import SizesResults
 
 Found = Results | SizesResults
 Page = Callable[[Mapping[str, str]], str]
-"""Returns the page with the figures of these names and files."""
+"""Name → file name of each figure → the page."""
+
+FIGURES = (
+    *("success", "steps", "return", "trajectories", "strips", "mismatch"),
+    *("learning", "learning_steps", "gap", "validity", "data_efficiency"),
+)
+"""Names of all figures that a page can have."""
 
 
 def read_published(path: Path) -> Found:
-    """Return the results in a JSON file.
+    """Read results from a JSON file.
 
     Raises:
-        BadInputError: there are none, or they are not as they are written now.
+        BadInputError: the file is missing, or has another layout.
     """
     if not path.is_file():
         raise BadInputError(f"expected published results in {path}, found none: leave out what asks for them")
@@ -34,14 +38,14 @@ def read_published(path: Path) -> Found:
 
 def published_figures(folder: Path, recipe: str) -> dict[str, bytes]:
     """Return the figures of a recipe that are in `folder`, by name."""
-    paths = {name: folder / f"{recipe}_{name}.png" for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES)}
+    paths = {name: folder / f"{recipe}_{name}.png" for name in FIGURES}
     return {name: path.read_bytes() for name, path in paths.items() if path.exists()}
 
 
 def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:
-    """Write to `folder` under the recipe's name, in place of what was there before."""
+    """Write page, JSON and `images` to `folder` under the recipe's name, replacing earlier ones."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (*HOW_TO_READ, *HOW_TO_READ_SIZES):
+    for name in FIGURES:
         (folder / f"{found.recipe}_{name}.png").unlink(missing_ok=True)
     write_results(found, page, images, folder, found.recipe, f"{found.recipe}_")
 

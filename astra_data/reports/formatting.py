@@ -1,16 +1,38 @@
-"""How numbers and tables look on the page."""
+"""Numbers, tables and templates of the pages."""
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from astra_data.reports.statistics import Summary
 
 
-def table(head: Sequence[str], rows: Iterable[Iterable[str]], *, words: int = 1) -> str:
+def fill(template: str, **values: object) -> str:
+    """Return a file of `templates/` with its `values`."""
+    return _templates().get_template(template).render(values)
+
+
+@cache
+def _templates() -> Environment:
+    # Pages are Markdown: nothing to escape.
+    templates = Environment(
+        loader=PackageLoader("astra_data.reports"),
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )
+    templates.globals |= {"table": table, "interval": interval, "duration": duration}
+    return templates
+
+
+def table(head: Sequence[str], lines: Iterable[Iterable[str]], *, words: int = 1) -> str:
     """Return a Markdown table whose first `words` columns are aligned left, the others right."""
     rule = ["---"] * words + ["---:"] * (len(head) - words)
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *rows))
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
 
 
 def spread(summary: Summary, digits: int) -> str:
@@ -29,18 +51,18 @@ def _mean_std(mean: float, std: float | None, digits: int) -> str:
 
 
 def interval(value: float, low: float | None, high: float | None, digits: int = 2) -> str:
-    """Return a value with its interval, where it has one."""
+    """Return a value and, if it has one, its interval."""
     ends = "" if low is None or high is None else f" [{low:.{digits}f}, {high:.{digits}f}]"
     return f"{value:.{digits}f}{ends}"
 
 
 def short(rate: float) -> str:
-    """Return three digits."""
+    """Return a rate with three significant digits, in thousands from 1000 on."""
     return f"{rate / 1000:.3g} k" if rate >= 1000 else f"{rate:.3g}"
 
 
 def duration(seconds: float | None) -> str:
-    """Return a time in a unit that suits it; a dash for None."""
+    """Return a time in seconds, minutes or hours; a dash for None."""
     if seconds is None:
         return "-"
     if seconds < 100:

@@ -1,15 +1,13 @@
-"""Where results come from, each origin and each choice of datasets said once."""
+"""Where results come from: each origin and each choice of datasets once."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
 from astra_data.reports.schema import DatasetUse, Origin
-
-Named = tuple[str | None, str | None]
-"""Version and hash of the dataset that an evaluation names."""
+from astra_data.reports.seed_table import Named
 
 
 def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
-    """Return every code, machine and set of packages once, with all the stages that it made."""
+    """Return every code, machine and set of packages once, with all stages that ran there."""
     merged: dict[str, Origin] = {}
     for origin in origins:
         key = origin.model_dump_json(exclude={"stages"})
@@ -20,7 +18,7 @@ def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
 
 
 def dataset_uses(named: Mapping[str, Sequence[Named]]) -> list[DatasetUse]:
-    """Return the datasets of each row's seeds, with the rows that name the same ones together."""
+    """Return the datasets of each row's seeds, grouped by rows that name the same ones."""
     rows: dict[tuple[Named, ...], list[str]] = {}
     for method, of_seeds in named.items():
         rows.setdefault(tuple(of_seeds), []).append(method)

@@ -21,9 +21,9 @@ class Runs:
         recipe: the recipe's name.
         root: its folder of runs.
         methods: the rows.
-        seeds: to report, of each row those whose evaluation is finished.
-        groundings: row → the folder of its grounding and alignment, where that is not its base's.
-        percent: the size of the dataset, where there are several.
+        seeds: those to report, as far as their evaluation is finished.
+        groundings: row → the row whose grounding and alignment it uses, if not its base row's.
+        percent: the dataset size, if there are several.
     """
 
     recipe: str
@@ -34,20 +34,20 @@ class Runs:
     percent: int | None = None
 
     def __post_init__(self) -> None:
-        """Check that there is something to report."""
+        """Check that there are rows and seeds."""
         if not self.methods or not self.seeds:
             raise BadInputError(
                 f"{self.recipe}: expected methods and seeds, got none; name some in the recipe"
             )
 
     def owner(self, stage: str, method: str) -> str:
-        """Return the name of a row's folder: rows may share a grounding and its alignment."""
+        """Return the row in whose folder the artefact is: rows may share a grounding and its alignment."""
         if stage in SHARED and not (self.root / stage / method).is_dir():
             return self.groundings.get(method, base_method(method))
         return method
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:
-        """Return where a stage leaves a file of one row and seed."""
+        """Return the path of a stage's file for one row and seed."""
         return self.root / stage / self.owner(stage, method) / place(seed, self.percent) / name
 
     @cached_property
@@ -61,12 +61,12 @@ class Runs:
 
     @property
     def any_finished(self) -> bool:
-        """Whether any row has an evaluation."""
+        """Whether any row has a finished evaluation."""
         return any(self._seeds.values())
 
     @property
     def finished(self) -> dict[str, tuple[int, ...]]:
-        """The seeds of each row whose evaluation is finished; rows without any are left out.
+        """The seeds of each row whose evaluation is finished, without rows that have none.
 
         Raises:
             MissingStageError: no row has one.
@@ -76,11 +76,11 @@ class Runs:
         return {method: found for method, found in self._seeds.items() if found}
 
     def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
-        """Read a file of every row and its finished seeds: row → seed → file."""
+        """Read a file for every row and finished seed: row → seed → file."""
         return self._read(stage, name, model, tuple(self.finished))
 
     def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
-        """Read a file of the rows that have it, by `owner`: for all of their finished seeds, or for none."""
+        """Read a file for the rows that have it for all finished seeds (or none): owner → seed → file."""
         present = [
             method
             for method, seeds in self.finished.items()
@@ -89,7 +89,7 @@ class Runs:
         return self._read(stage, name, model, present)
 
     def datasets(self, stage: str) -> dict[int, DatasetFile]:
-        """Read what is known of the datasets that a stage wrote, by seed."""
+        """Read the metadata of the datasets that a stage wrote, by seed."""
         percent = self.percent if stage == "subset" else None
         paths = {
             seed: self.root / stage / place(seed, percent) / "meta" / "astra" / "dataset.json"
@@ -101,7 +101,7 @@ class Runs:
         """Check that the rows have a file for every finished seed.
 
         Raises:
-            MissingStageError: some have not; the message lists them and says how to make the first.
+            MissingStageError: some do not; the message lists them and the command that makes the first.
         """
         self._require(stage, name, {method: self.finished[method] for method in methods})
 

@@ -1,4 +1,4 @@
-"""Results: what results.json holds. A row's lists are over its seeds, in the order of its `seeds`."""
+"""Results: the content of results.json. A row's lists are over its seeds, in the order of `seeds`."""
 
 from typing import Annotated, Literal
 
@@ -13,37 +13,37 @@ def _nan_for_null(value: object) -> object:
 
 
 Number = Annotated[float, BeforeValidator(_nan_for_null)]
-"""JSON knows no NaN: it is written as null and read back."""
+"""A float whose NaN is null in JSON."""
 
 
-class Part(BaseModel):
-    """A frozen part of the results."""
+class Section(BaseModel):
+    """A section of the results; frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Machine(Part):
-    """A machine that something was made on."""
+class Machine(Section):
+    """The machine that a stage ran on."""
 
     cpu: str
     cores: int
     memory_gib: float
     gpu: str | None = None
-    """Where the networks ran on one."""
+    """None where the networks ran on the CPU."""
 
 
-class Origin(Part):
-    """What some stages' artefacts say of their making; None or empty where they do not say."""
+class Origin(Section):
+    """Code, machine and packages that some stages ran with; None or empty where not recorded."""
 
     commit: str | None
-    """Of the code, ending in "-dirty" where it was changed since."""
+    """Ends in "-dirty" if there were uncommitted changes."""
     machine: Machine | None
     packages: dict[str, str | None]
     stages: list[str]
-    """"report" for what is drawn and simulated by the report itself."""
+    """Names of those stages; "report" is the report itself."""
 
 
-class Dataset(Part):
+class DatasetOrigin(Section):
     """A dataset that the recipe wrote."""
 
     stage: str
@@ -53,7 +53,7 @@ class Dataset(Part):
     content_hash: str
 
 
-class DatasetUse(Part):
+class DatasetUse(Section):
     """The dataset of each seed, as the evaluations of rows recorded it."""
 
     versions: list[str | None]
@@ -61,15 +61,15 @@ class DatasetUse(Part):
     methods: list[str]
 
 
-class Learning(Part):
+class Learning(Section):
     """One seed's training."""
 
     steps: list[float]
     score: list[Number] = Field(validation_alias=AliasChoices("score", "success"))
-    """The headline of the training episodes that ended, wherever in the task they began."""
+    """Headline score of the training episodes that ended, from all start states."""
 
 
-class BandMeans(Part):
+class BandMeans(Section):
     """An error at each horizon, averaged over seeds."""
 
     mean: list[Number]
@@ -77,7 +77,7 @@ class BandMeans(Part):
     high: list[Number]
 
 
-class GapMeans(Part):
+class GapMeans(Section):
     """Open-loop error by horizon for each quantity, averaged over seeds."""
 
     seeds: list[int]
@@ -87,31 +87,31 @@ class GapMeans(Part):
     raw: dict[str, BandMeans]
 
 
-class Cost(Part):
-    """The time that one seed of a stage takes, on average."""
+class Cost(Section):
+    """Mean time of a stage for one seed."""
 
     wall_seconds: float
     cpu_seconds: float | None
-    """Of all threads; None where it was not recorded."""
+    """Of all threads; None if not recorded."""
 
 
-class Validity(Part):
-    """How well the return in a simulator foretells that in the target, over policies: rows and seeds."""
+class Validity(Section):
+    """Correlation between returns in a simulator and in the target, over policies (every row and seed)."""
 
     policies: int
     pearson: Correlation | None
-    """None where it is undefined: for fewer than three policies, or where all have the same return."""
+    """None if undefined: fewer than three policies, or all with the same return."""
     spearman: Correlation | None
 
 
-class MethodResults(Part):
-    """One row. Each measure is a list over seeds of means over episodes in the target."""
+class MethodResults(Section):
+    """One row. Each measure is a list over seeds: its mean over the episodes in the target."""
 
     title: str
     role: str | None
-    """"floor", "ceiling" or "trained there", in the target, of the rows that others are seen against."""
+    """"floor", "ceiling" or "trained there" (in the target), for the reference rows."""
     seeds: list[int]
-    """Those that are finished."""
+    """Finished seeds."""
     success: list[float]
     failed: list[float]
     wall_contact: list[float]
@@ -122,27 +122,27 @@ class MethodResults(Part):
         validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
     )
     distance: list[Number]
-    """Way of the robot in an episode that succeeds, in m; NaN for a seed where none does."""
+    """Path length of the robot in successful episodes, in m; NaN for a seed without any."""
     simulated_success: list[float] | None
-    """Success in the simulator that the policy was trained in; None for a row that was in none."""
+    """Success in the simulator that the policy was trained in; None if it was trained in none."""
     simulated_steps: list[float] | None = None
-    """Length of an episode there, likewise."""
+    """Length of an episode in that simulator, in control steps."""
     simulator_returns: dict[str, list[float]]
-    """Return in the simulators that all rows are tested in, "raw" and "grounded", where the row was."""
+    """Return in the shared test simulators, "raw" and "grounded", in which the row was tested."""
     encoders: dict[str, dict[str, list[float]]]
-    """The same measures by encoder, where a row has more than one."""
+    """The same measures by encoder, for rows with more than one."""
     summary: dict[str, Summary] = Field(default_factory=dict)
-    """Every measure over seeds; of the distance over those that have one."""
+    """Every measure over seeds; the distance over seeds that have one."""
     grounding: str | None
-    """Name of the row's folder of groundings, which rows may share."""
+    """Name of the row's grounding folder, which rows may share."""
     gap: GapMeans | None
     learning: list[Learning]
-    """Empty for a row that is not trained."""
+    """Empty if the row is not trained."""
     cost: dict[str, Cost]
-    """By stage; with the grounding and alignment that it uses, though other rows may share them."""
+    """By stage; includes the grounding and alignment that it uses, though other rows may share them."""
 
     def measures(self) -> dict[str, list[float] | None]:
-        """Return every measure over seeds by its name; None for one that the row has not."""
+        """Return every measure over seeds by its name; None for one that the row does not have."""
         return {
             "success": self.success,
             "failed": self.failed,
@@ -155,8 +155,8 @@ class MethodResults(Part):
         }
 
 
-class Results(Part):
-    """All that the page and the figures show."""
+class Results(Section):
+    """All numbers on the page and in the figures."""
 
     format: Literal[1] = 1
     recipe: str
@@ -164,34 +164,34 @@ class Results(Part):
     command: str
     """The command that produced these results."""
     scores: tuple[Score, ...] = (SUCCESS,)
-    """What the rows are compared by, the headline first."""
+    """Scores that the rows are compared by, the headline first."""
     settings: dict[str, JsonValue]
-    """Of the recipe, with its defaults."""
+    """All settings of the recipe, with defaults filled in."""
     origins: list[Origin]
-    """Normally one; more if code or machine changed on the way."""
+    """Normally one; more if code or machine changed between stages."""
     wall_seconds: dict[str, float]
-    """By stage over all rows and seeds, and "total"; stages that record no time are left out."""
+    """By stage, summed over all rows and seeds, and "total"; without stages that recorded no time."""
     cpu_seconds: dict[str, float]
-    """The same of all threads."""
-    datasets: list[Dataset]
+    """The same for CPU time of all threads."""
+    datasets: list[DatasetOrigin]
     evaluated_with: list[DatasetUse]
     seeds: list[int] = Field(default_factory=list)
-    """Of which rows may have finished only some."""
+    """Seeds that any row has finished."""
     episodes: int
     """Per row and seed."""
     leg_scale: float = 1.0
-    """Of the target's robot, which the data was not collected with if it is not 1."""
+    """Leg length of the target's robot, relative to the one that collected the data."""
     stand_in: str | None = None
-    """What stands in for a physical robot in the target, where something does."""
+    """The simulator that stands in for a physical robot in the target, if any."""
     methods: dict[str, MethodResults]
     paper_success: dict[str, float] = Field(default_factory=dict)
     """Row → the success rate that the paper prints for it."""
     unfinished: list[str] = Field(default_factory=list)
-    """Titles of the recipe's rows that no seed of is finished yet."""
+    """Titles of the recipe's rows without a finished seed."""
     probability_of_improvement: dict[str, dict[str, Comparison]] = Field(default_factory=dict)
-    """ASTRA's row → another that is trained alike → how likely a seed of the one beats one of the other."""
+    """ASTRA's row → comparable row → probability that a seed of the first beats one of the second."""
     predictive_validity: dict[str, Validity] = Field(default_factory=dict)
-    """Of the simulators that all rows are tested in: "raw", and "grounded" where there is one."""
+    """By shared test simulator: "raw", and "grounded" if there is one."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
     """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
 
@@ -201,7 +201,7 @@ class Results(Part):
         return self.scores[0]
 
     def gaps(self) -> dict[str, GapMeans]:
-        """Return each grounding's gap once, though rows share it."""
+        """Return each grounding's gap once, even if rows share it."""
         return {
             row.grounding: row.gap
             for row in self.methods.values()

@@ -1,8 +1,8 @@
-"""How a few seeds are summarised: mean and spread, interquartile mean, intervals, comparisons, correlations.
+"""Statistics over a few seeds: mean and spread, interquartile mean, intervals, comparisons, correlations.
 
-Follows "Deep reinforcement learning at the edge of the statistical precipice" (Agarwal et al., 2021) by means
-of its own library, rliable. One score per seed and task, in any unit that all tasks share; resampling is over
-seeds, within each task.
+Follows "Deep reinforcement learning at the edge of the statistical precipice" (Agarwal et al., 2021) and uses
+its library, rliable. One score per seed and task, in one unit for all tasks; resampling is over seeds, within
+each task.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +17,7 @@ from astra_data.core.errors import BadInputError
 Floats = NDArray[np.float64]
 
 REPLICATES = 2000
-"""Bootstrap resamples behind each interval."""
+"""Bootstrap resamples per interval."""
 
 CONFIDENCE = 0.95
 """Share of the resamples that lie inside an interval."""
@@ -25,7 +25,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Summary:
-    """What a row's seeds say together.
+    """A row's score over its seeds.
 
     Attributes:
         mean: mean over seeds.
@@ -107,14 +107,14 @@ def probability_of_improvement(scores: Floats, others: Floats, *, replicates: in
 def correlation(
     first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False, replicates: int = REPLICATES
 ) -> Correlation | None:
-    """Correlate two scores of every seed of some rows: Pearson's coefficient, or of `ranks`, Spearman's.
+    """Correlate two scores over all seeds of some rows: Pearson's coefficient, or with `ranks` Spearman's.
 
-    The seeds of a row are alike, so the interval resamples rows, and seeds within each.
+    The seeds of a row are not independent, so the interval resamples rows, and seeds within each row.
 
     Args:
-        first: one score, an array (seeds,) per row.
-        second: the other, likewise.
-        ranks: correlate ranks.
+        first: one score, an array (seeds,) for each row.
+        second: the other score, of the same shapes.
+        ranks: correlate ranks (Spearman).
         replicates: bootstrap resamples.
 
     Returns:

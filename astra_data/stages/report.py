@@ -1,4 +1,4 @@
-"""Report: what all rows and seeds of a recipe gave, as results.json, results.md and figures."""
+"""Report: the results of all rows and seeds of a recipe, as results.json, results.md and figures."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -31,10 +31,10 @@ from astra_data.worlds.task import Task
 
 
 class ReportConfig(Config):
-    """How a report is drawn."""
+    """Settings of the report."""
 
     trajectory_methods: tuple[str, ...] = ()
-    """Rows whose trajectories are drawn where they are reported; all rows when none of them is."""
+    """Rows whose trajectories are drawn; all rows if none of these is reported."""
 
     trajectory_episodes: int = Field(default=12, ge=1)
     """Episodes drawn per row and world, the first ones of the row's first seed."""
@@ -43,14 +43,14 @@ class ReportConfig(Config):
     """Row → the success rate that the paper prints for it, shown beside ours."""
 
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
-    """Resamples behind each interval."""
+    """Bootstrap resamples per interval."""
 
 
 DEFAULTS = ReportConfig()
 
 
 class Reported(Protocol):
-    """What a report needs to know of a recipe."""
+    """What a report needs of a recipe."""
 
     @property
     def name(self) -> str:
@@ -66,11 +66,11 @@ class Reported(Protocol):
 
     @property
     def seeds(self) -> Iterable[int]:
-        """Seeds to report, of each row those that are finished."""
+        """Seeds to report, as far as they are finished."""
 
     @property
     def groundings(self) -> Mapping[str, str]:
-        """Row → the method whose grounding and alignment it uses, where that is not its own."""
+        """Row → the method whose grounding and alignment it uses, if not its own."""
 
     @property
     def settings(self) -> Mapping[str, JsonValue]:
@@ -78,7 +78,7 @@ class Reported(Protocol):
 
     @property
     def percents(self) -> Sequence[int]:
-        """Sizes of the dataset that every row is repeated on; none where it is made on the whole."""
+        """Dataset sizes in percent that every row is repeated on; empty if only on the whole."""
 
 
 def report(
@@ -98,14 +98,14 @@ def report(
         root: the recipe's folder of runs.
         command: the command line to print as the results' origin.
         publish: a folder for copies named after the recipe, or None.
-        progress: told the share done and what was written.
-        add_to: a file of results to which those at `root` are added, or None.
-        config: how to draw.
+        progress: called with the share done and a note.
+        add_to: a file of published results to merge with those at `root`, or None.
+        config: settings.
 
     Raises:
-        MissingStageError: no row has an evaluation, or one has other artefacts for some of its finished
-            seeds only.
-        BadInputError: an artefact is malformed, or rows were evaluated or made of data differently.
+        MissingStageError: no row has an evaluation, or one lacks other artefacts for some of its finished
+            seeds.
+        BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
@@ -145,7 +145,7 @@ def report(
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
         )
-        # Robots with a ball turn to it, wherever it lies.
+        # A robot with a ball turns to it, so its commands are not comparable.
         if task.plane is not None and task.ball_index is None:
             replay = replay_commands(task)
             figures["mismatch"] = dynamics_mismatch(
@@ -168,7 +168,7 @@ def _camera(task: Task) -> Camera | None:
 
 
 def _with_common_rows(sizes: Iterable[Results]) -> list[Results]:
-    """Leave out the rows that are not finished at every size."""
+    """Leave out the rows that are not finished at every dataset size."""
     found = list(sizes)
     rows = [row for row in found[0].methods if all(row in results.methods for results in found)]
     return [

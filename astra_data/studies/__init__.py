@@ -1,13 +1,15 @@
-"""Open-loop prediction of a real robot's recorded walk, by abstract simulators that learn from other records.
+"""Open-loop prediction of a real robot's recorded walk, by abstract simulators fitted to other recordings.
 
-recordings   a folder of logs or a dataset → pieces of rows, with what is no walking marked
-motion       planar motions in the body's frame: composed, seen, mirrored
-walks        pieces → control steps, paired with the abstract simulator; stretches drawn from them
-predictors   what a model of the walk is; the raw simulator, and one gain per axis
+recordings   logs or datasets → pieces of rows, with rows that are not walking marked
+motion       planar motions in the body's frame: composed, inverted, mirrored
+planar_walker   the abstract simulator of a walking robot
+walks        pieces → control steps, paired with the abstract simulator; stretches of them
+predictors   the interface of a walk model; the raw simulator, and one gain per axis
 windows      ridge regression and a feed-forward network on the last H steps
-histories    ASTRA and NAS: the grounding model, fed what the body feels
-rollouts     open-loop prediction, and fitting by it
+histories    ASTRA and NAS: the grounding model on motions in the body's frame
+rollouts     open-loop prediction, and fitting to it
 errors       errors per axis and horizon, with intervals over pieces
-study        which models learn from what and are tested on what; resumable
-page         the results as Markdown
+study        training data, models and test data of a study; resumable
+page         results → Markdown and figure
+run          recipe and recordings → results, page and figure
 """

@@ -1,4 +1,4 @@
-"""Errors of open-loop predictions, per axis and horizon, and what they say together."""
+"""Errors of open-loop predictions, per axis and horizon, and their summary."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from astra_data.worlds.plane.geometry import turned
 Floats = NDArray[np.float64]
 
 AXES = ("forward_m", "left_m", "turn_rad", "field_x_m", "field_y_m")
-"""Displacement and turn since the start, in the body's frame there; and the displacement in the field's."""
+"""Displacement and turn in the body's frame at the start; and the displacement in the field's frame."""
 
 BODY_AXES = AXES[:3]
 MOST_STARTS = 4000
@@ -27,11 +27,11 @@ REPLICATES = 1000
 
 @dataclass(frozen=True)
 class Trial:
-    """The starting moments at which models are tested, the same for all.
+    """The starting moments at which all models are tested.
 
     Attributes:
         stretch: histories, and the steps of the longest horizon, (N, ...).
-        piece: which piece each start lies in, (N,). horizons: in steps, K of them.
+        piece: index of the piece of each start, (N,). horizons: K, in steps.
     """
 
     stretch: Stretch
@@ -40,9 +40,9 @@ class Trial:
 
     @classmethod
     def of(cls, walks: Walks, history: int, horizons: Sequence[int]) -> "Trial":
-        """Start at every row of `walks` with a history behind it, or evenly at `MOST_STARTS` of them."""
+        """Start at every row of `walks` with a history before it; of too many, at `MOST_STARTS` evenly."""
         sequence, step = walks.starts(history, min(horizons))
-        # In the order of time, so that even spacing is spread over every piece.
+        # In order of time, so that an even spacing covers every piece.
         order = torch.argsort(walks.piece[sequence] * 10**6 + step, stable=True)
         order = order[torch.linspace(0, len(order) - 1, min(len(order), MOST_STARTS)).long()]
         sequence, step = sequence[order], step[order]
@@ -51,7 +51,7 @@ class Trial:
 
     @torch.no_grad()
     def squared_errors(self, model: Predictor) -> Tensor:
-        """Return squared errors (N, K, 5); NaN where the robot does not walk all the way to the horizon."""
+        """Return squared errors (N, K, 5); NaN where the robot stops walking before the horizon."""
         stretch, chosen = self.stretch, [horizon - 1 for horizon in self.horizons]
         wrong = predict(model, stretch)[:, chosen] - chained(stretch.motion)[:, chosen]
         field = turned(wrong[..., :2], stretch.heading[:, None].expand(wrong.shape[:2]))
@@ -63,18 +63,18 @@ class Trial:
 def summary(
     squared: Mapping[str, Floats], piece: NDArray[np.int64], horizons_s: Sequence[float], seed: int = 0
 ) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-    """Return what the errors of several models say, by model, horizon and axis.
+    """Summarise the errors of several models by model, horizon and axis.
 
     Args:
         squared: squared errors of each model, (seeds, N, K, 5), at the same N starts; "raw" among them.
-        piece: which piece each start lies in, (N,).
+        piece: index of the piece of each start, (N,).
         horizons_s: the K horizons.
-        seed: of the bootstrap, which resamples pieces: starts within one are alike.
+        seed: of the bootstrap, which resamples pieces: starts within a piece are not independent.
 
     Returns:
-        For each axis "rmse" with "low" and "high"; "less_than_raw", the share of the raw simulator's RMSE
-        that is gone, with "_low" and "_high"; and likewise "less_than_ridge" where ridge regression is among
-        them. The axis "mean" holds the means of such shares over the three axes of the body.
+        For each axis "rmse" with "low" and "high"; "less_than_raw", the reduction of RMSE relative to the raw
+        simulator, with "_low" and "_high"; and "less_than_ridge" likewise, if ridge regression is among the
+        models. The axis "mean" holds the means of these reductions over the three axes of the body.
     """
     pieces, number = np.unique(piece, return_inverse=True)
     rng = generator(seed, "walk bootstrap")
@@ -117,5 +117,5 @@ def _rmse(squared: Floats, number: NDArray[np.intp], weight: Floats) -> Floats:
 
 def _interval(name: str, values: Floats) -> dict[str, float]:
     low, high = np.nanquantile(values[1:], [0.025, 0.975])
-    told = {name: values[0], f"{name}_low": low, f"{name}_high": high}
-    return {key: round(float(value), 5) for key, value in told.items()}
+    ends = {name: values[0], f"{name}_low": low, f"{name}_high": high}
+    return {key: round(float(value), 5) for key, value in ends.items()}

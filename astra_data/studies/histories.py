@@ -1,4 +1,4 @@
-"""ASTRA and NAS on a walk: the grounding model, with motions in the body's frame for states."""
+"""ASTRA and NAS on a walk: the grounding model, with motions in the body's frame as states."""
 
 from dataclasses import replace
 
@@ -14,9 +14,8 @@ from astra_data.studies.walks import Stretch
 class HistoryModel(Predictor):
     """A `GroundingModel` whose state is the last step's motion and whose goal is the ball.
 
-    Motions in the body's frame are what is left of abstract states when the place and the heading do not
-    matter, so the model is the same everywhere on the field. The logs hold no reward: in its place, L_rew
-    predicts how much nearer the ball comes (of its bounded distance).
+    Motions in the body's frame do not depend on position and heading in the field, so neither does the model.
+    The logs hold no reward: instead, L_rew predicts the decrease of the ball's bounded distance.
     """
 
     def __init__(self, latent_size: int, head_sizes: tuple[int, ...], weights: LossWeights) -> None:
@@ -33,7 +32,7 @@ class HistoryModel(Predictor):
         self.weights = weights
 
     def set_scales(self, stretch: Stretch) -> None:
-        """Take the scales from the histories, and of the correction from the walked steps ahead."""
+        """Set the input scales from the histories, and the correction's from the future steps of walking."""
         walked = stretch.is_walking
         nearer = _nearer(stretch.past_ball)
         model = self.grounding
@@ -45,7 +44,7 @@ class HistoryModel(Predictor):
             }
         )
         model.set_reward_scales(torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1))
-        # Left and right, the mean is that of the walks that happen to be there.
+        # Sideways and in turn a mean other than zero is an accident of the recordings.
         model.state_mean[1:] = 0.0
         model.goal_mean[1:] = 0.0
 
@@ -60,14 +59,14 @@ class HistoryModel(Predictor):
         return self.grounding.correct(self.grounding.encoder.latent(memory), action, simulated)
 
     def after(self, memory: Tensor, motion: Tensor, ball: Tensor, action: Tensor) -> Tensor:
-        """Encode the step."""
+        """Return the hidden state (B, Z) after a step."""
         inputs = self.grounding.encoder_input(motion, bounded(ball), action)
         return self.grounding.encoder.step(inputs, memory)
 
     def loss(self, stretch: Stretch) -> Tensor:
         """Return λ1 L_trans + λ2 L_rew (paper, Section IV-A) over the history, each step given the true past.
 
-        L_state is left to open-loop prediction, see `rollouts`.
+        L_state is part of open-loop prediction, see `rollouts`.
         """
         if self.weights.latent == self.weights.reward == 0.0:
             return stretch.motion.new_zeros(())
@@ -82,7 +81,7 @@ class HistoryModel(Predictor):
             next_state=motion[:, 1:],
             reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
             topples_soon=torch.zeros_like(nearer),
-            # Where it was no walking, the simulator's motion stands for the robot's: nothing to learn.
+            # Where the robot did not walk, the simulator's motion stands in: nothing to learn.
             mask=(motion != simulated)[:, 1:].any(-1).float(),
         )
         total, _ = self.grounding.losses(windows, replace(self.weights, state=0.0))
@@ -90,6 +89,6 @@ class HistoryModel(Predictor):
 
 
 def _nearer(ball: Tensor) -> Tensor:
-    """Return how much nearer the ball (B, T, 2) comes, in its bounded distance, (B, T - 1)."""
+    """Return the decrease (B, T - 1) of the bounded distance of the ball (B, T, 2)."""
     distance: Tensor = bounded(ball).norm(dim=-1)
     return distance[:, :-1] - distance[:, 1:]

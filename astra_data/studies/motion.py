@@ -6,7 +6,7 @@ from torch import Tensor
 from astra_data.worlds.plane.geometry import turned
 
 MIRROR = (1.0, -1.0, -1.0)
-"""What a mirror image does to forward, left and turn."""
+"""Signs of forward, left and turn in the mirror image."""
 
 
 def wrapped(angle_rad: Tensor) -> Tensor:
@@ -21,18 +21,18 @@ def between(before: Tensor, after: Tensor) -> Tensor:
 
 
 def composed(first: Tensor, then: Tensor) -> Tensor:
-    """Return the motion (..., 3) that is `first` and `then` after one another; also moves a pose on."""
+    """Return the motion (..., 3) of `first` followed by `then`; `first` may be a pose."""
     place = first[..., :2] + turned(then[..., :2], first[..., 2])
     return torch.cat([place, first[..., 2:] + then[..., 2:]], dim=-1)
 
 
 def chained(motions: Tensor) -> Tensor:
-    """Return where the first 1, 2, ... T of `motions` (B, T, 3) lead together, (B, T, 3)."""
+    """Return the cumulative motions (B, T, 3) after 1, 2, ... T of `motions` (B, T, 3)."""
     heading = torch.cat([torch.zeros_like(motions[:, :1, 2]), motions[..., 2].cumsum(1)], dim=1)
     place = turned(motions[..., :2], heading[:, :-1]).cumsum(1)
     return torch.cat([place, heading[:, 1:, None]], dim=-1)
 
 
 def seen_after(point: Tensor, motion: Tensor) -> Tensor:
-    """Return where a body sees a resting `point` (..., 2) after its `motion` (..., 3)."""
+    """Return a resting `point` (..., 2), given in the body's frame, in its frame after `motion` (..., 3)."""
     return turned(point - motion[..., :2], -motion[..., 2])

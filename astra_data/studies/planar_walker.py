@@ -1,4 +1,4 @@
-"""The abstract simulator of a walking NAO: a planar body that moves at once as told, and a resting ball."""
+"""The abstract simulator of a walking NAO: a planar body that follows commands at once; a resting ball."""
 
 import torch
 from torch import Tensor
@@ -10,16 +10,16 @@ FORWARD_M_S = 0.25
 BACKWARD_M_S = 0.15
 LEFT_M_S = 0.20
 TURN_RAD_S = 2.094
-"""Largest walking speeds of the robot's walk engine (BadgerRLSystemCodeRelease2023, walkingEngine.cfg: 250,
+"""Maximum walking speeds of the robot's walk engine (BadgerRLSystemCodeRelease2023, walkingEngine.cfg: 250,
 150 and 200 mm/s, 120 °/s)."""
 
 
 def walk_command(action: Tensor) -> Tensor:
     """Return the body's commanded velocity (..., 3), forward and left in m/s, turn in rad/s.
 
-    `action` (..., 4) is the policy's (turn, forward, left, kick), clipped to ±1; the kick moves no body. As
-    the robot's NeuralControl.cpp does it (BadgerRLSystemCodeRelease2023): shares of the largest speeds, 0.6
-    of the turn, half of the forward action, of which what is positive becomes 1.6 times itself plus 0.2.
+    `action` (..., 4) is the policy's (turn, forward, left, kick), clipped to ±1; the kick is ignored. As in
+    the robot's NeuralControl.cpp (BadgerRLSystemCodeRelease2023): fractions of the maximum speeds, with turn
+    scaled by 0.6, a backward action by 0.5, and a forward action f > 0 mapped to 0.8 f + 0.2.
     """
     turn, forward, left = action[..., :3].clamp(-1.0, 1.0).unbind(-1)
     ahead = torch.where(forward > 0, (0.8 * forward + 0.2) * FORWARD_M_S, 0.5 * forward * BACKWARD_M_S)
@@ -30,7 +30,7 @@ class PlanarWalker:
     """B bodies [x, y, heading, forward and left velocity, turn rate, ball x, ball y], in m, rad and s.
 
     Positions are in the field's frame, velocities in the body's. A command is the velocity of the next step,
-    along an arc. Left out: everything that has legs, the delay of the walk, kicks, and what moves the ball.
+    along an arc. Not modelled: legs, the delay of the walk, kicks, and the motion of the ball.
 
     Attributes:
         state: (B, 8) float32.
@@ -54,7 +54,7 @@ class PlanarWalker:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What a dataset paired with this simulator records about it."""
+        """Parameters recorded in datasets that are paired with this simulator."""
         return {"timestep_s": self.timestep_s}
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:

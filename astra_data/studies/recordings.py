@@ -1,4 +1,4 @@
-"""Recordings of a robot that walks: datasets and logs into pieces of rows, with what is no walking marked."""
+"""Recordings of a walking robot: datasets and logs → pieces of rows; rows that are not walking are marked."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,17 +26,17 @@ ACTION_NAMES = ("turn", "forward", "left", "kick")
 
 
 class WalkingConfig(Config):
-    """Where a recording is a robot that walks, and no robot that is carried or finds itself elsewhere."""
+    """When a robot counts as walking: not while it is carried, nor where self-localisation jumps."""
 
     jump_m: Positive = 0.06
-    """Between two rows, self-localisation has jumped above it: at 60 Hz, 3.6 m/s."""
+    """A larger displacement between two rows is a jump of self-localisation: at 60 Hz, 3.6 m/s."""
     jump_rad: Positive = 0.1
-    """Likewise, of the heading."""
+    """The same for the change of heading."""
     fastest_m_s: Positive = 0.6
-    """Over half a second, a robot that is faster is carried or corrects its position: twice the fastest walk
-    that the robot's walk engine is configured for."""
+    """A robot that is faster over half a second is carried or corrects its position. Twice the maximum speed
+    of the robot's walk engine."""
     piece_s: Positive = 30.0
-    """Longer episodes are cut into pieces of this length: what is held out, and what intervals resample."""
+    """Longer episodes are cut into pieces of this length, the unit of hold-out and of resampling."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Piece:
     Attributes:
         recording: its name.
         state: [x, y, heading, ball x, ball y] before each row and after the last, in m and rad, (N + 1, 5).
-        action: (turn, forward, left, kick) in each row, (N, 4). broken: rows that are no walking, (N,).
+        action: (turn, forward, left, kick) in each row, (N, 4). broken: rows that are not walking, (N,).
     """
 
     recording: str
@@ -85,22 +85,22 @@ class Recording:
 
     @property
     def broken_share(self) -> float:
-        """Share of the rows that are no walking."""
+        """Share of the rows that are not walking."""
         return float(sum(piece.broken.sum() for piece in self.pieces) / self.rows)
 
 
 def read_recordings(place: Path, mapping: Path, home: Path, config: WalkingConfig) -> list[Recording]:
-    """Read every recording in `place`, importing by `mapping` those that are no datasets yet.
+    """Read every recording in `place`, and import by `mapping` those that are not datasets yet.
 
     Args:
         place: a dataset, a log, an archive of logs, or a folder of any of these; each archive and each
-            dataset is a recording of its own, logs that lie in a folder are one together.
+            dataset is one recording, and so are all loose logs of a folder.
         mapping: how logs become columns.
         home: folder where imported datasets are kept, so that none is imported twice.
-        config: what is walking.
+        config: thresholds for walking.
 
     Raises:
-        BadInputError: there is nothing usable; says of each part why.
+        BadInputError: a part of `place` is not usable, or there is none; the message says why.
     """
     if not place.exists():
         raise BadInputError(f"{place} does not exist: expected a dataset, or logs that {mapping} describes")
@@ -111,10 +111,10 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: WalkingConfi
         except BadInputError as error:
             faults.append(str(error))
     if not found:
-        told = "; ".join(faults) or "it has no datasets, no archives and no .json or .log files"
-        raise BadInputError(f"{place}: expected recordings of a walking robot, found none: {told}")
+        reasons = "; ".join(faults) or "it has no datasets, no archives and no .json or .log files"
+        raise BadInputError(f"{place}: expected recordings of a walking robot, found none: {reasons}")
     if faults:
-        raise BadInputError(f"{place}: {'; '.join(faults)}; move aside what is no recording")
+        raise BadInputError(f"{place}: {'; '.join(faults)}; move aside what is not a recording")
     return found
 
 
@@ -149,17 +149,17 @@ def _recording(part: Path, mapping: Path, home: Path, config: WalkingConfig) -> 
 
 
 def place_name(place: Path) -> str:
-    """Return what a recording, or a folder of them, is called: its file's name without endings."""
+    """Return the name of a recording or of a folder of recordings: its file name without endings."""
     return place.resolve().name.partition(".")[0]
 
 
 def _check_names(dataset: Dataset) -> None:
     expected = {STATE: STATE_NAMES, NEXT_STATE: STATE_NAMES, ACTION: ACTION_NAMES}
-    told = {column.name: column.names for column in dataset.schema}
+    found = {column.name: column.names for column in dataset.schema}
     faults = [
-        f"{name} holds {', '.join(told.get(name) or ('no names',))}, expected {', '.join(names)}"
+        f"{name} holds {', '.join(found.get(name) or ('no names',))}, expected {', '.join(names)}"
         for name, names in expected.items()
-        if told.get(name) != names
+        if found.get(name) != names
     ]
     if faults:
         raise BadInputError(f"{dataset.reference}: {'; '.join(faults)}")
@@ -169,7 +169,7 @@ def _pieces(name: str, dataset: Dataset, fps: int, config: WalkingConfig) -> Ite
     longest = round(config.piece_s * fps)
     columns = [STATE, NEXT_STATE, ACTION, TERMINATED]
     for episode in dataset.episodes(columns):
-        # Where an episode terminates, the log holds no next state: the state itself stands for it.
+        # A terminated episode has no next state at its end in the log: the state itself stands in.
         rows = len(episode) - int(episode.columns[TERMINATED][-1])
         if rows == 0:
             continue
@@ -183,7 +183,7 @@ def _pieces(name: str, dataset: Dataset, fps: int, config: WalkingConfig) -> Ite
 
 
 def broken_rows(state: Floats, fps: int, config: WalkingConfig) -> NDArray[np.bool_]:
-    """Tell which rows (N,) between states (N + 1, 5) are no walking: jumps, and what is too fast."""
+    """Return which rows (N,) between states (N + 1, 5) are not walking: jumps, and speeds above the limit."""
     place, heading = state[:, :2], state[:, 2]
     moved = np.linalg.norm(np.diff(place, axis=0), axis=1)
     broken = (moved > config.jump_m) | (abs(wrapped(np.diff(heading))) > config.jump_rad)

@@ -1,4 +1,4 @@
-"""Open-loop prediction of walks, and fitting by it."""
+"""Open-loop prediction of walks, and fitting models to it."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,24 +19,24 @@ from astra_data.studies.walks import Stretch, Walks
 from astra_data.studies.windows import WindowModel
 
 STRENGTHS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-"""Of ridge regression, from which the best is taken."""
+"""Penalties of ridge regression, of which the best is chosen."""
 
 
 class FitConfig(DescentConfig):
-    """How models are fitted; all that learn by gradients alike."""
+    """Settings of fitting, the same for all models with gradients."""
 
     updates: Count = 400
-    """Gradient updates in all."""
+    """Gradient updates in total."""
     batch: Count = 64
     """Stretches per update."""
     steps: Count = 6
-    """Steps that are predicted on end while fitting."""
+    """Steps of an open-loop prediction during fitting."""
     learning_rate: Positive = 2e-3
-    """At the start; falls to zero along a half cosine."""
+    """Initial learning rate; decays to zero along a half cosine."""
     weight_decay: NotNegative = 0.01
-    """Of AdamW."""
+    """Weight decay of AdamW."""
     noise: NotNegative = 1.0
-    """Standard deviation of noise on the history, in units of `NOISE`, against learning it by heart."""
+    """Standard deviation of noise on the history, in units of `NOISE`, against overfitting."""
     latent_size: Count = 64
     """Z of ASTRA and NAS."""
     head_sizes: tuple[Count, ...] = (64, 64)
@@ -46,13 +46,13 @@ class FitConfig(DescentConfig):
 
 
 NOISE = ((0.02, 0.02, 0.06), (0.1, 0.1))
-"""Of motions (forward and left in m, turn in rad) and of the ball (m)."""
+"""Noise on motions (forward and left in m, turn in rad) and on the ball (m)."""
 
 
 def predict(model: Predictor, stretch: Stretch) -> Tensor:
-    """Return where the steps ahead lead, seen from the start, (B, F, 3).
+    """Return the predicted poses after each future step, in the body's frame at the start, (B, F, 3).
 
-    The mean of the prediction and the mirrored prediction of the mirror image: left and right are alike.
+    The mean of the prediction and of the mirrored prediction for the mirror image, so that it is symmetric.
     """
     both = torch.stack(
         [rollout(model, stretch), rollout(model, stretch.mirrored()) * stretch.motion.new_tensor(MIRROR)]
@@ -61,7 +61,7 @@ def predict(model: Predictor, stretch: Stretch) -> Tensor:
 
 
 def rollout(model: Predictor, stretch: Stretch) -> Tensor:
-    """Return where the steps ahead lead, (B, F, 3), each from the predictions before; the ball rests."""
+    """Return the poses (B, F, 3) after each future step, predicted from the one before; the ball rests."""
     memory, ball = model.begin(stretch), stretch.past_ball[:, -1]
     place = torch.zeros_like(stretch.motion[:, 0])
     places = []
@@ -74,10 +74,10 @@ def rollout(model: Predictor, stretch: Stretch) -> Tensor:
 
 
 def fit(name: str, walks: Walks, history: int, config: FitConfig, seed: int, progress: Progress) -> Predictor:
-    """Fit the model `name` of `MODELS` to `walks`, of which it sees `history` steps.
+    """Fit the model `name` of `MODELS` to `walks`, with a history of `history` steps.
 
     Raises:
-        BadInputError: there is too little walking to fit to.
+        BadInputError: there are too few steps of walking.
     """
     torch.manual_seed(derive(seed, f"walk model {name}"))
     return MODELS[name](walks, history, config, progress)
@@ -94,7 +94,7 @@ def _gains(walks: Walks, history: int, config: FitConfig, progress: Progress) ->
 
 
 def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    """Solve ridge regression with the strength that is best on the last quarter of each sequence."""
+    """Solve ridge regression with the penalty that is best on the last quarter of each sequence."""
     sequence, step = walks.starts(history, 1)
     is_late = step > 0.75 * walks.lengths[sequence]
     everything, early = (
@@ -139,13 +139,13 @@ MODELS: dict[str, Callable[[Walks, int, FitConfig, Progress], Predictor]] = {
     "nas": _history_model(LossWeights(0.0, 0.0, 1.0)),
     "astra": _history_model(LossWeights(0.1, 1.0, 1.0)),
 }
-"""By name; each is fitted to walks. λ of ASTRA as in the mazes' recipes."""
+"""Name → fitting of the model to walks. λ of ASTRA as in the maze recipes."""
 
 _SAMPLE = 20_000
 
 
 def _sample(walks: Walks, history: int, steps: int) -> Stretch:
-    """Return at most `_SAMPLE` walked stretches of `steps` steps, evenly spread over all."""
+    """Return at most `_SAMPLE` stretches with `steps` steps of walking, evenly spaced over all."""
     sequence, step = walks.starts(history, steps)
     if len(sequence) < 2:
         raise BadInputError(
@@ -163,7 +163,7 @@ def _descend[M: (WindowModel, HistoryModel)](
     config: FitConfig,
     progress: Progress,
 ) -> M:
-    """Fit by gradients: open-loop errors after 1, 2, ... steps, each in units of its spread; `own_loss`."""
+    """Fit by gradients: open-loop errors after 1, 2, ... steps in units of their spread, plus `own_loss`."""
     spread = chained(_sample(walks, history, config.steps).motion).std(0)
     sequence, step = walks.starts(history, 1)
     descent = Descent(model, config, weight_decay=config.weight_decay)
@@ -171,7 +171,7 @@ def _descend[M: (WindowModel, HistoryModel)](
         chosen = torch.randint(len(sequence), (config.batch,))
         stretch = walks.stretches(sequence[chosen], step[chosen], history, config.steps)
         stretch = stretch.mirrored(torch.rand(config.batch) < 0.5)
-        # What follows a jump within a stretch cannot be judged.
+        # Errors after a jump within a stretch are undefined.
         judged = stretch.is_walking.long().cumprod(1)[..., None].bool().expand_as(stretch.motion)
         error = (rollout(model, _noisy(stretch, config.noise)) - chained(stretch.motion)) / spread
         missed = error[judged].square().mean()

@@ -1,4 +1,4 @@
-"""The gap between models of a robot's walk and its recordings: from recipe and logs to a page."""
+"""The gap between models of a robot's walk and its recordings: recipe and logs → results and page."""
 
 import json
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ RUNS = Path("runs")
 
 
 def is_gap_recipe(path: Path) -> bool:
-    """Tell whether the file at `path` names what recipes for `astra-data gap` have and others have not.
+    """Return whether the file at `path` has the keys of a recipe for `astra-data gap`.
 
     Raises:
         RecipeError: it is missing or not TOML.
@@ -27,10 +27,10 @@ def is_gap_recipe(path: Path) -> bool:
 
 
 def load_gap_recipe(recipe_path: Path) -> GapRecipe:
-    """Read a `GapRecipe` whose mapping is there.
+    """Read a `GapRecipe` and check that its mapping exists.
 
     Raises:
-        RecipeError: it has faults.
+        RecipeError: the recipe has faults, or the mapping is missing.
     """
     recipe = load_recipe(recipe_path, GapRecipe)
     mapping = recipe_path.parent / recipe.mapping
@@ -48,19 +48,22 @@ def measure_gap(
     publish: bool = False,
     root: Path = RUNS,
 ) -> Path:
-    """Fit models to recordings, test them on others, and write page, figure and numbers; return the page.
+    """Fit models to recordings, test them on others, and write page, figure and numbers.
 
     Args:
         recipe_path: a `GapRecipe`.
         data: recordings to predict.
         train: recordings to learn from; by default a part of `data`.
-        seeds: those of the recipe's seeds to use, by default all.
+        seeds: a subset of the recipe's seeds, by default all.
         publish: also copy the results to results/ beside the recipe.
-        root: where the recipe's folder is.
+        root: folder of runs.
+
+    Returns:
+        The path of the page.
 
     Raises:
         RecipeError: the recipe has faults.
-        BadInputError: there are no usable recordings, or the folder holds what other settings gave.
+        BadInputError: there are no usable recordings, or the folder holds results of other settings.
     """
     recipe = load_gap_recipe(recipe_path)
     unknown = sorted(set(seeds) - set(recipe.seeds))
@@ -78,11 +81,11 @@ def measure_gap(
     }
     if both:
         raise BadInputError(
-            f"{data} and {train} hold the same recordings: expected to predict what is not learned"
+            f"{data} and {train} hold the same recordings: expected others to predict than to learn from"
         )
     label = "_from_".join(place_name(place) for place in (data, train) if place is not None)
     folder = home / label
-    # The networks are so small that one thread is the fastest.
+    # The networks are so small that one thread is fastest.
     torch.set_num_threads(1)
     with shown(f"{name}/{folder.name}") as progress:
         found = run_study(recipe, tested, learned, folder, progress)

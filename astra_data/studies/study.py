@@ -1,4 +1,4 @@
-"""Which models learn from which walks, and on which they are tested; each fit is kept and never repeated."""
+"""Training data, models and test data of a study; finished fits are kept and not repeated."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ from astra_data.studies.rollouts import MODELS, FitConfig, fit
 from astra_data.studies.walks import StepsConfig, Walks
 
 LEARNED = ("mlp", "nas", "astra")
-"""Models that a seed changes beyond the choice of the data."""
+"""Models that depend on the seed even with all the data."""
 
 
 class GapRecipe(Config):
@@ -33,23 +33,23 @@ class GapRecipe(Config):
     mapping: str
     """How logs become columns: a file of `astra-data import`, relative to the recipe."""
     models: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Names in `rollouts.MODELS`; the raw simulator is always among them."""
+    """Names in `rollouts.MODELS`; the raw simulator is always added."""
     seeds: Annotated[tuple[int, ...], Field(min_length=1)]
-    """Each chooses the data of the smaller sizes, and begins the networks."""
+    """Seeds of the smaller data sizes' choice of pieces, and of the networks."""
     minutes: tuple[Positive, ...] = ()
-    """Sizes of the training data, besides all of it; smaller ones lie inside larger ones."""
+    """Sizes of the training data, besides all of it; each is a subset of the larger ones."""
     horizons_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.5, 1.0, 2.0, 3.0)
-    """After which errors are taken, besides one step; whole control steps."""
+    """Prediction horizons, besides one step; rounded to control steps."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Share of the pieces of each recording that nothing learns from, where no other recordings are given."""
+    """Share of each recording's pieces held out for testing, if no other recordings are given."""
     notes: tuple[str, ...] = ()
-    """Paragraphs for the page, such as what was tuned on what."""
+    """Paragraphs for the page, such as which data was used for tuning."""
     walking: WalkingConfig = WalkingConfig()
-    """What is walking."""
+    """When a robot counts as walking."""
     steps: StepsConfig = StepsConfig()
     """How rows become control steps."""
     fit: FitConfig = FitConfig()
-    """How models are fitted."""
+    """Settings of fitting."""
 
     @field_validator("models")
     @classmethod
@@ -62,12 +62,12 @@ class GapRecipe(Config):
 
 @dataclass(frozen=True)
 class Case:
-    """What is learned from, and what is predicted.
+    """Training data and test data.
 
     Attributes:
-        name: of its folder. title: a sentence's beginning.
+        name: of its folder. title: heading on the page.
         training: pieces to learn from. test: pieces to predict.
-        minutes: sizes of the training data besides all of it.
+        minutes: sizes of the training data, besides all of it.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Case:
 
 
 def cases(recipe: GapRecipe, data: Sequence[Recording], train: Sequence[Recording]) -> Iterator[Case]:
-    """Yield the cases for the recordings `data`: learned from `train`, or else from parts of `data`."""
+    """Yield the cases that test on `data`: learned from `train` if given, else from parts of `data`."""
     if train:
         test = tuple(piece for recording in data for piece in recording.pieces)
         training = tuple(piece for recording in train for piece in recording.pieces)
@@ -118,7 +118,7 @@ def _held_out(data: Sequence[Recording], share: float) -> tuple[tuple[Piece, ...
 
 
 def shortened(pieces: Sequence[Piece], rows: int, seed: int) -> tuple[Piece, ...]:
-    """Return pieces of `rows` rows in all, in a random order whose beginnings are the smaller sizes."""
+    """Return pieces of `rows` rows in total, the first of a random order: a smaller size is a subset."""
     kept: list[Piece] = []
     for number in generator(seed, "pieces to learn from").permutation(len(pieces)):
         piece, room = pieces[number], rows - sum(map(len, kept))
@@ -135,10 +135,10 @@ def run_study(
     folder: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fit and test every model of every case, but for what is in `folder` already; return what was found.
+    """Fit and test every model of every case, except for fits that are in `folder`; return the results.
 
     Raises:
-        BadInputError: `folder` holds what other settings or recordings gave, or is in use; or the recordings
+        BadInputError: `folder` holds results of other settings or recordings, or is in use; or the recordings
             are too short.
     """
     every = [*data, *train]
@@ -148,7 +148,7 @@ def run_study(
             f"expected recordings of one rate, got {', '.join(map(str, sorted(rates)))} per second"
         )
     fps = rates.pop()
-    told = {
+    settings = {
         "recipe": recipe.model_dump(mode="json", exclude={"notes", "models", "seeds", "minutes"}),
         "data": [recording.content_hash for recording in data],
         "train": [recording.content_hash for recording in train],
@@ -157,7 +157,7 @@ def run_study(
     with held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
-        _check_same(folder / "config.json", told)
+        _check_same(folder / "config.json", settings)
         made, stopwatch, found = origin(), Stopwatch(), []
         chosen = list(cases(recipe, data, train))
         amounts = [len(list(_fits(recipe, case, fps))) for case in chosen]
@@ -173,13 +173,13 @@ def run_study(
         }
 
 
-def _check_same(path: Path, told: dict[str, Any]) -> None:
-    if path.exists() and json.loads(path.read_text()) != told:
+def _check_same(path: Path, settings: dict[str, Any]) -> None:
+    if path.exists() and json.loads(path.read_text()) != settings:
         raise BadInputError(
             f"{path.parent} holds results of other settings or other recordings: remove it, or name another "
             "folder with --root"
         )
-    path.write_text(json.dumps(told, indent=1))
+    path.write_text(json.dumps(settings, indent=1))
 
 
 def _described(recording: Recording) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def _fits(recipe: GapRecipe, case: Case, fps: int) -> Iterator[tuple[float, str,
 
 
 def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Progress) -> dict[str, Any]:
-    """Fit and test the models of one case; return their errors by size of the data."""
+    """Fit and test the models of one case; return their errors by data size."""
     steps_config = recipe.steps
     step_s = steps_config.rows / fps
     horizons = (1, *(round(seconds / step_s) for seconds in recipe.horizons_s))
@@ -237,8 +237,8 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
                 path,
                 _labelled(share, f"{case.name}/{name}/{size}/{seed}"),
             )
-        tensors, told = load_tensors(path)
-        cpu_seconds += told["cpu_seconds"]
+        tensors, metadata = load_tensors(path)
+        cpu_seconds += metadata["cpu_seconds"]
         errors = tensors[_ERRORS].double().numpy()
         squared.setdefault(minutes, {}).setdefault(name, []).append(errors)
     by_size = [
@@ -275,10 +275,10 @@ def _fit_one(
     model = fit(name, walks, recipe.steps.history, recipe.fit, seed, progress)
     tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    told = {"model": name, "seed": seed, **stopwatch.spent()}
-    save_tensors(path, tensors | {_ERRORS: trial.squared_errors(model)}, told)
+    metadata = {"model": name, "seed": seed, **stopwatch.spent()}
+    save_tensors(path, tensors | {_ERRORS: trial.squared_errors(model)}, metadata)
 
 
 def _labelled(progress: Progress, label: str) -> Progress:
-    """Return the progress of a job that says its name in every note."""
+    """Return progress with `label` before every note."""
     return lambda fraction, note: progress(fraction, f"{label}  {note}")

@@ -1,4 +1,4 @@
-"""Recorded walks in control steps, each paired with the abstract simulator; and stretches of them."""
+"""Recorded walks in control steps, paired with the abstract simulator; and stretches of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -22,22 +22,22 @@ class StepsConfig(Config):
     """How rows become control steps."""
 
     rows: Count = 10
-    """Rows in a control step: at 60 Hz a sixth of a second, of which half a second is a whole number."""
+    """Rows per control step: at 60 Hz a sixth of a second, so that half a second is three steps."""
     history: Count = 20
-    """H, the past control steps that the models see."""
+    """H, the past control steps in the models' input."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """B stretches of a walk: H steps of history, then F steps to predict. All in the body's frame.
+    """B stretches of a walk: H steps of history, then F steps to predict, all in the body's frame.
 
     Attributes:
-        past_motion: of each past step, (B, H, 3); where it was no walking, the simulator's.
-        past_action: mean action in each, (B, H, 4). past_ball: the ball as seen after each, in m, (B, H, 2).
+        past_motion: of each past step, (B, H, 3); the simulator's where the robot did not walk.
+        past_action: mean action in each, (B, H, 4). past_ball: the ball after each, in m, (B, H, 2).
         past_simulated: the simulator's motion in each, (B, H, 3).
-        action: mean action in each step to come, (B, F, 4). simulated: the simulator's motion, (B, F, 3).
-        motion: what the robot did, (B, F, 3). is_walking: (B, F) bool.
-        heading: in the field, where the prediction starts, (B,).
+        action: mean action in each future step, (B, F, 4). simulated: the simulator's motion, (B, F, 3).
+        motion: the robot's motion, (B, F, 3). is_walking: (B, F) bool.
+        heading: in the field at the start of the prediction, (B,).
     """
 
     past_motion: Tensor
@@ -55,7 +55,7 @@ class Stretch:
         return len(self.heading)
 
     def mirrored(self, which: Tensor | None = None) -> "Stretch":
-        """Return the mirror images, left for right, of those in `which` (B,) bool, by default all."""
+        """Mirror left and right in the stretches in `which` (B,) bool, by default all."""
         signs = {3: MIRROR, 4: MIRRORED_ACTION, 2: MIRRORED_POINT}
         changed = {}
         for field in fields(self):
@@ -72,14 +72,14 @@ class Stretch:
 class Walks:
     """E sequences of control steps, padded at the end to T.
 
-    A piece gives as many sequences as a control step has rows, each beginning one row later, so that every
-    row begins a step.
+    A piece gives as many sequences as a control step has rows, each starting one row later, so that a step
+    starts at every row.
 
     Attributes:
         motion: of each step, in the body's frame, (E, T, 3). simulated: the abstract simulator's, (E, T, 3).
-        action: mean action of the rows, (E, T, 4). ball: as seen before each step and after the last, (E, T
-        + 1, 2). heading: before each step, (E, T). is_walking: (E, T) bool, False in the padding.
-        piece: which piece each sequence is of, (E,). lengths: steps of each, (E,).
+        action: mean action of the rows, (E, T, 4). ball: in the body's frame before each step and after the
+        last, (E, T + 1, 2). heading: before each step, (E, T). is_walking: (E, T) bool, False in the padding.
+        piece: index of the piece of each sequence, (E,). lengths: steps of each, (E,).
     """
 
     motion: Tensor
@@ -96,7 +96,7 @@ class Walks:
         """Cut `pieces`, recorded at `fps` rows per second, into steps; replay each in the abstract simulator.
 
         Raises:
-            BadInputError: none is long enough for a history and a step.
+            BadInputError: no piece is long enough for a history and one step.
         """
         sequences = [
             _steps(piece, number, first, fps, config.rows)
@@ -118,7 +118,7 @@ class Walks:
         )
 
     def starts(self, history: int, steps: int) -> tuple[Tensor, Tensor]:
-        """Return sequences (N,) and steps (N,) with `history` steps behind and `steps` of walking ahead."""
+        """Return sequences (N,) and steps (N,) with `history` steps before and `steps` of walking after."""
         length = self.is_walking.shape[1]
         if length < history + steps:
             return torch.empty(0, dtype=torch.long), torch.empty(0, dtype=torch.long)
@@ -148,7 +148,7 @@ class Walks:
 
 
 def _steps(piece: Piece, number: int, first: int, fps: int, rows: int) -> dict[str, Tensor]:
-    """Return the control steps of a piece that begin at row `first`, each column (T, ...)."""
+    """Return the control steps of a piece from row `first` on, each column (T, ...)."""
     count = (len(piece) - first) // rows
     state = torch.from_numpy(piece.state[first : first + count * rows + 1 : rows])
     action = torch.from_numpy(piece.action[first : first + count * rows]).reshape(count, rows, 4)
@@ -168,7 +168,7 @@ def _steps(piece: Piece, number: int, first: int, fps: int, rows: int) -> dict[s
 def _replayed(state: Tensor, action: Tensor, fps: int) -> Tensor:
     """Return the abstract simulator's motions (T, 3) from `state` (T, 5) under actions (T, rows, 4)."""
     simulator = PlanarWalker(len(state), timestep_s=1 / fps)
-    # How fast the body moves before does not matter: it moves at once as it is told.
+    # The velocity before does not matter: the body follows commands at once.
     standing = torch.zeros(len(state), 3, dtype=state.dtype)
     simulator.reset_to(torch.cat([state[:, :3], standing, state[:, 3:]], dim=-1))
     for row in action.unbind(1):

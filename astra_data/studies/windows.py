@@ -1,4 +1,4 @@
-"""Models that see a window of the last H steps: ridge regression, and a feed-forward network."""
+"""Models on a window of the last H steps: ridge regression, and a feed-forward network."""
 
 import torch
 from torch import Tensor, nn
@@ -9,16 +9,16 @@ from astra_data.studies.walks import Stretch
 
 
 class WindowModel(Predictor):
-    """Correct the simulator's motion from the last H motions and actions, the ball, and that motion itself.
+    """Corrects the simulator's motion from the last H motions and actions, the ball, and that motion itself.
 
-    Without hidden layers it is linear. Scales are buffers, so that the weights carry them.
+    Without hidden layers it is linear. Scales are buffers, so they are saved with the weights.
     """
 
     def __init__(self, history: int, hidden_sizes: tuple[int, ...] = ()) -> None:
         super().__init__()
         self.history = history
         self.network = mlp((7 * history + 9, *hidden_sizes, 3))
-        # Unfitted, it is the raw simulator.
+        # Before fitting it is the raw simulator.
         for parameter in self.network[-1].parameters():
             nn.init.zeros_(parameter)
         for name in ("motion_mean", "motion_std", "correction_std"):
@@ -28,21 +28,21 @@ class WindowModel(Predictor):
         self.correction_std: Tensor
 
     def set_scales(self, stretch: Stretch) -> None:
-        """Take the scales from the steps ahead that are walked."""
+        """Set the scales from the future steps of walking."""
         motion, simulated = (values[stretch.is_walking] for values in (stretch.motion, stretch.simulated))
         self.motion_std.copy_(motion.std(0))
-        # Left and right, the mean is that of the walks that happen to be there.
+        # Sideways and in turn a mean other than zero is an accident of the recordings.
         self.motion_mean.copy_(motion.mean(0) * motion.new_tensor([1.0, 0.0, 0.0]))
         self.correction_std.copy_((motion - simulated).std(0))
 
     def inputs(self, memory: Tensor, ball: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
-        """Return what the network sees, (B, 7 H + 9)."""
+        """Return the network's inputs, (B, 7 H + 9)."""
         past, past_action = memory.view(len(memory), self.history, 7).split((3, 4), dim=-1)
         seen = [self._normal(past).flatten(1), past_action.flatten(1), action, bounded(ball)]
         return torch.cat([*seen, self._normal(simulated)], dim=-1)
 
     def begin(self, stretch: Stretch) -> Tensor:
-        """Remember the window, (B, 7 H)."""
+        """Return the window of past motions and actions, (B, 7 H)."""
         return torch.cat([stretch.past_motion, stretch.past_action], dim=-1).flatten(1)
 
     def motion(self, memory: Tensor, ball: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
@@ -51,13 +51,13 @@ class WindowModel(Predictor):
         return simulated + self.correction_std * correction
 
     def after(self, memory: Tensor, motion: Tensor, ball: Tensor, action: Tensor) -> Tensor:
-        """Move the window on by a step."""
+        """Return the window moved on by one step."""
         return torch.cat([memory[:, 7:], motion, action], dim=-1)
 
     def solve(self, stretch: Stretch, strength: float) -> None:
-        """Solve ridge regression of the first step's correction; `strength` is relative to the samples.
+        """Solve ridge regression of the first step's correction; the penalty is `strength` times the samples.
 
-        For a model without hidden layers.
+        Only for a model without hidden layers.
         """
         step = (stretch.past_ball[:, -1], stretch.action[:, 0], stretch.simulated[:, 0])
         inputs = self.inputs(self.begin(stretch), *step).double()

@@ -62,7 +62,7 @@ def test_the_way_is_that_of_the_robot_in_episodes_that_succeed(root: Path) -> No
     assert rows["direct_transfer"].summary["distance"].mean == pytest.approx(11.5)
 
 
-def test_the_papers_figures_are_told_of_rows_that_are_there(root: Path) -> None:
+def test_the_papers_figures_are_those_of_reported_rows(root: Path) -> None:
     found = assemble(
         "antmaze_u",
         "antmaze-u",
@@ -143,7 +143,7 @@ def test_each_row_has_the_seeds_that_it_has_finished(root: Path) -> None:
     assert list(assembled(root, ("astra_plus",)).seeds) == [1, 2]
 
 
-def test_rows_of_no_seed_are_left_out_and_told_where_nothing_else_is_there(root: Path) -> None:
+def test_rows_without_a_finished_seed_are_left_out_and_an_error_if_there_are_no_others(root: Path) -> None:
     for seed in SEEDS:
         (root / f"evaluate/astra/seed_{seed}/evaluation.json").unlink()
     (root / "evaluate/follower/seed_2/evaluation.json").unlink()

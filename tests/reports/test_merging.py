@@ -25,8 +25,8 @@ def assembled(
     return Results.model_validate_json(found.model_dump_json(by_alias=True))
 
 
-def told(results: Results, *apart: str) -> str:
-    """Return all that results say, with equal NaNs, but for some fields."""
+def content(results: Results, *apart: str) -> str:
+    """Return the content of results but for some fields, with equal NaNs."""
     values = results.model_dump(exclude=set(apart))
     for row in values["methods"].values():
         row["gap"] = None
@@ -54,7 +54,7 @@ def test_seeds_found_apart_amount_to_what_they_do_together(root: Path) -> None:
     merged = assembled(root, published=published)
     # Some of the groundings and datasets are in both.
     counted = ("wall_seconds", "cpu_seconds", "throughput")
-    assert told(merged, *counted) == told(whole, *counted)
+    assert content(merged, *counted) == content(whole, *counted)
     assert merged.wall_seconds["evaluate"] == whole.wall_seconds["evaluate"]
     assert merged.methods["astra"].cost["evaluate"] == Cost(wall_seconds=13.0, cpu_seconds=20.0)
     assert sorted(merged.throughput["evaluate"]["target_steps_per_second"]["astra"]) == [1000, 1001, 1002]
@@ -72,7 +72,7 @@ def test_rows_found_apart_amount_to_what_they_do_together(root: Path) -> None:
     assert assembled(root).unfinished == ["ASTRA+", "Careful follower"]
     merged = assembled(root, published=published)
     counted = ("wall_seconds", "cpu_seconds", "throughput")
-    assert told(merged, *counted) == told(whole, *counted)
+    assert content(merged, *counted) == content(whole, *counted)
     assert repr(merged.methods["astra_plus"].gap) == repr(whole.methods["astra"].gap)
 
 
@@ -94,13 +94,13 @@ def test_what_is_found_anew_replaces_what_is_published(root: Path) -> None:
 
 def test_results_added_to_themselves_stay_as_they_are(root: Path) -> None:
     found = assembled(root)
-    assert told(assembled(root, published=found)) == told(found)
+    assert content(assembled(root, published=found)) == content(found)
 
 
 def test_published_results_alone_are_enough(root: Path) -> None:
     published = assembled(root)
     shutil.rmtree(root)
-    assert told(assembled(root, published=published)) == told(published)
+    assert content(assembled(root, published=published)) == content(published)
     based_on_it = published.model_copy(update={"recipe": "base"})
     fewer = assembled(root, ("astra", "nas"), (0, 2), based_on_it)
     assert fewer.recipe == "antmaze_u"

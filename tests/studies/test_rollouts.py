@@ -29,7 +29,7 @@ def error(name: str) -> torch.Tensor:
     return TEST.squared_errors(model)[:, 1, :3].nanmean(0).sqrt()
 
 
-def test_the_raw_simulator_predicts_a_robot_that_does_as_told() -> None:
+def test_the_raw_simulator_predicts_a_robot_that_follows_commands_at_once() -> None:
     walks = Walks.of_pieces([piece(300, 0, gains=(1.0, 1.0, 1.0), late_rows=0)], FPS, CONFIG)
     errors = Trial.of(walks, 4, (1, 5)).squared_errors(Gains())
     assert errors.nan_to_num().max() < 1e-8

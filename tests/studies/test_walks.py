@@ -13,7 +13,7 @@ CONFIG = StepsConfig(rows=10, history=4)
 FAITHFUL = {"gains": (1.0, 1.0, 1.0), "late_rows": 0}
 
 
-def test_a_robot_that_does_as_told_moves_like_the_simulator() -> None:
+def test_a_robot_that_follows_commands_at_once_moves_like_the_simulator() -> None:
     walks = Walks.of_pieces([piece(207, 0, **FAITHFUL)], FPS, CONFIG)
     assert walks.lengths.tolist() == [20] * 8 + [19] * 2
     real = torch.arange(20) < walks.lengths[:, None]

@@ -18,15 +18,15 @@ from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.sizes import Visits, data_efficiency
 from astra_data.reports.figures.strips import Strip, strips
 from astra_data.reports.figures.style import ROLES, method_colour, method_title, png
-from astra_data.reports.figures.validity import Foretold, predictive_validity
+from astra_data.reports.figures.validity import SimulatorReturns, predictive_validity
 from astra_data.reports.figures.walks import walk_prediction
 
 __all__ = [
     "ROLES",
     "Curve",
-    "Foretold",
     "OpenLoop",
     "Panel",
+    "SimulatorReturns",
     "Strip",
     "Visits",
     "coverage",

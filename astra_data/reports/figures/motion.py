@@ -18,18 +18,18 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 COLUMNS = 4
-"""Most panels side by side."""
+"""Panels side by side, at most."""
 
 PANEL_INCHES = 2.0
 """Width of a panel."""
 
 TITLE_POINTS = 10.0
-"""Size of a panel's title, of which `TITLE_LETTERS` fit; longer ones are smaller."""
+"""Font size of a panel's title; one of more than `TITLE_LETTERS` letters is smaller."""
 
 TITLE_LETTERS = 17
 
 RIM = 0.35
-"""How much of the outer walls is shown, in cells."""
+"""Visible width of the outer walls, in cells."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How fast a simulator drifts from the target when it is given the target's own actions."""
+"""How fast a simulator drifts from the target under the target's own actions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Scores of each row: at the end, and while it learns."""
+"""Scores of each row: final, and during training."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from astra_data.worlds.score import Score
 Floats = NDArray[np.float64]
 
 CURVE_POINTS = 200
-"""Points at which curves of different seeds are brought together."""
+"""Points at which curves of different seeds are interpolated."""
 
 PANELS_ACROSS = 4
-"""Most panels of learning curves side by side."""
+"""Learning-curve panels side by side, at most."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Curve:
 
     Attributes:
         steps: simulator steps so far, (K,), increasing.
-        score: of the training episodes that ended, (K,); NaN where none had ended.
+        score: of the training episodes that ended, (K,); NaN where none ended.
     """
 
     steps: Floats
@@ -49,7 +49,7 @@ def score_bars(
         score: what is drawn.
         scores: those of each row's seeds, (seeds,).
         intervals: (interquartile mean, low, high) of each row; low and high are NaN for a single seed.
-        simulated: mean score of a row in the simulator it was trained in, where there is one.
+        simulated: mean score of a row in the simulator that it was trained in, if any.
     """
     with style():
         figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(scores)), layout="constrained")
@@ -84,7 +84,7 @@ def score_bars(
 def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figure:
     """Draw a score of the training episodes over steps: mean over seeds, band from the worst to the best.
 
-    Each method has a panel; with the [plus] settings it is dashed.
+    Each method has a panel; its row with the [plus] settings is dashed.
 
     Args:
         score: what is drawn.

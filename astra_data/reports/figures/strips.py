@@ -15,9 +15,9 @@ class Strip:
     """One episode.
 
     Attributes:
-        pictures: (K, height, width, 3), of the first K of all times; none of later ones, for it was over.
+        pictures: (K, height, width, 3), at the first K of all times; the episode was over at the others.
         ended_s: when the episode ended.
-        failed: whether that was badly.
+        failed: whether it ended in failure.
     """
 
     pictures: NDArray[np.uint8]
@@ -26,7 +26,7 @@ class Strip:
 
 
 def strips(times_s: Sequence[float], rows: Mapping[str, Strip]) -> Figure:
-    """Draw a row of pictures per method, taken at the same times; and when its episode ended.
+    """Draw a row of pictures per method, taken at the same times, and the time when its episode ended.
 
     Args:
         times_s: from the start, one for each column.
@@ -43,11 +43,11 @@ def strips(times_s: Sequence[float], rows: Mapping[str, Strip]) -> Figure:
                 axes.set_axis_off()
             for axes, picture in zip(line, strip.pictures, strict=False):
                 axes.imshow(picture)
-            told = f"fell after {strip.ended_s:.1f} s" if strip.failed else f"{strip.ended_s:.0f} s"
+            ended = f"fell after {strip.ended_s:.1f} s" if strip.failed else f"{strip.ended_s:.0f} s"
             place = {"transform": line[0].transAxes, "ha": "right"}
             name = method_title(method).replace(" + ", " +\n").replace(", ", ",\n")
             line[0].text(-0.08, 0.55, name, va="bottom", weight="bold", color=method_colour(method), **place)
-            line[0].text(-0.08, 0.5, told, va="top", color=FAINT, size=8, **place)
+            line[0].text(-0.08, 0.5, ended, va="top", color=FAINT, size=8, **place)
         for axes, time_s in zip(grid[0], times_s, strict=True):
             axes.set_title(f"{time_s:g} s", size=8, weight="normal")
         return figure

@@ -1,4 +1,4 @@
-"""How well simulators foretell the target: one dot per policy."""
+"""How well simulators predict returns in the target: one dot per policy."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Foretold:
-    """One simulator.
+class SimulatorReturns:
+    """Returns in one simulator and in the target.
 
     Attributes:
-        title: of its panel.
+        title: of the panel.
         returns: row → mean returns of its seeds' policies in the simulator and in the target, (2, seeds).
     """
 
@@ -27,7 +27,7 @@ class Foretold:
     returns: Mapping[str, Floats]
 
 
-def predictive_validity(simulators: list[Foretold]) -> Figure:
+def predictive_validity(simulators: list[SimulatorReturns]) -> Figure:
     """Draw the return in the target against that in each simulator; on the dashed line they are equal."""
     rows = list(dict.fromkeys(row for simulator in simulators for row in simulator.returns))
     with style():

@@ -11,7 +11,7 @@ from astra_data.reports.figures.style import style
 
 Floats = NDArray[np.float64]
 Bands = Mapping[str, Mapping[str, Floats]]
-"""By axis and model: error, low and high, (3, K)."""
+"""Axis → model → error, low and high, (3, K)."""
 
 LABELS = {"forward_m": "forward (m)", "left_m": "left (m)", "turn_rad": "turn (rad)"}
 RAW = "raw"
@@ -25,11 +25,11 @@ def walk_prediction(
     horizon_s: float,
     looks: Mapping[str, tuple[str, str]],
 ) -> Figure:
-    """Draw a column per axis: RMS error by horizon; below, where there are several, by size of the data.
+    """Draw a column per axis: RMS error by horizon; below, with several data sizes, by size.
 
     Args:
         horizons_s: the K horizons.
-        by_horizon: errors of the models that learned from all the data.
+        by_horizon: errors of the models fitted to all the data.
         minutes: the M sizes of the data.
         by_minutes: errors at `horizon_s`.
         horizon_s: the horizon of the lower row.

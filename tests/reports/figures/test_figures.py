@@ -11,9 +11,9 @@ from matplotlib.image import imread
 from astra_data.methods import METHODS
 from astra_data.reports.figures import (
     Curve,
-    Foretold,
     OpenLoop,
     Panel,
+    SimulatorReturns,
     Strip,
     Visits,
     coverage,
@@ -156,7 +156,9 @@ def test_many_rows_get_a_panel_each_and_readable_bars() -> None:
 
 def test_validity_draws_a_dot_per_policy_in_its_rows_colour() -> None:
     returns = {"nas": np.array([[1.0, 2.0], [3.0, 4.0]]), "astra_plus": np.array([[5.0], [6.0]])}
-    figure = predictive_validity([Foretold("Raw simulator", returns), Foretold("Grounded", {})])
+    figure = predictive_validity(
+        [SimulatorReturns("Raw simulator", returns), SimulatorReturns("Grounded", {})]
+    )
     raw, grounded = figure.axes
     assert (raw.get_title(loc="left"), grounded.get_title(loc="left")) == ("Raw simulator", "Grounded")
     assert legend(figure) == ["NAS", "ASTRA+"]
@@ -194,8 +196,8 @@ def test_strips_have_a_picture_for_each_moment_until_the_end() -> None:
     figure.canvas.draw()
     assert [len(axes.images) for axes in figure.axes] == [1, 1, 0, 1, 1, 1]
     assert [axes.get_title() for axes in figure.axes[:3]] == ["0 s", "1 s", "5 s"]
-    told = [[text.get_text() for text in axes.texts] for axes in figure.axes[::3]]
-    assert told == [["NAS", "fell after 1.3 s"], ["ASTRA", "5 s"]]
+    texts = [[text.get_text() for text in axes.texts] for axes in figure.axes[::3]]
+    assert texts == [["NAS", "fell after 1.3 s"], ["ASTRA", "5 s"]]
 
 
 def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:

@@ -33,7 +33,7 @@ def test_the_papers_figures_stand_beside_ours(root: Path, folder: Path) -> None:
     assert "their heights cannot" in page
 
 
-def test_each_origin_is_told_with_its_stages(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_origin_is_shown_with_its_stages(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assembly, "origin", lambda: MADE)
     make(root)
     assert "- Code: commit `abc` with uncommitted changes.\n" in (root / "report/results.md").read_text()
