@@ -1,0 +1,250 @@
+"""README, CONTRIBUTING and docs/: links lead somewhere, commands exist, snippets run in order on a page."""
+
+import glob
+import os
+import re
+import shlex
+import shutil
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_run import ALIGN, GROUND, TASK, TRAIN, short_task
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from astra_data.cli.app import app
+from astra_data.core.progress import silent
+from astra_data.stages.align import align
+from astra_data.stages.collect import CollectConfig, collect
+from astra_data.stages.ground import ground
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.stages.train import train
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text()
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+}
+GROUP = get_command(app)
+assert isinstance(GROUP, TyperGroup)
+COMMANDS = GROUP.commands
+SET_UP = "pip install uv && uv run astra-data run recipes/quickstart.toml"
+TEST = "pip install uv && uv run pytest"
+
+NOT_RUN = {"minutes", "hours", "network", "needs logs that are not in the repository"}
+"""Why a block may be left out of the run; its commands and options are checked all the same."""
+MOST_NOT_RUN = 12
+QUICKER = {"--episodes 50": "--episodes 4 --max-steps 300", "--episodes 200": "--episodes 6"}
+"""What is written for a reader, and what is run in its place."""
+
+BLOCK = re.compile(
+    r"^(?:<!-- not run: (?P<reason>[^>\n]+) -->\n)?```(?P<language>\w+)\n(?P<text>.*?)^```$", re.M | re.S
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block of a page. `reason`: why it is not run, if it is not."""
+
+    language: str
+    text: str
+    reason: str | None
+
+    @property
+    def commands(self) -> list[list[str]]:
+        """The shell commands, without comments and set-up, as lists of words."""
+        lines = [part for line in self.text.splitlines() for part in line.split("&&")]
+        words = [shlex.split(line, comments=True) for line in lines]
+        return [line[2:] if line[:2] == ["uv", "run"] else line for line in words if line]
+
+
+def blocks(page: str) -> list[Block]:
+    return [Block(m["language"], m["text"], m["reason"]) for m in BLOCK.finditer(PAGES[page])]
+
+
+@pytest.fixture(scope="session")
+def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `runs/quickstart` as the quickstart leaves it, but for tiny episodes and networks."""
+    folder = tmp_path_factory.mktemp("docs")
+    run = folder / "runs" / "quickstart"
+    out = {stage: run / stage / "astra" / "seed_0" for stage in ("ground", "train", "align")}
+    collected, pairs = run / "collect" / "seed_0", run / "pair" / "seed_0"
+    made = {"seed": 0, "device": "cpu", "progress": silent}
+    with short_task():
+        collect(TASK, CollectConfig(episodes=100, max_steps=25), seed=0, out=collected, progress=silent)
+        pair(TASK, PairConfig(), dataset=collected, out=pairs, progress=silent)
+        few = GROUND.model_copy(update={"updates": 2})
+        ground(TASK, "astra", few, dataset=pairs, out=out["ground"], **made)  # type: ignore[arg-type]
+        inputs: dict[str, Any] = {"dataset": pairs, "grounding": out["ground"], **made}
+        train(TASK, "astra", TRAIN, out=out["train"], **inputs)
+        align(ALIGN.model_copy(update={"updates": 2}), out=out["align"], **inputs)
+    return folder
+
+
+@pytest.fixture
+def workplace(quickstart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Stand in a folder with the recipes, the small quickstart, and logs of a robot on wheels."""
+    shutil.copytree(quickstart, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "recipes").symlink_to(ROOT / "recipes")
+    (tmp_path / "logs").mkdir()
+    rng = np.random.default_rng(0)
+    for run in range(3):
+        command = rng.uniform(-1, 1, (40, 2))
+        position = np.cumsum(0.04 * command, axis=0) - 0.04 * command
+        values = np.column_stack([position, np.zeros(40), command])
+        np.savetxt(tmp_path / f"logs/{run}.csv", values, "%.4f", ",", header="x,y,heading,vx,vy", comments="")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ASTRA_DATA_HOME", raising=False)
+    monkeypatch.setenv("ASTRA_DATA_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def run_command(words: list[str]) -> None:
+    """Run one command of a page as the shell would, or fail."""
+    line = shlex.join(words)
+    for written, quicker in QUICKER.items():
+        line = line.replace(written, quicker)
+    arguments = [found for word in shlex.split(line) for found in (sorted(glob.glob(word)) or [word])]
+    assert arguments[0] == "astra-data", f"only astra-data is run from pages: {line}"
+    app(arguments[1:], standalone_mode=False)
+
+
+@pytest.mark.parametrize("page", [name for name in PAGES if blocks(name)])
+def test_the_snippets_of_a_page_run_in_order(page: str, workplace: Path) -> None:
+    namespace: dict[str, Any] = {"__name__": "snippet"}
+    for block in blocks(page):
+        if file := re.match(r"# (\w+\.(?:py|toml))\n", block.text):
+            (workplace / file[1]).write_text(block.text)
+        if block.reason is not None:
+            continue
+        if block.language == "python":
+            exec(compile(block.text, page, "exec"), namespace)
+        elif block.language == "toml":
+            tomllib.loads(block.text)
+        elif block.language == "sh":
+            for words in block.commands:
+                if words[0] == "astra-data":
+                    run_command(words)
+
+
+def all_commands() -> Iterator[tuple[str, list[str]]]:
+    for page in PAGES:
+        for block in blocks(page):
+            yield from ((page, words) for words in block.commands if block.language == "sh")
+
+
+def test_commands_of_blocks_are_taken_by_the_command_line() -> None:
+    lines = [(page, words) for page, words in all_commands() if words[0] == "astra-data"]
+    assert len(lines) > 15
+    for page, (_, name, *arguments) in lines:
+        assert name in COMMANDS, f"{page}: no command {name}"
+        COMMANDS[name].make_context(name, arguments)
+
+
+def test_options_named_in_the_text_exist() -> None:
+    named = [
+        (page, code) for page, text in PAGES.items() for code in re.findall(r"`(?:astra-data )(.+?)`", text)
+    ]
+    assert len(named) > 30
+    faults = []
+    for page, code in named:
+        name, *words = code.split()
+        if name not in COMMANDS:
+            faults.append(f"{page}: {code}")
+            continue
+        parameters = COMMANDS[name].params
+        known = {
+            option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)
+        }
+        unknown = {word for word in words if word.startswith("--")} - known
+        faults += [f"{page}: {code}: no option {option}" for option in unknown]
+    assert not faults, "\n".join(faults)
+
+
+def test_blocks_that_are_not_run_say_why_and_are_few() -> None:
+    reasons = [block.reason for page in PAGES for block in blocks(page) if block.reason is not None]
+    assert set(reasons) <= NOT_RUN
+    assert len(reasons) <= MOST_NOT_RUN
+    markers = [marker for text in PAGES.values() for marker in re.findall(r"<!--.*?-->", text)]
+    assert len(markers) == len(reasons), "every comment stands right before its block"
+    assert not [
+        block for page in PAGES for block in blocks(page) if block.language == "python" and block.reason
+    ]
+
+
+def test_every_fence_is_a_block_of_a_known_language() -> None:
+    for page, text in PAGES.items():
+        assert 2 * len(blocks(page)) == len(re.findall(r"^```", text, re.MULTILINE)), page
+        assert {block.language for block in blocks(page)} <= {"python", "sh", "toml", "text"}, page
+
+
+@pytest.mark.parametrize("command", [SET_UP, TEST])
+def test_the_set_up_commands_stand_alone_on_a_line(command: str) -> None:
+    assert command in README.splitlines()
+
+
+def test_the_checks_call_the_test_command() -> None:
+    assert TEST in (ROOT / ".ci" / "run").read_text().splitlines()
+
+
+def test_the_readme_is_one_screen() -> None:
+    assert len(README.split()) <= 1200
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_is_in_both_tables_and_has_help(name: str) -> None:
+    assert re.search(rf"^\| `astra-data {name}\b", PAGES["docs/commands.md"], re.MULTILINE)
+    assert name in readme_table()
+    assert COMMANDS[name].help
+    assert all(getattr(parameter, "help", "") for parameter in COMMANDS[name].params)
+
+
+def readme_table() -> list[str]:
+    section = README.partition("\n## Commands\n")[2].partition("\n## ")[0]
+    cells = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    return [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
+
+
+def test_the_tables_name_no_command_twice_and_none_that_is_not_there() -> None:
+    for names in (
+        readme_table(),
+        re.findall(r"^\| `astra-data (\w+)", PAGES["docs/commands.md"], re.MULTILINE),
+    ):
+        assert sorted(names) == sorted(COMMANDS)
+
+
+def slug(heading: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_figures_lead_somewhere(page: str) -> None:
+    linked = re.findall(r"\]\((?!https?:)([^)\s]+)\)", PAGES[page])
+    dead = []
+    for link in linked:
+        path, _, anchor = link.partition("#")
+        target = Path(os.path.normpath((ROOT / page).parent / path)) if path else ROOT / page
+        if not target.exists():
+            dead.append(link)
+        elif anchor:
+            headings = re.findall(r"^#+ (.+)$", target.read_text(), re.MULTILINE)
+            dead += [] if anchor in map(slug, headings) else [link]
+    assert not dead, f"{page}: {dead}"
+
+
+def test_the_index_and_the_readme_lead_to_every_page() -> None:
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    assert pages == set(re.findall(r"\]\((\w+\.md)\)", PAGES["docs/index.md"]))
+    assert "docs/index.md" in README
+
+
+def test_nothing_is_left_to_fill_in() -> None:
+    for page, text in PAGES.items():
+        assert re.findall(r"^[A-Z_]{4,}$|\b[A-Z]+_MINUTES\b|\bTODO\b", text, re.MULTILINE) == [], page

@@ -1,0 +1,107 @@
+"""The words of CONTRIBUTING.md, enforced: those that are not used, and one word for one thing."""
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+HOUSE = ROOT / "astra_data"
+SECTION = (ROOT / "CONTRIBUTING.md").read_text().partition("\n## Words\n")[2].partition("\n## ")[0]
+WORDS, _, AVOIDED = SECTION.partition("| not | but |\n")
+MODULES = {"base", "common", "helpers", "manager", "misc", "utils"}
+"""Names of modules that say nothing."""
+
+
+def rows(table: str) -> list[tuple[str, str]]:
+    cells = re.findall(r"^\| (.+?) \| (.+) \|$", table, flags=re.MULTILINE)
+    return [(word, meaning) for word, meaning in cells if word != "word"]
+
+
+def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield the line and the name of everything that a file names itself or asks others for."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                yield node.lineno, name
+            case (
+                ast.arg(arg=name) | ast.keyword(arg=str(name)) | ast.Name(id=name) | ast.Attribute(attr=name)
+            ):
+                yield node.lineno, name
+            case ast.alias(name=name, asname=other):
+                yield node.lineno, other or name.rpartition(".")[2]
+
+
+def parts(name: str) -> list[str]:
+    """Return the words of an identifier: `doubt_penalty` and `DoubtPenalty` are "doubt", "penalty"."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+
+
+def holds(name: str, avoided: str) -> bool:
+    """Tell whether consecutive words of `name` are those of `avoided`, in the singular or the plural."""
+    given, wanted = parts(name), parts(avoided)
+    forms = [{word, word.removesuffix("s"), f"{word}s"} for word in wanted]
+    starts = range(len(given) - len(wanted) + 1)
+    return any(all(given[start + i] in form for i, form in enumerate(forms)) for start in starts)
+
+
+@pytest.mark.parametrize(
+    ("name", "avoided", "found"),
+    [
+        ("doubt_penalty", "doubt", True),
+        ("DoubtPenalty", "doubt", True),
+        ("_opinion", "opinions", True),
+        ("what_rewards_lack", "what_rewards_lack", True),
+        ("rewards_lacking", "what_rewards_lack", False),
+        ("undoubted", "doubt", False),
+        ("width", "dt", False),
+        ("DT", "dt", True),
+    ],
+)
+def test_words_are_found_in_names(name: str, avoided: str, found: bool) -> None:
+    assert holds(name, avoided) is found
+
+
+@pytest.mark.parametrize("avoided", [word for word, _ in rows(AVOIDED)])
+def test_no_identifier_has_a_word_that_is_not_used(avoided: str) -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in sorted(HOUSE.rglob("*.py"))
+        for line, name in identifiers(ast.parse(path.read_text()))
+        if holds(name, avoided)
+    ]
+    assert not found, f"say {dict(rows(AVOIDED))[avoided]} for {avoided}:\n" + "\n".join(found)
+
+
+def test_no_two_classes_have_one_name() -> None:
+    classes = defaultdict(list)
+    for path in sorted(HOUSE.rglob("*.py")):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                classes[node.name].append(str(path.relative_to(ROOT)))
+    doubled = {name: paths for name, paths in classes.items() if len(paths) > 1}
+    assert not doubled
+
+
+def test_no_module_has_a_name_that_says_nothing() -> None:
+    assert not [path for path in HOUSE.rglob("*.py") if path.stem in MODULES]
+
+
+def test_each_word_is_defined_once_in_order_and_used() -> None:
+    words = [word for word, _ in rows(WORDS)]
+    assert len(words) > 30
+    assert words == sorted(set(words))
+    avoided = [word for word, _ in rows(AVOIDED)]
+    assert avoided == sorted(set(avoided))
+    text = "\n".join(path.read_text().lower() for path in [*HOUSE.rglob("*.py"), *ROOT.glob("docs/*.md")])
+    flat = re.sub(r"[\s_]+", " ", text)
+    assert not [word for word in words if word not in flat]
+
+
+def test_meanings_use_no_word_that_is_not_used() -> None:
+    avoided = [word for word, _ in rows(AVOIDED)]
+    meanings = " ".join(meaning for _, meaning in rows(WORDS)).lower()
+    assert not [word for word in avoided if re.search(rf"\b{word.replace('_', ' ')}\b", meanings)]
