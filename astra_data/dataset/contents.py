@@ -1,5 +1,6 @@
 """A dataset's table of contents: everything but the values of its columns."""
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,7 @@ from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
-from astra_data.dataset.plain import read_tasks
-from astra_data.dataset.validate import file_faults
+from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
 
 Ints = NDArray[np.int64]
 _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
@@ -74,7 +74,7 @@ def read_contents(root: Path) -> Contents:
             f"the format is {info.get('codebase_version')}, expected {layout.CODEBASE_VERSION}"
         )
     columns = [Column.from_feature(name, feature) for name, feature in info["features"].items()]
-    tables = list(read_blocks(sorted((root / "meta/episodes").glob("*/*.parquet")), _LOCATION))
+    tables = list(read_blocks(episodes_files(root), _LOCATION))
     facts = list(read_blocks([root / layout.METADATA_PATH]))
     tasks = read_tasks(root)
     if isinstance(tasks, str) or 0 not in tasks:
@@ -104,7 +104,7 @@ def read_contents(root: Path) -> Contents:
         )
     if lengths.sum() != info["total_frames"] or (starts != np.cumsum(lengths) - lengths).any():
         faults.append(f"meta/episodes adds up to {lengths.sum()} frames, expected {info['total_frames']}")
-    faults += file_faults(root, columns, rows)
+    faults += _file_faults(root, columns, rows)
     if faults:
         raise CorruptDatasetError("; ".join(faults))
     position = {uid: episode for episode, uid in enumerate(uids.tolist())}
@@ -121,3 +121,25 @@ def read_contents(root: Path) -> Contents:
         task=tasks[0],
         paths=list(rows),
     )
+
+
+def _file_faults(root: Path, columns: Sequence[Column], rows: Mapping[Path, int]) -> Iterator[str]:
+    """Compare the footers of the data files with the columns and with the number of rows of each."""
+    for path in sorted(set(data_files(root)) - set(rows)):
+        yield f"{path.relative_to(root)} does not belong to it"
+    types = {column.name: layout.arrow_type(column) for column in columns}
+    for path, expected in rows.items():
+        name, footer = path.relative_to(root), read_footer(path)
+        if isinstance(footer, str):
+            yield f"{name} {footer}"
+            continue
+        found, schema = footer
+        if found != expected:
+            yield f"{name} has {found} rows, expected {expected}"
+        for key in sorted(set(schema.names) - types.keys()):
+            yield f"{name} has an unknown column {key}"
+        for key, kind in types.items():
+            if key not in schema.names:
+                yield f"{name} lacks column {key}"
+            elif schema.field(key).type != kind:
+                yield f"{name} has {key} as {schema.field(key).type}, expected {kind}"

@@ -1,7 +1,8 @@
-"""Columns of chosen episodes as tensors, ready to be drawn from."""
+"""Columns of chosen episodes as tensors, from which training draws windows and transitions."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,12 @@ import torch
 from torch import Tensor
 
 from astra_data.dataset.column_files import cache_folder, mapped_columns, memory_bytes
-from astra_data.dataset.columns import Column
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.step_windows import Padding, Transitions, Windows
+from astra_data.dataset.samples import Samples, take
+from astra_data.dataset.step_windows import Padding, step_windows
 
 MEMORY_SHARE = 0.5
-"""Share of the machine's memory beyond which columns are mapped in from files."""
+"""Columns that take more than this share of the machine's memory are memory-mapped."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,10 +27,10 @@ class Frames:
             batch["observation.state"]  # (256, 32, 29)
 
     Attributes:
-        columns: name to (N, size), or (N,) where there is one value per step, on the device where they fit.
+        columns: name to (N, size), or (N,) where there is one value per step.
         starts: first row of each episode, (E,), ascending.
         lengths: its number of steps, (E,).
-        device: where batches go.
+        device: of the batches.
     """
 
     columns: dict[str, Tensor]
@@ -48,17 +49,17 @@ class Frames:
         memory_share: float = MEMORY_SHARE,
         cache: Path | None = None,
     ) -> "Frames":
-        """Load columns, each in one piece.
+        """Load whole columns.
 
-        Columns of more than `memory_share` of the machine's memory are not loaded but mapped in from raw
-        files. Columns that do not fit on a CUDA device stay in memory, and batches are moved there.
+        Columns of more than `memory_share` of the machine's memory are memory-mapped from raw files instead.
+        Columns that do not fit on a CUDA device stay in main memory, and each batch is moved to the device.
 
         Args:
-            dataset: where they are.
-            names: of the columns, by default all that were handed to the writer.
+            dataset: the dataset.
+            names: names of the columns, by default all of `dataset.schema`.
             episodes: indices of the episodes, by default all; they come in the dataset's order.
             device: torch device of the batches.
-            memory_share: 0 maps always.
+            memory_share: 0 to memory-map always.
             cache: folder of the raw files, by default `column_files.cache_folder()`.
 
         Raises:
@@ -68,7 +69,7 @@ class Frames:
         names = [column.name for column in dataset.schema] if names is None else names
         chosen = dataset.selected(episodes)
         lengths = dataset.lengths[chosen]
-        step_bytes = sum(map(_step_bytes, dataset.specs(names)))
+        step_bytes = sum(column.size * np.dtype(column.dtype).itemsize for column in dataset.specs(names))
         if step_bytes * int(lengths.sum()) > memory_share * memory_bytes():
             arrays = mapped_columns(dataset, names, cache or cache_folder())
             starts = dataset.starts[chosen]
@@ -77,11 +78,11 @@ class Frames:
             starts = np.cumsum(lengths) - lengths
         columns = {name: torch.from_numpy(values) for name, values in arrays.items()}
         target = torch.device(device)
-        place = target if _fits(columns, target) else torch.device("cpu")
+        storage = target if _fits(columns, target) else torch.device("cpu")
         return cls(
-            columns={name: values.to(place) for name, values in columns.items()},
-            starts=torch.from_numpy(starts).to(place),
-            lengths=torch.from_numpy(lengths).to(place),
+            columns={name: values.to(storage) for name, values in columns.items()},
+            starts=torch.from_numpy(starts).to(storage),
+            lengths=torch.from_numpy(lengths).to(storage),
             device=target,
         )
 
@@ -94,21 +95,20 @@ class Frames:
         columns = ", ".join(f"{name} {tuple(values.shape[1:])}" for name, values in self.columns.items())
         return f"Frames({len(self.lengths)} episodes, {len(self)} steps, {columns}, to {self.device})"
 
-    def windows(self, length: int, *, stride: int = 1, padding: Padding = "valid", past: int = 0) -> Windows:
-        """Return windows of L consecutive steps of one episode.
+    def windows(self, length: int, *, stride: int = 1, padding: Padding = "valid", past: int = 0) -> Samples:
+        """Return windows of L consecutive steps of one episode, with "is_pad" (L,), true outside of it.
 
         Args:
             length: L.
             stride: steps from one window to the next.
             padding: "valid" for windows inside their episode; "edge" for a window at every step t (of a
-                stride), in which the first or the last step stands for those beyond, as in lerobot's
-                `delta_timestamps`.
+                stride), padded with the first or the last step, as in lerobot's `delta_timestamps`.
             past: with "edge", how many steps before t the window begins.
 
         Raises:
             BadInputError: an argument is out of range, or no episode is long enough; lists every fault.
         """
-        return Windows(
+        return step_windows(
             *(self.columns, self.starts, self.lengths, self.device),
             length=length,
             stride=stride,
@@ -116,20 +116,20 @@ class Frames:
             past=past,
         )
 
-    def transitions(self) -> Transitions:
-        """Return single steps; what comes after a step is in its columns `next.*`."""
+    def transitions(self) -> Samples:
+        """Return single steps; the step's outcome is in its columns `next.*`."""
         steps = torch.arange(len(self), device=self.starts.device)
         before = self.lengths.cumsum(0) - self.lengths
         rows = steps + (self.starts - before).repeat_interleave(self.lengths)
-        return Transitions(self.columns, rows, self.device)
+        return Samples(rows, partial(_rows, self.columns), self.device)
 
 
-def _step_bytes(column: Column) -> int:
-    return column.size * np.dtype(column.dtype).itemsize
+def _rows(columns: dict[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    return {name: take(values, rows) for name, values in columns.items()}
 
 
 def _fits(columns: dict[str, Tensor], device: torch.device) -> bool:
-    """Return whether columns fit on `device`, with as much left for the rest as half of what is free."""
+    """Return whether columns take at most half of the device's free memory."""
     if device.type != "cuda":
         return True
     free, _ = torch.cuda.mem_get_info(device)

@@ -144,6 +144,17 @@ def read_small_table(path: Path) -> pa.Table | str:
         return f"cannot be read ({first_line(error)})"
 
 
+def read_footer(path: Path) -> tuple[int, pa.Schema] | str:
+    """Return the number of rows and the schema of the parquet file at `path`, or what is wrong with it."""
+    try:
+        with pq.ParquetFile(path) as file:
+            return file.metadata.num_rows, file.schema_arrow
+    except FileNotFoundError:
+        return "is missing"
+    except UNREADABLE as error:
+        return f"is truncated or no parquet file ({first_line(error)})"
+
+
 def data_files(root: Path) -> list[Path]:
     """Return the data files in order."""
     return sorted((root / "data").glob("*/*.parquet"))

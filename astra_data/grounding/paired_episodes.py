@@ -3,9 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -21,7 +19,6 @@ from astra_data.dataset.columns import (
     STATE,
     SUCCESS,
     TERMINATED,
-    Array,
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.learning.networks.paired_windows import RISK_STEPS, Windows
@@ -38,12 +35,14 @@ class PairedEpisodes:
     """E paired episodes, padded at the end to T steps.
 
     Attributes:
-        target_state: s_i, (E, T, S). reward: what the target paid for each step, (E, T).
-        terminated: (E, T) bool, the task ended there, well or badly; never by running out of time.
+        target_state: s_i, (E, T, S).
+        reward: the target's reward r_i, (E, T).
+        terminated: (E, T) bool, the task ended there, in success or failure; not set by time-outs.
         windows: everything else, (E, T, ...), with the mask of real steps.
-        reference: name and version of the dataset. content_hash: its hash.
-        held_out: which episodes the dataset itself sets aside, (E,) bool; None where it does not.
-        dropped_place: the entries of s_i that tell where the robot is, if φ drops all of them.
+        reference: name and version of the dataset.
+        content_hash: its hash.
+        held_out: the episodes that the dataset marks as held out, (E,) bool; None if it marks none.
+        dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
     """
 
     target_state: Tensor
@@ -57,7 +56,7 @@ class PairedEpisodes:
 
     @property
     def named(self) -> dict[str, str]:
-        """What files made from these episodes tell of them: `dataset` and `hash`."""
+        """The metadata of files made from these episodes: `dataset` and `hash`."""
         return {"dataset": self.reference, "hash": self.content_hash}
 
     @classmethod
@@ -71,39 +70,34 @@ class PairedEpisodes:
         dataset = Dataset.open(root)
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
-        columns = dataset.columns([*_COLUMNS, *({GOAL} & dataset.features.keys())])
-        ends = np.cumsum(dataset.lengths)[:-1]
-
-        def padded(values: Array) -> Tensor:
-            pieces = [torch.from_numpy(piece).float() for piece in np.split(values, ends)]
-            return pad_sequence(pieces, batch_first=True).to(device)
-
-        said = [bool(word) for word in dataset.metadata.get("held_out", ())]
-        action = padded(columns[ACTION])
-        goal = columns.get(GOAL, np.empty((len(columns[ACTION]), 0)))
-        ended = columns[TERMINATED]
+        names = [*_COLUMNS, *({GOAL} & dataset.features.keys())]
+        lengths = dataset.lengths.tolist()
+        padded = {}
+        for name, values in dataset.columns(names).items():
+            steps = torch.from_numpy(values if values.dtype == bool else values.astype("float32", copy=False))
+            padded[name] = pad_sequence(steps.to(device).split(lengths), batch_first=True)
+        mask = torch.arange(max(lengths), device=device) < torch.tensor(lengths, device=device)[:, None]
+        action, reward, terminated = padded[ACTION], padded[REWARD], padded[TERMINATED]
+        failed = terminated & ~padded[SUCCESS]
+        held_out = [bool(flag) for flag in dataset.metadata.get("held_out", ())]
         return cls(
-            target_state=padded(columns[STATE]),
-            reward=padded(columns[REWARD]),
-            terminated=padded(ended).bool(),
+            target_state=padded[STATE],
+            reward=reward,
+            terminated=terminated,
             windows=Windows(
-                state=padded(columns[ABSTRACT_STATE]),
+                state=padded[ABSTRACT_STATE],
                 action=action,
                 previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
-                goal=padded(goal),
-                simulated_next=padded(columns[ABSTRACT_SIMULATED_NEXT_STATE]),
-                next_state=padded(columns[ABSTRACT_NEXT_STATE]),
-                reward=padded(
-                    np.stack(
-                        [columns[REWARD] * ~ended, columns[REWARD] * (ended & ~columns[SUCCESS])], axis=-1
-                    )
-                ),
-                topples_soon=padded(_soon(ended & ~columns[SUCCESS], dataset.lengths)),
-                mask=padded(np.ones(len(columns[ACTION]))),
+                goal=padded.get(GOAL, action.new_empty(*mask.shape, 0)),
+                simulated_next=padded[ABSTRACT_SIMULATED_NEXT_STATE],
+                next_state=padded[ABSTRACT_NEXT_STATE],
+                reward=torch.stack([reward * ~terminated, reward * failed], dim=-1),
+                topples_soon=_topples_soon(failed, mask),
+                mask=mask.float(),
             ),
             reference=dataset.reference,
             content_hash=dataset.content_hash,
-            held_out=torch.tensor(said, dtype=torch.bool, device=device) if any(said) else None,
+            held_out=torch.tensor(held_out, device=device) if any(held_out) else None,
             dropped_place=_dropped_place(dataset),
         )
 
@@ -128,9 +122,12 @@ class PairedEpisodes:
         )
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
-        """Split by episodes into training and held-out ones: as the dataset says, else at random.
+        """Split into training and held-out episodes, as the dataset marks them, else at random.
 
-        In an augmented dataset a random episode would leave copies of itself behind in the training ones.
+        Augmented datasets mark them: with a random split, copies of held-out episodes would be trained on.
+
+        Raises:
+            BadInputError: there are too few episodes.
         """
         if self.held_out is not None:
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
@@ -139,7 +136,8 @@ class PairedEpisodes:
         count = max(1, round(held_out_share * len(self)))
         if count >= len(self):
             raise BadInputError(
-                f"{self.reference} has {len(self)} episodes: expected more, to hold {count} of them out"
+                f"{self.reference} has {len(self)} episodes, of which {count} would be held out: expected "
+                "more episodes, or a smaller held_out_share"
             )
         return self.select(order[count:]), self.select(order[:count])
 
@@ -148,10 +146,10 @@ class PairedEpisodes:
         return values[self.windows.mask.bool()]
 
     def draw_windows(self, count: int, length: int) -> tuple[Windows, Tensor]:
-        """Draw windows of `length` steps as `draw_steps` does; the mask marks only the steps that were drawn.
+        """Draw windows of `length` steps with `draw_steps`; the mask marks only the steps that were drawn.
 
         Returns:
-            the windows (count, length, ...), and the target states in them (count, length, S).
+            the windows (count, length, ...), and their target states (count, length, S).
         """
         episodes, steps, is_drawn = draw_steps(self.lengths, count, length)
         windows = _gather(self.windows, (episodes, steps))
@@ -167,11 +165,10 @@ def _dropped_place(dataset: Dataset) -> tuple[int, ...]:
     return tuple(index for group in groups for index in range(group.start, group.stop))
 
 
-def _soon(toppled: NDArray[np.bool_], lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mark the last `RISK_STEPS` steps (N,) of each episode that ends in a topple."""
-    ends = np.cumsum(lengths)
-    steps_left = np.repeat(ends, lengths) - np.arange(len(toppled))
-    return np.repeat(toppled[ends - 1], lengths) & (steps_left <= RISK_STEPS)
+def _topples_soon(failed: Tensor, mask: Tensor) -> Tensor:
+    """Mark the last `RISK_STEPS` steps of each episode that ends in failure, (E, T), 0 or 1."""
+    steps_left = mask.flip(1).cumsum(1).flip(1)
+    return (failed.any(1, keepdim=True) & mask & (steps_left <= RISK_STEPS)).float()
 
 
 def _gather(windows: Windows, rows: Tensor | tuple[Tensor, Tensor]) -> Windows:

@@ -78,6 +78,20 @@ def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int
         assert uids(direct) == uids(stepwise) < uids(made.root)
 
 
+def test_every_stratified_subset_is_as_close_to_the_shares_as_it_can_be(tmp_path: Path) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for uid in (*range(0, 16, 2), *range(1, 7, 2)):  # 8 failures, 3 successes
+            open_writer.add(fake_episode(uid, 1))
+    whole = Dataset.open(tmp_path / "set")
+    order = [int(whole.uids[row]) for row in whole.order]
+    for count in range(1, 12):
+        taken = uids(subset(whole, episodes=count, stratify="success", out=tmp_path / f"{count}"))
+        successes = [uid for uid in order if uid % 2]
+        chosen = [uid for uid in successes if uid in taken]
+        assert abs(len(chosen) - count * 3 / 11) <= 0.5
+        assert chosen == successes[: len(chosen)]
+
+
 def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tmp_path: Path) -> None:
     made = subset(forty, percent=150, of=20, out=tmp_path / "more")
     assert len(Dataset.open(made)) == 30

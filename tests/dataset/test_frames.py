@@ -1,43 +1,15 @@
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fake_dataset import COLUMNS, LENGTHS, concatenated, write_fake
-from torch.utils.data import DataLoader
+from fake_dataset import COLUMNS, LENGTHS, concatenated
+from fake_frames import NAMES, assert_equal, everything
 
-from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, column_files
-from astra_data.dataset.columns import ACTION, INDEX, REWARD, STATE, TERMINATED
+from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import INDEX, STATE
 from astra_data.dataset.frames import Frames
-from astra_data.dataset.samples import Batch, Samples
-from astra_data.dataset.step_windows import Padding
-
-NAMES = (STATE, ACTION, REWARD, TERMINATED, "mode", INDEX)
-
-
-@pytest.fixture(scope="module")
-def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_fake(tmp_path_factory.mktemp("frames") / "set")
-
-
-@pytest.fixture(scope="module")
-def frames(fake: Dataset) -> Frames:
-    return Frames.load(fake, NAMES)
-
-
-def everything(samples: Samples) -> Batch:
-    return samples.__getitems__(range(len(samples)))
-
-
-def assert_equal(found: Batch, expected: Batch) -> None:
-    assert list(found) == list(expected)
-    for name, values in expected.items():
-        assert found[name].dtype == values.dtype
-        assert torch.equal(found[name], values), name
 
 
 def test_columns_are_the_datasets(fake: Dataset) -> None:
@@ -47,37 +19,6 @@ def test_columns_are_the_datasets(fake: Dataset) -> None:
         np.testing.assert_array_equal(values.numpy(), concatenated(name))
     assert len(frames) == sum(LENGTHS)
     assert repr(frames).startswith("Frames(5 episodes, 55 steps, observation.state (3,), action (2,), ")
-
-
-@pytest.mark.parametrize("stride", [1, 3])
-def test_valid_windows_are_all_that_lie_inside_an_episode(fake: Dataset, frames: Frames, stride: int) -> None:
-    expected = [
-        range(start + first, start + first + 6)
-        for start, length in zip(fake.starts.tolist(), LENGTHS, strict=True)
-        for first in range(0, length - 5, stride)
-    ]
-    windows = frames.windows(6, stride=stride)
-    batch = everything(windows)
-    assert batch[INDEX].tolist() == [list(rows) for rows in expected]
-    assert not batch["is_pad"].any()
-    for name in NAMES:
-        np.testing.assert_array_equal(batch[name].numpy(), fake.columns([name])[name][batch[INDEX].numpy()])
-
-
-@pytest.mark.parametrize(("length", "stride", "past"), [(6, 1, 0), (6, 4, 5), (40, 1, 20), (1, 2, 0)])
-def test_edge_windows_repeat_the_first_and_last_step(
-    fake: Dataset, frames: Frames, length: int, stride: int, past: int
-) -> None:
-    rows, is_pad = [], []
-    for start, steps in zip(fake.starts, LENGTHS, strict=True):
-        for step in range(0, steps, stride):
-            wanted = np.arange(step - past, step - past + length)
-            rows.append(start + np.clip(wanted, 0, steps - 1))
-            is_pad.append((wanted < 0) | (wanted >= steps))
-    batch = everything(frames.windows(length, stride=stride, padding="edge", past=past))
-    np.testing.assert_array_equal(batch[INDEX].numpy(), rows)
-    np.testing.assert_array_equal(batch["is_pad"].numpy(), is_pad)
-    np.testing.assert_array_equal(batch[STATE].numpy(), fake.columns([STATE])[STATE][np.array(rows)])
 
 
 def test_transitions_are_the_steps(fake: Dataset, frames: Frames) -> None:
@@ -100,21 +41,6 @@ def test_chosen_episodes_only(fake: Dataset, tmp_path: Path, memory_share: float
     assert padded[INDEX][7].tolist() == [20, 20, 20, 21]
 
 
-def test_mapped_columns_equal_loaded_ones(
-    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ASTRA_DATA_CACHE", str(tmp_path))
-    mapped = Frames.load(fake, NAMES, memory_share=0.0)
-    assert_equal(everything(mapped.windows(5)), everything(frames.windows(5)))
-    files = sorted(path.relative_to(tmp_path).parts for path in tmp_path.rglob("*") if path.is_file())
-    assert files == [(fake.content_hash, name, "values.npy") for name in sorted(NAMES)]
-    # The second time the raw files serve, and what is written to the tensors stays out of them.
-    monkeypatch.setattr(Dataset, "blocks", None)
-    mapped.columns[STATE].zero_()
-    again = Frames.load(fake, NAMES, memory_share=0.0)
-    assert torch.equal(again.columns[STATE], frames.columns[STATE])
-
-
 def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
     fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,85 +52,6 @@ def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
     monkeypatch.setattr("astra_data.dataset.frames.memory_bytes", lambda: 2 * size - 2)
     Frames.load(fake, [STATE], memory_share=0.5, cache=tmp_path)
     assert list(tmp_path.rglob("values.npy"))
-
-
-def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limit = tmp_path / "memory.max"
-    monkeypatch.setattr(column_files, "MEMORY_LIMIT", limit)
-    machine = column_files.memory_bytes()
-    for text, expected in (("max\n", machine), (f"{2**60}\n", machine), (f"{2**20}\n", 2**20)):
-        limit.write_text(text)
-        assert column_files.memory_bytes() == expected
-
-
-def test_processes_map_the_same_columns_at_once(fake: Dataset, tmp_path: Path) -> None:
-    script = Path(__file__).parents[1] / "mapped_rounds.py"
-    command = [sys.executable, *map(str, (script, fake.root, tmp_path))]
-    processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
-    told = [process.communicate(timeout=120)[1] for process in processes]
-    assert told == [""] * 4
-    assert len(list(tmp_path.rglob("values.npy"))) == 2 * 40
-    assert not list(tmp_path.rglob(".*"))
-
-
-def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
-    Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
-    [path] = tmp_path.rglob("values.npy")
-    os.truncate(path, 200)
-    with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .*; delete it and try again"):
-        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
-
-
-def test_a_failure_leaves_no_raw_file(
-    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(np.lib.format, "open_memmap", lambda *_, **__: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
-    assert not list(tmp_path.rglob("*.npy"))
-    again = Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
-    assert torch.equal(again.columns[STATE], frames.columns[STATE])
-
-
-def test_samples_come_one_by_one_too(frames: Frames) -> None:
-    windows = frames.windows(6, padding="edge")
-    batch = everything(windows)
-    assert_equal(windows[8], {name: values[8] for name, values in batch.items()})
-    assert_equal(windows[-1], {name: values[-1] for name, values in batch.items()})
-    with pytest.raises(IndexError, match="sample 55 of 55"):
-        windows[55]
-
-
-@pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])
-def test_a_data_loader_draws_the_same_batches(frames: Frames, workers: int, padding: Padding) -> None:
-    windows = frames.windows(6, padding=padding)
-    expected = list(windows.batches(8, seed=3))
-    order = windows.batches(8, seed=3).order
-    loader = DataLoader(windows, batch_sampler=order, collate_fn=windows.collate, num_workers=workers)  # type: ignore[arg-type]
-    found = list(loader)
-    assert len(found) == len(expected) == len(loader)
-    for ours, theirs in zip(expected, found, strict=True):
-        assert_equal(theirs, ours)
-
-
-def test_an_interrupted_epoch_goes_on_where_it_was_left(frames: Frames) -> None:
-    transitions = frames.transitions()
-    uninterrupted = transitions.batches(10, seed=5)
-    expected = [batch for _ in range(3) for batch in uninterrupted]
-    first = transitions.batches(10, seed=5)
-    found = list(first)
-    for batch in first:
-        found.append(batch)
-        state = first.state_dict()
-        if len(found) == 8:
-            break
-    second = transitions.batches(10, seed=5)
-    second.load_state_dict(state)
-    found += [*second, *second]
-    assert len(found) == len(expected) == 18
-    for ours, theirs in zip(found, expected, strict=True):
-        assert_equal(ours, theirs)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from fake_dataset import COLUMNS, LENGTHS, write_fake
+from fake_dataset import COLUMNS, LENGTHS
 
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
@@ -40,11 +40,6 @@ def lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespac
     patch.setattr(import_module("datasets").config, "HF_DATASETS_CACHE", cache)
     yield modules
     patch.undo()
-
-
-@pytest.fixture(scope="module")
-def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_fake(tmp_path_factory.mktemp("lerobot") / "set")
 
 
 @pytest.fixture(scope="module")

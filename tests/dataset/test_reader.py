@@ -16,11 +16,6 @@ from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import STATE, TIMESTAMP, Episode
 
 
-@pytest.fixture(scope="module")
-def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_fake(tmp_path_factory.mktemp("reader") / "set")
-
-
 def test_columns_come_back_whole(fake: Dataset) -> None:
     columns = fake.columns([column.name for column in COLUMNS])
     for name, values in columns.items():
@@ -215,9 +210,8 @@ def test_verify_finds_altered_values(tmp_path: Path) -> None:
     changed[9] = 7
     pq.write_table(table.set_column(frame, table.schema.field(frame), [changed]), path)
     faults = Dataset.open(dataset.root).verify()
-    assert faults[0] == "frame_index has a wrong value in episode 2 frame 1"
-    assert faults[1].startswith("the content hash is ")
-    assert len(faults) == 2
+    assert len(faults) == 1
+    assert faults[0].endswith(f", expected {dataset.content_hash}")
 
 
 def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:
@@ -233,12 +227,13 @@ def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:
     assert Dataset.open(tmp_path / "three").content_hash != fake.content_hash
 
 
-def test_reading_needs_neither_torch_nor_lerobot_nor_pandas(fake: Dataset) -> None:
+def test_reading_needs_no_heavy_package(fake: Dataset) -> None:
     code = (
-        "import sys; from pathlib import Path; from astra_data.dataset import Dataset; "
+        "import sys; from pathlib import Path; from astra_data.dataset.reader import Dataset; "
         "Dataset.open(Path(sys.argv[1])).columns(['action']); "
-        "print([name for name in ('torch', 'lerobot', 'datasets', 'pandas') if name in sys.modules])"
+        "print(*sys.modules)"
     )
     command = [sys.executable, "-c", code, str(fake.root)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    heavy = {"torch", "torchrl", "lerobot", "datasets", "matplotlib", "mujoco", "gymnasium", "pandas"}
+    assert not heavy & set(done.stdout.split())

@@ -88,6 +88,11 @@ def test_episodes_are_padded_at_the_end(episodes: PairedEpisodes) -> None:
     assert len(episodes.steps(windows.goal)) == sum(LENGTHS)
 
 
+def test_success_and_failure_terminate_and_time_outs_do_not(episodes: PairedEpisodes) -> None:
+    assert episodes.terminated.dtype == torch.bool
+    assert episodes.terminated.nonzero().tolist() == [[2, LENGTHS[2] - 1], [3, LENGTHS[3] - 1]]
+
+
 def test_rewards_of_steps_that_end_the_task_badly_stand_apart(episodes: PairedEpisodes) -> None:
     going_on, ending = episodes.windows.reward.unbind(-1)
     assert ending.nonzero().tolist() == [[3, LENGTHS[3] - 1]]

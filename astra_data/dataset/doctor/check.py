@@ -5,8 +5,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset.column_statistics import global_statistics
@@ -27,13 +25,14 @@ from astra_data.dataset.format import (
     TASKS_PATH,
 )
 from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
-from astra_data.dataset.parquet import UNREADABLE, first_line, read_blocks, to_numpy
+from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import (
     MOST_FPS,
     PlainColumn,
     data_files,
     episodes_files,
     plain_columns,
+    read_footer,
     read_object,
     read_small_table,
     read_statistics,
@@ -123,13 +122,11 @@ def _files_are_readable(
             report.fault("files", f"{kind} has no parquet file")
         for path in files:
             name = path.relative_to(root)
-            try:
-                with pq.ParquetFile(path) as file:
-                    schema = file.schema_arrow
-            except UNREADABLE as error:
-                report.fault("files", f"{name} is truncated or no parquet file ({first_line(error)})")
-                continue
-            if kind == "data":
+            footer = read_footer(path)
+            if isinstance(footer, str):
+                report.fault("files", f"{name} {footer}")
+            elif kind == "data":
+                _, schema = footer
                 unknown = sorted(set(schema.names) - info["features"].keys())
                 faults = schema_faults(schema, columns)
                 for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:

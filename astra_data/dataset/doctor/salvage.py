@@ -16,6 +16,7 @@ from astra_data.dataset.plain import (
     data_files,
     episodes_files,
     flag_faults,
+    read_footer,
     run_faults,
     runs,
 )
@@ -76,12 +77,7 @@ def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
 
 def _file_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str]) -> Iterator[Run]:
     wanted = [column.name for column in columns]
-    try:
-        with pq.ParquetFile(path) as file:
-            file.schema_arrow  # noqa: B018 - raises where names are no text
-    except UNREADABLE:
-        pass
-    else:
+    if not isinstance(read_footer(path), str):
         yield from runs(path, read_blocks([path], wanted), columns)
         return
     schema = pa.schema([(column.name, column.arrow_type) for column in columns])

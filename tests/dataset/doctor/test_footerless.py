@@ -44,6 +44,22 @@ def test_footers_are_rebuilt_for_many_pages_per_column(
             assert file.read().equals(table)
 
 
+def test_pages_of_narrow_values_are_not_taken_for_those_of_a_wide_column(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=1000)
+    table = pa.table({"narrow": values.astype(np.float32), "wide": values[::-1].copy()})
+    path = tmp_path / "pages.parquet"
+    pq.write_table(
+        table, path, data_page_size=1, write_batch_size=250, use_dictionary=False, compression="snappy"
+    )
+    whole = path.read_bytes()
+    path.write_bytes(whole[: -8 - int.from_bytes(whole[-8:-4], "little")])
+    metadata = rebuilt_metadata(path, table.schema)
+    assert metadata.num_row_groups == 1
+    with pq.ParquetFile(path, metadata=metadata) as file:
+        assert file.read().equals(table)
+
+
 @pytest.mark.parametrize("byte", [b"\x1c", b"\xff"])
 def test_a_header_without_end_is_no_page(tmp_path: Path, byte: bytes) -> None:
     path = tmp_path / "endless.parquet"

@@ -1,9 +1,53 @@
 import numpy as np
 import pytest
 import torch
+from fake_frames import assert_equal, everything
+from torch.utils.data import DataLoader
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.order import Order
+from astra_data.dataset.frames import Frames
+from astra_data.dataset.samples import Order
+from astra_data.dataset.step_windows import Padding
+
+
+def test_samples_come_one_by_one_too(frames: Frames) -> None:
+    windows = frames.windows(6, padding="edge")
+    batch = everything(windows)
+    assert_equal(windows[8], {name: values[8] for name, values in batch.items()})
+    assert_equal(windows[-1], {name: values[-1] for name, values in batch.items()})
+    with pytest.raises(IndexError, match="sample 55 of 55"):
+        windows[55]
+
+
+@pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])
+def test_a_data_loader_draws_the_same_batches(frames: Frames, workers: int, padding: Padding) -> None:
+    windows = frames.windows(6, padding=padding)
+    expected = list(windows.batches(8, seed=3))
+    order = windows.batches(8, seed=3).order
+    loader = DataLoader(windows, batch_sampler=order, collate_fn=windows.collate, num_workers=workers)  # type: ignore[arg-type]
+    found = list(loader)
+    assert len(found) == len(expected) == len(loader)
+    for ours, theirs in zip(expected, found, strict=True):
+        assert_equal(theirs, ours)
+
+
+def test_an_interrupted_epoch_goes_on_where_it_was_left(frames: Frames) -> None:
+    transitions = frames.transitions()
+    uninterrupted = transitions.batches(10, seed=5)
+    expected = [batch for _ in range(3) for batch in uninterrupted]
+    first = transitions.batches(10, seed=5)
+    found = list(first)
+    for batch in first:
+        found.append(batch)
+        state = first.state_dict()
+        if len(found) == 8:
+            break
+    second = transitions.batches(10, seed=5)
+    second.load_state_dict(state)
+    found += [*second, *second]
+    assert len(found) == len(expected) == 18
+    for ours, theirs in zip(found, expected, strict=True):
+        assert_equal(ours, theirs)
 
 
 def epoch(order: Order) -> list[int]:

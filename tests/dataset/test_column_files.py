@@ -1,0 +1,68 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fake_frames import NAMES, assert_equal, everything
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import Dataset, column_files
+from astra_data.dataset.columns import STATE
+from astra_data.dataset.frames import Frames
+
+
+def test_mapped_columns_equal_loaded_ones(
+    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_CACHE", str(tmp_path))
+    mapped = Frames.load(fake, NAMES, memory_share=0.0)
+    assert_equal(everything(mapped.windows(5)), everything(frames.windows(5)))
+    files = sorted(path.relative_to(tmp_path).parts for path in tmp_path.rglob("*") if path.is_file())
+    assert files == [(fake.content_hash, name, "values.npy") for name in sorted(NAMES)]
+    # The second time the raw files serve, and what is written to the tensors stays out of them.
+    monkeypatch.setattr(Dataset, "blocks", None)
+    mapped.columns[STATE].zero_()
+    again = Frames.load(fake, NAMES, memory_share=0.0)
+    assert torch.equal(again.columns[STATE], frames.columns[STATE])
+
+
+def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(column_files, "MEMORY_LIMIT", limit)
+    machine = column_files.memory_bytes()
+    for text, expected in (("max\n", machine), (f"{2**60}\n", machine), (f"{2**20}\n", 2**20)):
+        limit.write_text(text)
+        assert column_files.memory_bytes() == expected
+
+
+def test_processes_map_the_same_columns_at_once(fake: Dataset, tmp_path: Path) -> None:
+    script = Path(__file__).parents[1] / "mapped_rounds.py"
+    command = [sys.executable, *map(str, (script, fake.root, tmp_path))]
+    processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
+    told = [process.communicate(timeout=120)[1] for process in processes]
+    assert told == [""] * 4
+    assert len(list(tmp_path.rglob("values.npy"))) == 2 * 40
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
+    Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    [path] = tmp_path.rglob("values.npy")
+    os.truncate(path, 200)
+    with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .*; delete it and try again"):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+
+
+def test_a_failure_leaves_no_raw_file(
+    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(np.lib.format, "open_memmap", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert not list(tmp_path.rglob("*.npy"))
+    again = Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert torch.equal(again.columns[STATE], frames.columns[STATE])
