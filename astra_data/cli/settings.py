@@ -2,6 +2,3 @@
 
 The model is imported only when its command is called or helps, so that `astra-data --help` answers at once.
 """
-
-
-

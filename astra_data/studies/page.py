@@ -15,7 +15,6 @@ SHOWN_S = 1.0
 """The horizon of the first table."""
 
 
-
 def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str:
     """Return the page on what `study.run_study` found by `command`, with the figure in file `image`."""
     first = found["cases"][0]
@@ -49,7 +48,9 @@ def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str
         image=image,
         recordings=recordings,
         models=[
-            (MODELS[model].title, MODELS[model].text) for model in found["config"]["models"] if model in MODELS
+            (MODELS[model].title, MODELS[model].text)
+            for model in found["config"]["models"]
+            if model in MODELS
         ],
         cases=list(map(_case, found["cases"])),
         minutes=["model", *(f"{size['minutes']:.3g} min" for size in first["sizes"])],
