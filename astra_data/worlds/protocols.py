@@ -1,6 +1,6 @@
 """What the toolkit needs of an abstract simulator.
 
-A class of your own is an `OwnSimulator`; `astra-data pair --simulator cart.py:Cart` pairs a dataset with it:
+A class of your own is an `Simulator`; `astra-data pair --simulator cart.py:Cart` pairs a dataset with it:
 
     class Cart:
         abstract_state = Column("abstract.state", size=2, names=("x", "v"))
@@ -53,7 +53,7 @@ class AbstractSimulator(SteppedSimulator, Protocol):
         ...
 
 
-class OwnSimulator(AbstractSimulator, Protocol):
+class Simulator(AbstractSimulator, Protocol):
     """A simulator from a file of the user's, with its map from target states; built as `Own(num_envs)`.
 
     Attributes:
