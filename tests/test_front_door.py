@@ -13,12 +13,23 @@ from fake_dataset import write_fake
 import astra_data
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import EXTRAS
+from astra_data.core.progress import silent
+from astra_data.stages.collect import CollectConfig, collect
 
 PUBLIC = [
     *("Column", "Dataset", "DatasetWriter", "Episode", "Frames", "METHODS", "Objective", "Simulator"),
     *("StagedWriter", "TASKS", "Task", "align", "augment", "evaluate", "ground", "load_policy", "merge"),
     *("pair", "pull", "push", "run", "subset", "train"),
 ]
+RECIPE = """
+task = "antmaze-umaze"
+methods = ["direct_transfer", "nas"]
+seeds = [0]
+
+[collect]
+episodes = 4
+max_steps = 20
+"""
 WITHOUT = "import sys\nfor name in {names!r}: sys.modules[name] = None\n"
 
 
@@ -38,14 +49,39 @@ def test_these_names_are_public_and_no_others() -> None:
     assert (Path(astra_data.__file__).parent / "py.typed").exists()
 
 
+def examples(name: str) -> list[doctest.Example]:
+    return doctest.DocTestParser().get_examples(inspect.getdoc(getattr(astra_data, name)) or "")
+
+
 @pytest.mark.parametrize("name", PUBLIC)
 def test_every_name_is_what_it_says_and_has_an_example(name: str) -> None:
-    found = getattr(astra_data, name)
     if name.isupper():
-        assert len(found) > 10
+        assert len(getattr(astra_data, name)) > 10
         return
-    assert found.__name__ == name
-    assert doctest.DocTestParser().get_examples(inspect.getdoc(found) or ""), f"{name} shows no example"
+    assert getattr(astra_data, name).__name__ == name
+    assert examples(name), f"{name} shows no example"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with what the examples begin with: walks, their pairs, and a small recipe."""
+    made = tmp_path_factory.mktemp("examples")
+    config = CollectConfig(episodes=12, max_steps=60, start="task")
+    collect("antmaze-umaze", config, seed=0, name="walks", out=made / "walks", progress=silent)
+    astra_data.pair("antmaze-umaze", dataset=made / "walks", out=made / "pairs")
+    (made / "small.toml").write_text(RECIPE)
+    return made
+
+
+@pytest.mark.parametrize("name", [name for name in PUBLIC if not name.isupper() and name != "load_policy"])
+def test_examples_run(name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in folder.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    test = doctest.DocTest(examples(name), {}, name, None, 0, None)
+    failures: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=failures.append)
+    assert not failures, "".join(failures)
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones() -> None:

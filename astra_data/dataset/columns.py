@@ -76,6 +76,12 @@ class Column:
             therefore invariant, also its angular rates. A mirror image of the robot follows from the roles
             too, but for its invariant values: "mirror" names the value that each becomes, "-hip_2" with its
             sign changed, and is "" elsewhere.
+
+    Example:
+        >>> from astra_data import Column
+        >>> velocity = Column("action", size=2, names=("v", "w"), astra={"unit": ["m/s", "rad/s"]})
+        >>> velocity.feature()["shape"]
+        [2]
     """
 
     name: str
@@ -223,6 +229,13 @@ class Episode:
 
     Raises:
         BadInputError: lists every fault, with column and first frame.
+
+    Example:
+        >>> import numpy as np
+        >>> from astra_data import Episode
+        >>> episode = Episode(0, {"action": np.zeros((5, 2), np.float32)}, {"floor": "carpet"})
+        >>> episode.columns["action"].shape
+        (5, 2)
     """
 
     uid: int

@@ -48,6 +48,13 @@ def subset(
 
     Raises:
         BadInputError: not exactly one of `episodes` and `percent`, or more episodes than there are.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import Dataset, subset
+        >>> half = subset(Dataset.open("walks"), percent=50, out=Path("half"))
+        >>> len(Dataset.open(half))
+        6
     """
     if (episodes is None) == (percent is None) or (of is not None and percent is None):
         raise BadInputError("a subset takes either a number of episodes, or a percentage (and of how many)")
@@ -153,6 +160,14 @@ def merge(
 
     Raises:
         BadInputError: the datasets do not fit together; lists every difference.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import Dataset, merge
+        >>> walks = Dataset.open("walks")
+        >>> twice = merge([walks, walks], new_uids=True, out=Path("twice"))
+        >>> len(Dataset.open(twice))
+        24
     """
     if len(sources) < 2:
         raise BadInputError("expected two datasets or more to merge")

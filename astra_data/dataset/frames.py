@@ -31,6 +31,13 @@ class Frames:
         starts: first row of each episode, (E,), ascending.
         lengths: its number of steps, (E,).
         device: of the batches.
+
+    Example:
+        >>> from astra_data import Dataset, Frames
+        >>> frames = Frames.load(Dataset.open("walks"), ["action"])
+        >>> batch = next(iter(frames.windows(8, padding="edge").batches(4, seed=0)))
+        >>> batch["action"].shape  # (B, T, A)
+        torch.Size([4, 8, 2])
     """
 
     columns: dict[str, Tensor]

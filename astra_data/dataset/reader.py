@@ -17,7 +17,16 @@ from astra_data.dataset.parquet import read_blocks, to_numpy
 
 
 class Dataset(Contents):
-    """A finished dataset of E episodes and N steps; make one with `Dataset.open`."""
+    """A finished dataset of E episodes and N steps; make one with `Dataset.open`.
+
+    Example:
+        >>> from astra_data import Dataset
+        >>> data = Dataset.open("walks")
+        >>> data.reference, len(data)
+        ('walks@data-1.0.0', 12)
+        >>> data.columns(["action"])["action"].shape  # (N, A)
+        (720, 2)
+    """
 
     @classmethod
     def open(cls, root: Path | str) -> "Dataset":

@@ -43,6 +43,17 @@ class StagedWriter:
         staged: metadata of the episodes that are safe, by their position in the dataset.
         made, policy: as in `DatasetWriter`.
         folder: where they wait, and whatever else the recording needs to go on after an interruption.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from astra_data import Column, Dataset, Episode, StagedWriter
+        >>> columns = [Column("action", size=2)]
+        >>> recording = {"fps": 20, "task": "drive", "description": {"name": "log", "stage": "collect"}}
+        >>> with StagedWriter(Path("log"), columns, **recording, resume=True) as writer:
+        ...     writer.add(Episode(len(writer.staged), {"action": np.zeros((5, 2), np.float32)}))
+        >>> len(Dataset.open("log"))
+        1
     """
 
     def __init__(

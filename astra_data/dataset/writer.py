@@ -39,6 +39,19 @@ class DatasetWriter:
         made: how the dataset was made, such as how long it took, for meta/astra/dataset.json beside the
             description; to be filled in before leaving the block.
         policy: file of the policy that acted, if a copy of it belongs to the dataset; as `made`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from astra_data import Column, Dataset, DatasetWriter, Episode
+        >>> columns = [Column("observation.state", size=3), Column("action", size=2)]
+        >>> description = {"name": "cart", "stage": "collect"}
+        >>> recording = {"fps": 20, "task": "drive", "description": description}
+        >>> with DatasetWriter(Path("cart"), columns, **recording) as writer:
+        ...     state, action = np.zeros((5, 3), np.float32), np.zeros((5, 2), np.float32)
+        ...     writer.add(Episode(0, {"observation.state": state, "action": action}))
+        >>> len(Dataset.open("cart"))
+        1
     """
 
     def __init__(

@@ -55,6 +55,14 @@ def run(
         MissingStageError: an artefact of the recipe that it is based on is not finished.
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import run
+        >>> run(Path("small.toml"), jobs=1, until="pair")
+        collect/seed_0  started
+        ...
+        PosixPath('runs/small')
     """
     _check_stage(until or "report")
     experiment = load_experiment(recipe_path, root)

@@ -21,6 +21,7 @@ from astra_data.dataset.columns import (
     TERMINATED,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import open_dataset
 from astra_data.learning.networks.paired_windows import RISK_STEPS, Windows
 from astra_data.learning.recorded import draw_steps
 
@@ -60,14 +61,14 @@ class PairedEpisodes:
         return {"dataset": self.reference, "hash": self.content_hash}
 
     @classmethod
-    def load(cls, root: Path, device: str = "cpu") -> "PairedEpisodes":
+    def load(cls, root: str | Path, device: str = "cpu") -> "PairedEpisodes":
         """Read the paired dataset at `root`.
 
         Raises:
             BadInputError: the dataset has not been paired.
             CorruptDatasetError: it is incomplete.
         """
-        dataset = Dataset.open(root)
+        dataset = open_dataset(root)
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
         names = [*_COLUMNS, *({GOAL} & dataset.features.keys())]

@@ -11,7 +11,7 @@ from torch import Tensor
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.grounding.grounding_file import load_history_model
@@ -44,19 +44,27 @@ class AlignConfig(DescentConfig):
 
 
 def align(
-    config: AlignConfig,
+    config: AlignConfig = AlignConfig(),
     *,
-    dataset: Path,
+    dataset: str | Path,
     grounding: Path,
-    seed: int,
+    seed: int = 0,
     out: Path,
-    device: str,
-    progress: Progress,
+    device: str = "cpu",
+    progress: Progress = silent,
 ) -> None:
     """Fit ψ^t on index-matched target and abstract histories; write it and how well it agrees to `out`.
 
     Raises:
         BadInputError: an input is not there or not what was expected, or `out` was begun otherwise.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import align, ground
+        >>> from astra_data.grounding.fit import GroundConfig
+        >>> from astra_data.stages.align import AlignConfig
+        >>> ground("antmaze-umaze", "astra", GroundConfig(updates=2), dataset="pairs", out=Path("astra"))
+        >>> align(AlignConfig(updates=2), dataset="pairs", grounding=Path("astra"), out=Path("encoder"))
     """
     made = origin(device)
     grounding_file = grounding / "grounding.safetensors"

@@ -22,7 +22,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from astra_data.core.config import Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import (
     ABSTRACT_STATE,
@@ -38,7 +38,7 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import successor
+from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.worlds.plane.geometry import PlanarMap
 from astra_data.worlds.plane.relocation import Relocation, Rotations, outcomes, positions
@@ -99,14 +99,14 @@ class AugmentConfig(Config):
 
 
 def augment(
-    task: str | None,
-    config: AugmentConfig,
+    task: str | None = None,
+    config: AugmentConfig = AugmentConfig(),
     *,
-    dataset: Path,
-    seed: int,
+    dataset: str | Path,
+    seed: int = 0,
     name: str | None = None,
     out: Path | None = None,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Path:
     """Write a version of `dataset` with copies of its training episodes; return its folder.
 
@@ -127,8 +127,16 @@ def augment(
         BadInputError: the task has no maze; the dataset does not fit it, was paired or augmented, does not
             say how its columns move, or has no stretch to copy or no place for any copy.
         CorruptDatasetError: `dataset` is incomplete.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import Dataset, augment
+        >>> from astra_data.stages.augment import AugmentConfig
+        >>> turned = augment(config=AugmentConfig(episodes=16), dataset="walks", out=Path("turned"))
+        >>> len(Dataset.open(turned))
+        16
     """
-    source = Dataset.open(dataset)
+    source = open_dataset(dataset)
     world = _task_of(source, task)
     plane = world.planar
     _check(source, world)

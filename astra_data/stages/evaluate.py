@@ -20,7 +20,7 @@ from torch import Tensor
 from astra_data.core.checkpoint import finished_folder, save_tensors
 from astra_data.core.config import Config, Count, Positive
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
@@ -56,15 +56,15 @@ class EvaluateConfig(Config):
 def evaluate(
     task: str,
     method: str,
-    config: EvaluateConfig,
+    config: EvaluateConfig = EvaluateConfig(),
     *,
-    policy: Path | None,
-    grounding: Path | None,
-    target_encoder: Path | None,
+    policy: Path | None = None,
+    grounding: Path | None = None,
+    target_encoder: Path | None = None,
     reference: Path | None = None,
-    seed: int,
+    seed: int = 0,
     out: Path,
-    progress: Progress,
+    progress: Progress = silent,
     num_threads: int | None = None,
 ) -> None:
     """Test a row and write its figures and paths to `out`.
@@ -86,6 +86,15 @@ def evaluate(
 
     Raises:
         BadInputError: an input is not there or not what was expected.
+
+    Example:
+        >>> import json
+        >>> from pathlib import Path
+        >>> from astra_data import evaluate
+        >>> from astra_data.stages.evaluate import EvaluateConfig
+        >>> evaluate("antmaze-umaze", "follower", EvaluateConfig(episodes=2), out=Path("evaluation"))
+        >>> json.loads(Path("evaluation/evaluation.json").read_text())["target"]["success"]
+        [1.0, 1.0]
     """
     world, base = task_named(task), method_named(method)
     scores = world.objective.scores

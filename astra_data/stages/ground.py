@@ -6,7 +6,7 @@ from pathlib import Path
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.fit import Fitting, GroundConfig
@@ -20,14 +20,14 @@ from astra_data.worlds.registry import task_named
 def ground(
     task: str,
     method: str,
-    config: GroundConfig,
+    config: GroundConfig = GroundConfig(),
     *,
     settings: Config | None = None,
-    dataset: Path,
-    seed: int,
+    dataset: str | Path,
+    seed: int = 0,
     out: Path,
-    device: str,
-    progress: Progress,
+    device: str = "cpu",
+    progress: Progress = silent,
 ) -> None:
     """Fit a method's grounding to a paired dataset; write it, its telemetry and its gap report to `out`.
 
@@ -44,6 +44,12 @@ def ground(
 
     Raises:
         BadInputError: the method does not ground, the dataset is not paired, or `out` was begun otherwise.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import ground
+        >>> from astra_data.grounding.fit import GroundConfig
+        >>> ground("antmaze-umaze", "nas", GroundConfig(updates=2), dataset="pairs", out=Path("nas"))
     """
     fit = method_named(method).fit
     if fit is None:

@@ -10,7 +10,7 @@ import torch
 
 from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import machine
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import (
@@ -24,7 +24,7 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import successor
+from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.registry import TASKS
@@ -45,12 +45,12 @@ class PairConfig(Config):
 
 def pair(
     simulator: str,
-    config: PairConfig,
+    config: PairConfig = PairConfig(),
     *,
-    dataset: Path,
+    dataset: str | Path,
     name: str | None = None,
     out: Path | None = None,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Path:
     """Add the columns `abstract.*` to `dataset`, vectorised over its steps; return the new folder.
 
@@ -65,9 +65,17 @@ def pair(
     Raises:
         BadInputError: the simulator does not show the state it was reset to, or does not fit the dataset.
         CorruptDatasetError: `dataset` is incomplete.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import Dataset, pair
+        >>> pairs = pair("antmaze-umaze", dataset="walks", out=Path("pairs_again"))
+        >>> landed = "abstract.simulated_next_state"
+        >>> Dataset.open(pairs).columns([landed])[landed].shape  # (N, X)
+        (720, 4)
     """
     pairing = pairing_named(simulator)
-    source = Dataset.open(dataset)
+    source = open_dataset(dataset)
     _check(source, pairing)
     stopwatch = Stopwatch()
     batch = built(pairing, BATCH)

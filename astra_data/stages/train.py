@@ -7,7 +7,7 @@ from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.grounding_file import load_grounding
@@ -21,16 +21,16 @@ from astra_data.worlds.registry import task_named
 def train(
     task: str,
     method: str,
-    config: PpoTrainConfig | SacTrainConfig,
+    config: PpoTrainConfig | SacTrainConfig = PpoTrainConfig(),
     *,
     settings: Config | None = None,
-    dataset: Path,
-    grounding: Path | None,
+    dataset: str | Path,
+    grounding: Path | None = None,
     initial: Path | None = None,
-    seed: int,
+    seed: int = 0,
     out: Path,
-    device: str,
-    progress: Progress,
+    device: str = "cpu",
+    progress: Progress = silent,
     num_threads: int | None = None,
 ) -> None:
     """Learn the policy of a row and write it with its learning curve to `out`.
@@ -52,6 +52,13 @@ def train(
     Raises:
         BadInputError: the method has no policy to train, needs an artefact and got none, or `out` was begun
             otherwise.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import train
+        >>> from astra_data.training.train import PpoTrainConfig
+        >>> config = PpoTrainConfig(num_envs=8, rollout_steps=8, total_steps=64)
+        >>> train("antmaze-umaze", "direct_transfer", config, dataset="pairs", out=Path("policy"))
     """
     base, world, made = method_named(method), task_named(task), origin(device)
     if base.learn is None:

@@ -22,6 +22,13 @@ class Objective(ABC):
         success_reward: for reaching the goal. failure_reward: for ending badly.
         is_lasting: whether success is to last to the horizon, not to reach something before.
         action_size: A. goal_size: G, 0 where there is nothing to tell apart.
+
+    Example:
+        >>> import numpy as np
+        >>> from astra_data import TASKS
+        >>> objective = TASKS["antmaze-umaze"].objective
+        >>> objective.horizon, objective.draw_goals(np.random.default_rng(0), 3).shape  # (count, G)
+        (700, (3, 2))
     """
 
     is_lasting: ClassVar[bool] = False

@@ -58,6 +58,29 @@ class Simulator(AbstractSimulator, Protocol):
 
     Attributes:
         abstract_state: the column of abstract states, with names, units, frames and roles.
+
+    Example:
+        >>> import torch
+        >>> from astra_data import Column
+        >>> class Cart:
+        ...     abstract_state = Column("abstract.state", size=2, names=("x", "y"))
+        ...     parameters = {"timestep_s": 0.05}
+        ...
+        ...     def __init__(self, num_envs):
+        ...         self.state = torch.zeros(num_envs, 2)
+        ...
+        ...     @staticmethod
+        ...     def abstraction(state):
+        ...         return state[:, :2]
+        ...
+        ...     def reset_to(self, state, rows=None):
+        ...         self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+        ...
+        ...     def step(self, action):
+        ...         self.state = self.state + 0.05 * action
+        ...         return self.state
+        >>> Cart(3).step(torch.ones(3, 2)).shape
+        torch.Size([3, 2])
     """
 
     abstract_state: Column

@@ -73,6 +73,14 @@ class Task:
         plane: what only a task in a maze has; None for others.
         photograph: pictures (K, height, width, 3) of target states (K, S), where they are worth seeing.
         target_id: what the target is called where several tasks have it, so that episodes of one serve all.
+
+    Example:
+        >>> from astra_data import TASKS
+        >>> task = TASKS["antmaze-umaze"]
+        >>> task.fps, task.abstract_state.names
+        (20, ('x', 'y', 'vx', 'vy'))
+        >>> task.simulator(4).state.shape  # (B, X)
+        torch.Size([4, 4])
     """
 
     name: str

@@ -39,6 +39,12 @@ def pull(
     Raises:
         BadInputError: the source has no such version, or the folder holds something else.
         SharingError: the source cannot be reached, refuses, or is not to be trusted.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import pull, push
+        >>> pull(push("walks", "./shared"), out=Path("copy")).reference
+        'walks@data-1.0.0'
     """
     where, named = parse_source(source)
     asked = Version.parse(version.removeprefix("data-")) if version else named

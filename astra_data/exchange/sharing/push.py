@@ -44,6 +44,11 @@ def push(
         CorruptDatasetError: the dataset is incomplete or was altered.
         RecipeError: the notes are not what they should be.
         SharingError: the place refuses or cannot be reached.
+
+    Example:
+        >>> from astra_data import push
+        >>> push("walks", "./shared").rpartition("/shared/")[2]
+        'walks@data-1.0.0'
     """
     local = open_dataset(dataset)
     place = parse_place(destination)

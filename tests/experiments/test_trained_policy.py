@@ -1,0 +1,70 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
+from astra_data.experiments.trained_policy import load_policy
+from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.stages.align import align
+from astra_data.stages.collect import collect
+from astra_data.stages.ground import ground
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.stages.train import train
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.worlds.registry import TASKS
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run with ASTRA's artefacts of seed 0, and a policy of its `+` row."""
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    with short_task():
+        walks = collect(TASK, COLLECT, seed=0, out=folder / "collect/seed_0", progress=silent)
+        pairs = pair(TASK, PairConfig(), dataset=walks, out=folder / "pair/seed_0")
+        grounding = folder / "ground/astra/seed_0"
+        ground(TASK, "astra", GROUND, dataset=pairs, out=grounding)
+        align(ALIGN, dataset=pairs, grounding=grounding, out=folder / "align/astra/seed_0")
+        for row in ("astra_plus", "astra_task_reward"):
+            out = folder / "train" / row / "seed_0"
+            train(TASK, row, TRAIN, dataset=pairs, grounding=grounding, out=out)
+    (folder / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze"}))
+    return folder
+
+
+@pytest.mark.parametrize("row", ["astra_plus", "astra_task_reward"])
+def test_it_acts_as_the_artefacts_put_together_by_hand(row: str, run: Path) -> None:
+    by_hand = deploy(
+        TASKS["antmaze-umaze"],
+        PolicyFile.load(run / "train" / row / "seed_0/policy.safetensors"),
+        load_grounding(run / "ground/astra/seed_0/grounding.safetensors"),
+        load_target_encoder(run / "align/astra/seed_0/target_encoder.safetensors"),
+    )
+    loaded = load_policy(str(run), row)
+    torch.manual_seed(0)
+    by_hand.start(2)
+    loaded.start(2)
+    for _ in range(3):
+        state, goal = torch.randn(2, 29), torch.randn(2, 2)
+        action = loaded.act(state, goal)
+        assert action.shape == (2, 2)
+        assert torch.equal(action, by_hand.act(state, goal))
+
+
+def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> None:
+    missing = (
+        r"astra_plus, seed 1: expected .*policy.safetensors \(astra-data train\), .*\(astra-data align\)"
+    )
+    with pytest.raises(BadInputError, match=missing):
+        load_policy(run, "astra_plus", seed=1)
+
+
+def test_no_run_and_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected the folder of a run, which holds recipe\.json"):
+        load_policy(tmp_path, "astra")
+    with pytest.raises(BadInputError, match="follower trains no policy"):
+        load_policy(run, "follower")
