@@ -24,7 +24,7 @@ from astra_data.dataset.columns import (
     Array,
 )
 from astra_data.dataset.reader import Dataset
-from astra_data.learning.networks.paired_windows import RISK_STEPS, Windows
+from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
 from astra_data.learning.recorded import draw_steps
 
 _COLUMNS = (
@@ -49,7 +49,7 @@ class PairedEpisodes:
     target_state: Tensor
     reward: Tensor
     terminated: Tensor
-    windows: Windows
+    windows: PairedWindows
     reference: str
     content_hash: str
     held_out: Tensor | None = None
@@ -86,7 +86,7 @@ class PairedEpisodes:
             target_state=padded(columns[STATE]),
             reward=padded(columns[REWARD]),
             terminated=padded(ended).bool(),
-            windows=Windows(
+            windows=PairedWindows(
                 state=padded(columns[ABSTRACT_STATE]),
                 action=action,
                 previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
@@ -147,7 +147,7 @@ class PairedEpisodes:
         """Return the real steps of `values` (E, T, ...), one after another, (N, ...)."""
         return values[self.windows.mask.bool()]
 
-    def draw_windows(self, count: int, length: int) -> tuple[Windows, Tensor]:
+    def draw_windows(self, count: int, length: int) -> tuple[PairedWindows, Tensor]:
         """Draw windows of `length` steps as `draw_steps` does; the mask marks only the steps that were drawn.
 
         Returns:
@@ -174,5 +174,5 @@ def _soon(toppled: NDArray[np.bool_], lengths: NDArray[np.int64]) -> NDArray[np.
     return np.repeat(toppled[ends - 1], lengths) & (steps_left <= RISK_STEPS)
 
 
-def _gather(windows: Windows, rows: Tensor | tuple[Tensor, Tensor]) -> Windows:
-    return Windows(**{name: values[rows] for name, values in vars(windows).items()})
+def _gather(windows: PairedWindows, rows: Tensor | tuple[Tensor, Tensor]) -> PairedWindows:
+    return PairedWindows(**{name: values[rows] for name, values in vars(windows).items()})

@@ -6,7 +6,7 @@ from small_run import ALIGN
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
-from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.grounding.files import load_target_encoder
 from astra_data.stages.align import align
 
 
