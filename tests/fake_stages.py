@@ -34,7 +34,7 @@ class FakeConfig(Config):
     fails: bool = False
     learner: str = "ppo"
     limits_commands: bool = False
-    doubt_penalty: float = 0.0
+    disagreement_penalty: float = 0.0
     reward: str | None = None
     correction_heads: int = 1
 

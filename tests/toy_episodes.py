@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.paired_windows import Windows
+from astra_data.learning.networks.paired_windows import PairedWindows
 
 
 def toy_episodes(
@@ -22,12 +22,12 @@ def toy_episodes(
 ) -> PairedEpisodes:
     """Return E episodes of T steps with `state` (E, T, X) and `action` (E, T, A).
 
-    The other shapes are as in `PairedEpisodes` and `Windows`, whose `reward` is `parts` here. The simulator
-    lands where the target does, and every step is real, unless told otherwise.
+    The other shapes are as in `PairedEpisodes` and `PairedWindows`, whose `reward` is `parts` here. By
+    default the simulator lands where the target does, and every step is real.
     """
     nothing = torch.zeros(state.shape[:2])
     none = torch.zeros(*state.shape[:2], 2)
-    windows = Windows(
+    windows = PairedWindows(
         state=state,
         action=action,
         previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
@@ -50,4 +50,4 @@ def toy_episodes(
 
 def no_episodes() -> PairedEpisodes:
     empty = torch.zeros(1, 1)
-    return PairedEpisodes(empty, empty, empty.bool(), Windows(*[empty] * 9), "toy@data-1.0.0", "abc")
+    return PairedEpisodes(empty, empty, empty.bool(), PairedWindows(*[empty] * 9), "toy@data-1.0.0", "abc")

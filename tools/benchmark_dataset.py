@@ -35,6 +35,7 @@ from astra_data.core.cores import cores
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
 from astra_data.dataset.frames import Frames
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.stages.pair import pair_steps
 from astra_data.training.gymnasium import SeededSimulatorWorld, WorldEnv
 from astra_data.worlds.mujoco_model import MujocoModel
@@ -188,7 +189,7 @@ def point_mass_pairs() -> Candidates:
     action = rng.uniform(-1, 1, size=(PAIRED, 2)).astype(np.float32)
     pairing = pairing_named(TASK)
     batch, simulator = pairing.simulator(BATCH_OF_PAIRS), task.simulator(1)
-    env = WorldEnv(SeededSimulatorWorld(task.objective, simulator))
+    env = WorldEnv(SeededSimulatorWorld(task.objective, EpisodeSimulator(simulator)))
     env.reset(seed=0)
     abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
 

@@ -32,9 +32,11 @@ from astra_data.core.cores import cores
 from astra_data.core.errors import AstraDataError
 from astra_data.core.progress import silent
 from astra_data.experiments.recipe import Recipe
-from astra_data.grounding.build import simulator_of
 from astra_data.grounding.fit import Fitting, HistoryFit
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.iql import Experience, Iql, IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
@@ -101,10 +103,11 @@ def main(
 
 def grounded_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train on latents in the grounded simulator; what the model has learned is the same to the speed."""
+    grounding = HistoryGrounding(GroundingModel(SHAPE).requires_grad_(False))
     return (
         "PPO in the grounded simulator, steps",
         {
-            OURS: ppo_stretch(GroundingModel(SHAPE).requires_grad_(False), memory_size=0),
+            OURS: ppo_stretch(grounding, memory_size=0),
             "Stable-Baselines3, one vector environment": stable_baselines(stack, "ppo", "vector"),
             "Stable-Baselines3, DummyVecEnv of 16": stable_baselines(stack, "ppo", "single"),
         },
@@ -116,18 +119,18 @@ def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, 
     return (
         "PPO with a memory in the raw simulator, steps",
         {
-            OURS: ppo_stretch(None, memory_size=SETTINGS.train.memory_size),
+            OURS: ppo_stretch(NO_GROUNDING, memory_size=SETTINGS.train.memory_size),
             "sb3-contrib, LSTM, one vector environment": stable_baselines(stack, "recurrent_ppo", "vector"),
             "sb3-contrib, LSTM, DummyVecEnv of 16": stable_baselines(stack, "recurrent_ppo", "single"),
         },
     )
 
 
-def ppo_stretch(model: GroundingModel | None, memory_size: int) -> Stretch:
+def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
     config = SETTINGS.train
     assert isinstance(config, PpoTrainConfig)
-    env = SimulatorWorld(TASK.objective, simulator_of(TASK, model, config.num_envs, "cpu"))
+    env = SimulatorWorld(TASK.objective, grounding.simulator(TASK, config.num_envs))
     shape = ActorCriticShape(
         observation_size=env.observation_size,
         action_size=env.action_size,
@@ -146,7 +149,7 @@ def ppo_stretch(model: GroundingModel | None, memory_size: int) -> Stretch:
 def sac(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train an actor without memory in an abstract simulator of the humanoid."""
     count, updates, steps = 32, 8, 8 if quick else 64
-    env = SimulatorWorld(WALKER.objective, simulator_of(WALKER, None, count, "cpu"))
+    env = SimulatorWorld(WALKER.objective, NO_GROUNDING.simulator(WALKER, count))
     actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
     config = SacConfig(rollout_steps=steps, updates_per_step=updates, batch_size=256)
     learner = Sac(env, actor, config, horizon=WALKER.objective.horizon, seed=0)

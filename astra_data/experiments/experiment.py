@@ -20,6 +20,7 @@ from astra_data.core.errors import RecipeError
 from astra_data.core.naming import base_method, is_plus
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
+from astra_data.experiments.renamed import with_current_keys
 from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
@@ -167,7 +168,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     Raises:
         RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
     """
-    tables = load_tables(path)
+    tables = with_current_keys(load_tables(path), path)
     folder = root / path.stem
     if "based_on" not in tables:
         return Experiment(validated(tables, Recipe, str(path)), path, folder)
@@ -176,7 +177,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     if name not in known:
         raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
     base_path = path.with_name(f"{name}.toml")
-    base_tables = load_tables(base_path)
+    base_tables = with_current_keys(load_tables(base_path), base_path)
     if "based_on" in base_tables:
         raise RecipeError(f"{path}: based_on: expected a recipe that is based on none itself, got '{name}'")
     base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)

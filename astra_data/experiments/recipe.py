@@ -126,8 +126,9 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_heads_to_disagree(self) -> Self:
-        if (self.train.doubt_penalty or self.plus.doubt_penalty) and self.ground.correction_heads < 2:
-            raise ValueError("doubt_penalty: expected ground.correction_heads of 2 or more, got 1")
+        penalised = self.train.disagreement_penalty or self.plus.disagreement_penalty
+        if penalised and self.ground.correction_heads < 2:
+            raise ValueError("disagreement_penalty: expected ground.correction_heads of 2 or more, got 1")
         return self
 
     @model_validator(mode="after")

@@ -6,8 +6,7 @@ from pathlib import Path
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method, place
 from astra_data.experiments.plan import grounded_as
-from astra_data.grounding.grounding_file import load_grounding
-from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.methods import method_named
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.policy_file import PolicyFile, deploy

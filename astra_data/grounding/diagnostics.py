@@ -1,23 +1,23 @@
-"""How well a grounding does on episodes that it was not fitted to."""
+"""How well a grounding predicts episodes that it was not fitted to."""
 
 import torch
 from torch import Tensor
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, LossWeights
-from astra_data.learning.networks.paired_windows import Windows
+from astra_data.learning.networks.paired_windows import PairedWindows
 
 
 @torch.no_grad()
 def telemetry(
     model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights
 ) -> dict[str, float | None]:
-    """Return what falling losses do not show, on `episodes`.
+    """Return figures that losses do not show, on `episodes`.
 
-    R² of each head that is trained (of the correction: of the simulator's error that it removes), None where
-    there is nothing to explain, as in a perfect simulator; the mean standard deviation of the latent's
-    entries, and the latent's effective rank (exponential of the entropy of the covariance's normalised
-    eigenvalues).
+    They are: R² of each head that is trained (for the correction: the share of the simulator's error that it
+    removes), None where there is no variance to explain, as in a perfect simulator; the mean standard
+    deviation of the latent's entries; and the latent's effective rank (exponential of the entropy of the
+    normalised eigenvalues of its covariance).
     """
     windows = episodes.windows
     latent, _ = model.encode(windows)
@@ -41,11 +41,11 @@ def telemetry(
     return figures
 
 
-def correction_r2(corrected: Tensor, windows: Windows, std: Tensor) -> float | None:
+def correction_r2(corrected: Tensor, windows: PairedWindows, std: Tensor) -> float | None:
     """Return the share of the simulator's squared error, in units of `std` (X,), that a correction removes.
 
-    `corrected` (B, T, X) is what the correction makes of the simulated next states of `windows`. None where
-    there is nothing to explain.
+    `corrected` (B, T, X) are the corrected simulated next states of `windows`. None where the simulator makes
+    no error.
     """
     mask = windows.mask.bool()
     wrong, raw = (

@@ -1,4 +1,4 @@
-"""Fit: what a method is given to learn about its simulator from pairs, and the way of the history models."""
+"""Fit a grounding: what a method is given to fit it to, and how history models are fitted."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,14 +7,15 @@ from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from astra_data.core.config import Config, Count, Number, Positive, Share
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.grounding.diagnostics import telemetry
-from astra_data.grounding.grounding_file import Grounding
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.raw import scatter_factor
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
 from astra_data.worlds.task import Task
@@ -33,44 +34,45 @@ class GroundConfig(DescentConfig):
     """λ1, of the loss of the next latent. At 1 it crowds out the correction: on the Long Maze held-out R²
     0.826 against 0.835 of NAS, 200-step position error 0.92 m against 0.65 m; at 0.1: 0.833, 0.72 m."""
     reward_weight: Positive = 1.0
-    """λ2, of the loss of the reward; λ3, of the correction's, is 1."""
+    """λ2, of the loss of the reward; λ3, of the correction, is 1."""
     target: TargetKind = "ema"
-    """Where the next latent of the latent loss comes from; "online" is the printed loss, unbounded below."""
+    """The target of the latent loss: a slow copy of the encoder ("ema"), or the encoder itself without its
+    gradient ("detach") or with it ("online", the printed loss, which is unbounded below)."""
     ema_rate: Share = 0.01
-    """Share by which the slow encoder of "ema" follows, per update."""
+    """Share by which the slow encoder of "ema" follows the encoder, per update."""
     latent_size: Count = 64
-    """Z, also the size of the encoder's memory."""
+    """Z, also the size of the encoder's hidden state."""
     position_octaves: Number = 4
-    """Sines and cosines of the position from 16 m down by halves; 0 for the bare position. Without effect
-    where a task has no positions."""
+    """Number of wavelengths, from 16 m down by halves, of sines and cosines of the position; 0 for none.
+    Without effect where a task has no positions."""
     correction_heads: Count = 1
-    """Heads that correct the state, each of which learns from half of every batch, drawn for it; their mean
-    corrects, and `doubt_penalty` keeps policies from where they disagree."""
+    """Heads that correct the state. Each learns from its own random half of every batch; their mean is the
+    correction, and `disagreement_penalty` keeps policies away from where they disagree."""
     reward: Literal["whole", "correction"] = "whole"
-    """What R_pred learns: "whole", the target's reward, as in the paper; "correction", what the task's own
-    reward on recorded abstract states lacks of it, as f_abs corrects the state. Only for policies that learn
-    from the predicted reward; augmented copies are judged by abstract states, which lack nothing."""
+    """What R_pred learns: "whole", the target's reward, as in the paper; "correction", the residual reward:
+    the target's less the task's own on the recorded abstract states. It matters only to policies that learn
+    from the predicted reward. Augmented copies are rewarded on abstract states: their residual is zero."""
     reward_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the latent that R_pred does not see while it learns, so that it learns no failure by heart."""
+    """Dropout rate of the latent that R_pred is given in training, so that it memorises no failure."""
     failure_weight: Positive = 1.0
-    """Of the failures in the loss of the reward. With 1, predicting their average costs as much as predicting
-    that of the rest does."""
+    """Weight of the failures in the loss of the reward. With 1, predicting the average of the failures costs
+    as much as predicting the average of all other steps."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Share of the episodes on which nothing is fitted but the residual's scatter, unless the dataset sets
-    some aside itself."""
+    """Share of the episodes that are held out, to measure and to fit the scatter around the correction,
+    unless the dataset holds some out itself."""
 
 
 @dataclass(frozen=True)
 class Fitting:
-    """What a method has to learn about its simulator from.
+    """What a method is given to fit its grounding to.
 
     Attributes:
         task: the task. config: the recipe's `[ground]`.
         settings: the method's own table of the recipe, if it has one.
-        training: paired episodes to fit. held_out: those that only measure.
+        training: paired episodes to fit. held_out: paired episodes to measure on.
         seed: of all randomness. device: of the networks.
         folder: for checkpoints and further files; what is left in it becomes part of the artefact.
-        progress: told the share done and the rate.
+        progress: called with the share done and a note.
     """
 
     task: Task
@@ -84,16 +86,16 @@ class Fitting:
     progress: Progress
 
 
-Fit = Callable[[Fitting], tuple[Grounding, dict[str, Any]]]
-"""Returns what was learned, and figures that say how well and how fast."""
+Fit = Callable[[Fitting], tuple[FittedGrounding, dict[str, Any]]]
+"""Returns the grounding, and figures of how good it is and how fast it was fitted."""
 
 
 @dataclass(frozen=True)
 class HistoryFit:
-    """Fit a history model: the correction, and what else a method learns (paper, Section IV-A).
+    """Fit a history model: the correction, and the other parts that a method has (paper, Section IV-A).
 
     Attributes:
-        latent: whether it predicts the next latent. reward: whether it predicts the target's reward.
+        latent: whether the next latent is predicted. reward: whether the target's reward is predicted.
     """
 
     latent: bool
@@ -106,14 +108,14 @@ class HistoryFit:
             reward=config.reward_weight if self.reward else 0.0,
         )
 
-    def __call__(self, fitting: Fitting) -> tuple[GroundingModel, dict[str, Any]]:
-        """Return the model and its telemetry."""
+    def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
+        """Return the grounding and its figures."""
         config = fitting.config
         if config.reward == "correction":
             fitting = replace(
                 fitting,
-                training=what_rewards_lack(fitting.task, fitting.training),
-                held_out=what_rewards_lack(fitting.task, fitting.held_out),
+                training=residual_rewards(fitting.task, fitting.training),
+                held_out=residual_rewards(fitting.task, fitting.held_out),
             )
         torch.manual_seed(derive(fitting.seed, "grounding"))
         training = fitting.training
@@ -141,15 +143,15 @@ class HistoryFit:
         )
         model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
         metrics = _optimise(model, self.weights(config), fitting)
-        _fit_residual(model, fitting.held_out)
-        return model, metrics
+        _fit_scatter(model, fitting.held_out)
+        return HistoryGrounding(model), metrics
 
 
-def what_rewards_lack(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
-    """Take from the rewards in the windows of `episodes` what the task's own reward pays on abstract states.
+def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
+    """Subtract the task's own reward on abstract states from the rewards in the windows of `episodes`.
 
-    Where abstract states show a goal, or one out of reach, and the target goes on, nothing is lacking: there
-    simulators decide otherwise, and R_pred is not asked.
+    Where abstract states show that the goal is reached, or out of reach, but the target goes on, the residual
+    is zero: there the simulator ends the episode, and R_pred is not used.
     """
     windows, objective = episodes.windows, task.objective
     before, after, goal = (
@@ -159,15 +161,15 @@ def what_rewards_lack(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     own = objective.reward(before, after, goal, torch.zeros_like(decided))
     going_on, failing = windows.reward.unbind(-1)
     own, decided = own.reshape(going_on.shape), decided.reshape(going_on.shape)
-    asked = windows.mask.bool() & ~decided
-    lacking = torch.stack(
+    is_used = windows.mask.bool() & ~decided
+    residual = torch.stack(
         [
-            torch.where(asked & ~episodes.terminated, going_on - own, 0.0),
-            torch.where(asked & (failing != 0), failing - own, failing),
+            torch.where(is_used & ~episodes.terminated, going_on - own, 0.0),
+            torch.where(is_used & (failing != 0), failing - own, failing),
         ],
         dim=-1,
     )
-    return replace(episodes, windows=replace(windows, reward=lacking))
+    return replace(episodes, windows=replace(windows, reward=residual))
 
 
 def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:
@@ -196,18 +198,12 @@ def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
     }
 
 
-def scatter_factor(residual: Tensor) -> Tensor:
-    """Return the factor (X, X) of the Gaussian noise that scatters like `residual` (N, X)."""
-    covariance = torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=residual.device)
-    return torch.as_tensor(torch.linalg.cholesky(covariance))
-
-
 @torch.no_grad()
-def _fit_residual(model: GroundingModel, held_out: PairedEpisodes) -> None:
-    """Fit the scatter of the target around the correction, and of its heads, on episodes not trained on."""
+def _fit_scatter(model: GroundingModel, held_out: PairedEpisodes) -> None:
+    """Fit the scatter of the target around the correction, and the usual disagreement of its heads."""
     windows = held_out.windows
     latent, _ = model.encode(windows)
-    opinions = model.opinions(latent, windows.action, windows.simulated_next)
-    model.residual_factor.copy_(scatter_factor(held_out.steps(windows.next_state - opinions.mean(0))))
-    if len(opinions) > 1:
-        model.usual_disagreement.copy_(held_out.steps(model.doubt(opinions)).mean())
+    predictions = model.ensemble_predictions(latent, windows.action, windows.simulated_next)
+    model.residual_factor.copy_(scatter_factor(held_out.steps(windows.next_state - predictions.mean(0))))
+    if len(predictions) > 1:
+        model.usual_disagreement.copy_(held_out.steps(model.disagreement(predictions)).mean())

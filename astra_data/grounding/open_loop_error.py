@@ -1,4 +1,4 @@
-"""The gap report: how far raw and grounded simulator drift from the target under its own actions."""
+"""Open-loop error: how far the raw and the grounded simulator drift from the target under its own actions."""
 
 from typing import Any
 
@@ -8,64 +8,57 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.seeding import derive, generator
-from astra_data.grounding.build import hidden_before, simulator_of, start_simulator
-from astra_data.grounding.grounding_file import Grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.worlds.task import Task
-from astra_data.worlds.variation import Variation
 
 HORIZONS = (1, 10, 50, 200)
 _START_EVERY = 25
 
 
-def distances(task: Task, wrong: Tensor) -> Tensor:
-    """Return the length of errors (..., X) of abstract states in each of the task's quantities, (..., Q)."""
-    return torch.stack([wrong[..., list(entries)].norm(dim=-1) for entries in task.quantities.values()], -1)
+def distances(task: Task, error: Tensor) -> Tensor:
+    """Return the norms (..., Q) of errors (..., X) of abstract states in each of the task's quantities."""
+    return torch.stack([error[..., list(entries)].norm(dim=-1) for entries in task.quantities.values()], -1)
 
 
 @torch.no_grad()
 def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
     """Replay the actions of `episodes` open loop in both simulators and compare with the target.
 
-    Replays start every 25 steps, a grounding with a memory having seen the true history so far. Errors
-    are distances in the task's quantities after 1, 10, 50 and 200 steps; means and 95 % bootstrap intervals
-    over episodes.
+    Replays start every 25 steps, with a grounding's memory of the true history up to there. Errors are
+    distances in the task's quantities after 1, 10, 50 and 200 steps: means and 95 % bootstrap intervals over
+    episodes.
     """
     torch.manual_seed(derive(seed, "gap noise"))
-    windows = episodes.windows
-    lengths = episodes.lengths
+    windows, lengths = episodes.windows, episodes.lengths
     pairs = [
         (episode, step)
         for episode, length in enumerate(lengths.tolist())
         for step in range(0, length, _START_EVERY)
     ]
     episode, start = torch.tensor(pairs, device=lengths.device).T
-    if isinstance(grounding, Variation):
-        # The noise of its sensors is no part of where a simulator goes.
-        grounding = grounding.noiseless()
-    before = hidden_before(grounding, windows)
-    device = str(windows.state.device)
+    rows, device = torch.arange(len(pairs), device=lengths.device), str(windows.state.device)
     horizons = [horizon for horizon in HORIZONS if horizon <= int(lengths.max())]
-    raw = task.simulator(len(pairs), device)
-    raw.reset_to(windows.state[episode, start])
-    grounded = simulator_of(task, grounding, len(pairs), device)
-    start_simulator(
-        grounded,
-        windows.state[episode, start],
-        torch.arange(len(pairs), device=lengths.device),
-        windows.goal[episode, start],
-        hidden=None if before is None else before[episode, start],
-        previous_action=windows.previous_action[episode, start],
-    )
-    errors: dict[str, dict[int, Tensor]] = {"raw": {}, "grounded": {}}
+    simulators = {}
+    for name, one in {"raw": NO_GROUNDING, "grounded": grounding.for_replay()}.items():
+        simulators[name] = one.simulator(task, len(pairs), device)
+        before = one.hidden_before(windows)
+        simulators[name].start(
+            windows.state[episode, start],
+            rows,
+            windows.goal[episode, start],
+            hidden=None if before is None else before[episode, start],
+            previous_action=windows.previous_action[episode, start],
+        )
+    errors: dict[str, dict[int, Tensor]] = {name: {} for name in simulators}
     for step in range(horizons[-1]):
         now = (start + step).clamp_max(windows.mask.shape[1] - 1)
         action = windows.action[episode, now]
-        states = {"raw": raw.step(action), "grounded": grounded.step(action)}
+        states = {name: simulator.step(action) for name, simulator in simulators.items()}
         if step + 1 in horizons:
             for name, state in states.items():
-                wrong = state - windows.next_state[episode, now]
-                apart = distances(task, wrong)
+                apart = distances(task, state - windows.next_state[episode, now])
                 apart[start + step >= lengths[episode]] = torch.nan
                 errors[name][step + 1] = apart
     rng = generator(seed, "gap bootstrap")
@@ -73,13 +66,15 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     for name, by_horizon in errors.items():
         report[name] = {}
         for index, quantity in enumerate(task.quantities):
-            rows = [_interval(by_horizon[h][:, index], episode, rng) for h in horizons]
-            report[name][quantity] = dict(zip(("mean", "low", "high"), zip(*rows, strict=True), strict=True))
+            intervals = [_interval(by_horizon[h][:, index], episode, rng) for h in horizons]
+            report[name][quantity] = dict(
+                zip(("mean", "low", "high"), zip(*intervals, strict=True), strict=True)
+            )
     return report
 
 
 def _interval(errors: Tensor, episode: Tensor, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Return mean and 95 % bootstrap interval of `errors` (N,), resampling episodes (N,)."""
+    """Return the mean of `errors` (N,) and its 95 % bootstrap interval, resampling episodes (N,)."""
     values, groups = errors.cpu().numpy(), episode.cpu().numpy()
     keep = np.isfinite(values)
     counts = np.bincount(groups[keep])

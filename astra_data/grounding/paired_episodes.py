@@ -22,7 +22,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
-from astra_data.learning.networks.paired_windows import RISK_STEPS, Windows
+from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
 from astra_data.learning.recorded import draw_steps
 
 _COLUMNS = (
@@ -49,7 +49,7 @@ class PairedEpisodes:
     target_state: Tensor
     reward: Tensor
     terminated: Tensor
-    windows: Windows
+    windows: PairedWindows
     reference: str
     content_hash: str
     held_out: Tensor | None = None
@@ -85,7 +85,7 @@ class PairedEpisodes:
             target_state=padded[STATE],
             reward=reward,
             terminated=terminated,
-            windows=Windows(
+            windows=PairedWindows(
                 state=padded[ABSTRACT_STATE],
                 action=action,
                 previous_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
@@ -146,7 +146,7 @@ class PairedEpisodes:
         """Return the real steps of `values` (E, T, ...), one after another, (N, ...)."""
         return values[self.windows.mask.bool()]
 
-    def draw_windows(self, count: int, length: int) -> tuple[Windows, Tensor]:
+    def draw_windows(self, count: int, length: int) -> tuple[PairedWindows, Tensor]:
         """Draw windows of `length` steps with `draw_steps`; the mask marks only the steps that were drawn.
 
         Returns:
@@ -172,5 +172,5 @@ def _topples_soon(failed: Tensor, mask: Tensor) -> Tensor:
     return (failed.any(1, keepdim=True) & mask & (steps_left <= RISK_STEPS)).float()
 
 
-def _gather(windows: Windows, rows: Tensor | tuple[Tensor, Tensor]) -> Windows:
-    return Windows(**{name: values[rows] for name, values in vars(windows).items()})
+def _gather(windows: PairedWindows, rows: Tensor | tuple[Tensor, Tensor]) -> PairedWindows:
+    return PairedWindows(**{name: values[rows] for name, values in vars(windows).items()})

@@ -1,4 +1,4 @@
-"""Short windows of recorded episodes, and their replays in simulators with given parameters."""
+"""Replays of short windows of recorded episodes, in simulators with given parameters."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from astra_data.worlds.task import Task
 
 
 @dataclass(frozen=True)
-class Recorded:
+class ReplayWindows:
     """W windows of H steps of the target: `state` (W, X), `action` (W, H, A) and `next_state` (W, H, X)."""
 
     state: Tensor
@@ -20,30 +20,30 @@ class Recorded:
     next_state: Tensor
 
     @classmethod
-    def at(cls, episodes: PairedEpisodes, episode: Tensor, first: Tensor, length: int) -> "Recorded":
+    def at(cls, episodes: PairedEpisodes, episode: Tensor, first: Tensor, length: int) -> "ReplayWindows":
         """Cut windows of `length` steps out of `episode` (W,) from step `first` (W,) on."""
         windows, steps = episodes.windows, first[:, None] + torch.arange(length, device=first.device)
         rows = episode[:, None], steps
         return cls(windows.state[episode, first], windows.action[rows], windows.next_state[rows])
 
     @classmethod
-    def side_by_side(cls, episodes: PairedEpisodes, length: int) -> "Recorded":
+    def side_by_side(cls, episodes: PairedEpisodes, length: int) -> "ReplayWindows":
         """Cut all episodes into windows of `length` steps that do not overlap."""
         episode, first = beginnings(episodes, length)
         chosen = first % length == 0
         return cls.at(episodes, episode[chosen], first[chosen], length)
 
     def summary(self, task: Task) -> Tensor:
-        """Return what a causal model knows of windows: first state and mean command, (W, K), each about one.
+        """Return a causal model's inputs of each window: first state and mean command, (W, K), scaled to one.
 
-        Where in a maze a window begins does not matter.
+        In a maze the position is left out.
         """
         known = self.state[:, 2:] if task.plane else task.objective.observe(self.state, self.state[:, :0])
         return torch.cat([known, self.action.mean(1)], dim=-1)
 
 
 def beginnings(episodes: PairedEpisodes, length: int) -> tuple[Tensor, Tensor]:
-    """Return episode and first step, (N,) each, of every window of `length` steps.
+    """Return the episode and the first step, (N,) each, of every window of `length` steps.
 
     Raises:
         BadInputError: no episode is that long.
@@ -59,14 +59,17 @@ def beginnings(episodes: PairedEpisodes, length: int) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def trajectory_gaps(task: Task, recorded: Recorded, parameters: Tensor, seed: int) -> Tensor:
-    """Replay W windows with each of `parameters` (C, P) and the same noise; return their gaps (C, W, Q)."""
+def trajectory_gaps(task: Task, recorded: ReplayWindows, parameters: Tensor, seed: int) -> Tensor:
+    """Replay W windows with each of `parameters` (C, P) and the same noise; return their gaps (C, W, Q).
+
+    A gap is the mean distance from the recorded states over a window, in each of the task's Q quantities.
+    """
     count, length = recorded.action.shape[:2]
     simulator = task.varied_simulator(count, type(task.varied.wide)(), str(recorded.state.device))
     gaps = []
-    for context in parameters:
+    for values in parameters:
         torch.manual_seed(seed)
-        simulator.parameters = context.expand(count, -1)
+        simulator.parameters = values.expand(count, -1)
         simulator.reset_to(recorded.state)
         wrong = [simulator.step(recorded.action[:, i]) - recorded.next_state[:, i] for i in range(length)]
         gaps.append(distances(task, torch.stack(wrong)).mean(0))

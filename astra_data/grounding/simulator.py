@@ -1,70 +1,59 @@
-"""The grounded simulator: an abstract simulator corrected every step by a history model (Algorithm 2)."""
+"""The abstract simulator that episodes are run in: raw, scattered or varied; groundings correct its steps."""
 
 import torch
 from torch import Tensor
 
-from astra_data.learning.networks.grounding import GroundingModel
-from astra_data.worlds.protocols import PlacedSimulator
+from astra_data.worlds.protocols import PlacedSimulator, RememberingSimulator
+from astra_data.worlds.task import Task
+from astra_data.worlds.variation import Variation, VariedSimulator
 
 
-class GroundedSimulator:
-    """Step the simulator, correct where it landed, set it back there, and encode the history anew.
+class EpisodeSimulator:
+    """B abstract simulators. As it is, steps are the simulator's own; subclasses correct where they land.
 
     Attributes:
-        state: corrected abstract states, (B, X). latent: z, (B, Z).
-        blocked: (B,) bool, the last step or its correction was stopped at a wall.
+        simulator: the abstract simulator that is stepped; the parameters of a `VariedSimulator` are drawn
+            anew for each episode.
+        scatter: factor (X, X) of Gaussian noise that is added after each step; None for no noise.
+        latent_size: Z, of the latents that policies observe; 0 where there are none.
     """
 
-    def __init__(
-        self,
-        simulator: PlacedSimulator,
-        model: GroundingModel,
-        *,
-        scatter: Tensor | None = None,
-    ) -> None:
-        """Wrap `simulator`.
+    latent_size: int = 0
 
-        Args:
-            simulator: the abstract simulator.
-            model: a trained grounding model; only read.
-            scatter: factor (X, X) of the noise that stands for the target's scatter around the correction.
-        """
+    def __init__(self, simulator: PlacedSimulator, *, scatter: Tensor | None = None) -> None:
+        """Wrap `simulator`."""
         self.simulator = simulator
-        self.model = model
         self.scatter = scatter
-        count, device = len(simulator.state), simulator.state.device
-        shape = model.shape
-        self.hidden = torch.zeros(count, shape.latent_size, device=device)
-        self.goal = torch.zeros(count, shape.goal_size, device=device)
-        self._opinions = torch.zeros(1, count, shape.state_size, device=device)
+        self._varied = simulator if isinstance(simulator, VariedSimulator) else None
+        self._remembering = _remembering_within(simulator)
 
     @property
     def state(self) -> Tensor:
-        """The corrected abstract states, (B, X)."""
+        """The present abstract states, (B, X)."""
         return self.simulator.state
 
     @property
     def blocked(self) -> Tensor:
-        """Which were stopped at a wall, (B,) bool."""
+        """Which states were stopped at a wall in the last step, or by its correction, (B,) bool."""
         return self.simulator.blocked
 
     @property
-    def latent(self) -> Tensor:
-        """The latents (B, Z) of the histories so far."""
-        return self.model.encoder.latent(self.hidden)
+    def latent(self) -> Tensor | None:
+        """The latents (B, Z) of the histories so far; None where there are none."""
+        return None
 
     @property
-    def doubt(self) -> Tensor:
-        """By how much more than usual the correction's heads disagreed on the last step, (B,).
+    def disagreement(self) -> Tensor:
+        """By how much more than on the data an ensemble disagreed on the last step, (B,); else zero."""
+        return torch.zeros_like(self.state[:, 0])
 
-        Zero before the first step, and where there is but one head.
-        """
-        if len(self._opinions) == 1:
-            return torch.zeros_like(self._opinions[0, :, 0])
-        return (self.model.doubt(self._opinions) - 1.0).clamp_min(0.0)
+    @property
+    def parameters(self) -> Tensor | None:
+        """The varied parameters (B, P), from -1 to 1 over their ranges; None where they stay plain."""
+        varied = self._varied
+        return None if varied is None else varied.variation.normal(varied.parameters)
 
-    @torch.no_grad()
-    def reset_to(
+    def start(
         self,
         state: Tensor,
         rows: Tensor,
@@ -73,33 +62,73 @@ class GroundedSimulator:
         hidden: Tensor | None = None,
         previous_action: Tensor | None = None,
     ) -> None:
-        """Set `rows` (n,) to `state` (n, X) with `goal` (n, G), at the start or within a known history.
+        """Start episodes in `rows` (n,), either new ones or within a known history.
 
         Args:
-            state: abstract states.
-            rows: which.
-            goal: their goals.
-            hidden: hidden states (n, Z) of the history before `state`, by default none.
-            previous_action: the actions (n, A) that led to `state`, by default zero.
+            state: abstract states, (n, X).
+            rows: which of the B simulators.
+            goal: (n, G).
+            hidden: what the grounding remembers of the history before `state`, (n, H); by default nothing.
+            previous_action: the actions (n, A) that led to `state`; by default zero.
         """
         self.simulator.reset_to(state, rows)
-        self.goal[rows] = goal
-        if previous_action is None:
-            previous_action = torch.zeros(len(state), self.model.shape.action_size, device=state.device)
-        if hidden is None:
-            hidden = torch.zeros(len(state), self.model.shape.latent_size, device=state.device)
-        self.hidden[rows] = self.model.encoder.step(
-            self.model.encoder_input(state, goal, previous_action), hidden
-        )
+        varied = self._varied
+        if varied is not None:
+            varied.parameters = varied.variation.redraw(varied.parameters, rows)
 
-    @torch.no_grad()
     def step(self, action: Tensor) -> Tensor:
-        """Apply `action` (B, A); return the corrected state (B, X)."""
+        """Apply `action` (B, A); return the new states (B, X)."""
         before = self.simulator.state
-        self._opinions = self.model.opinions(self.latent, action, self.simulator.step(action))
-        corrected = self._opinions.mean(0)
+        landed = self.simulator.step(action)
+        return landed if self.scatter is None else self._settle(before, landed)
+
+    def _settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Scatter `landed` (B, X) and move there from `before` (B, X), as far as walls allow."""
         if self.scatter is not None:
-            corrected = corrected + torch.randn_like(corrected) @ self.scatter.T
-        state = self.simulator.settle(before, corrected)
-        self.hidden = self.model.encoder.step(self.model.encoder_input(state, self.goal, action), self.hidden)
+            landed = landed + torch.randn_like(landed) @ self.scatter.T
+        return self.simulator.settle(before, landed)
+
+    def topple_risk(self) -> Tensor | None:
+        """Return the probability (B,) that the target toppled in the last step; None where unknown."""
+        return None
+
+    def predicted_reward(self, own: Tensor) -> Tensor | None:
+        """Return the target's reward (B,) of the last step as predicted; None where nothing predicts it.
+
+        `own` (B,) is the task's own reward on abstract states, to which residual rewards are added.
+        """
+        return None
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all that `load_state_dict` needs to go on from here."""
+        state = {"state": self.state}
+        if self._varied is not None:
+            state |= {"true": self._varied.true_state, "parameters": self._varied.parameters}
+        if self._remembering is not None:
+            state["memory"] = self._remembering.memory
         return state
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state`."""
+        self.simulator.reset_to(state["state"])
+        if self._varied is not None:
+            self._varied.true_state = state["true"].clone()
+            self._varied.parameters = state["parameters"].clone()
+        if self._remembering is not None:
+            self._remembering.memory = state["memory"].clone()
+
+
+def _remembering_within(simulator: object) -> RememberingSimulator | None:
+    """Return the innermost simulator if its steps depend on more than its states."""
+    while hasattr(simulator, "simulator"):
+        simulator = simulator.simulator
+    return simulator if isinstance(simulator, RememberingSimulator) else None
+
+
+def abstract_simulator(
+    task: Task, num_envs: int, device: str, variation: Variation | None
+) -> PlacedSimulator:
+    """Build `num_envs` abstract simulators of `task`; with a `variation`, their parameters vary."""
+    if variation is None:
+        return task.simulator(num_envs, device)
+    return task.varied_simulator(num_envs, variation, device)

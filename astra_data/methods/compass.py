@@ -21,7 +21,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.fit import Fitting
-from astra_data.grounding.replays import Recorded, beginnings, trajectory_gaps
+from astra_data.grounding.parameters import IdentifiedParameters
+from astra_data.grounding.replays import ReplayWindows, beginnings, trajectory_gaps
 from astra_data.learning.networks.causal import CausalConfig, descend, fit_causes
 from astra_data.methods.method import Method, Table
 from astra_data.training.train import InSimulator
@@ -104,7 +105,7 @@ def _within(value: float, ends: tuple[float, float]) -> float:
     return min(max(value, ends[0]), ends[1])
 
 
-def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
+def identify(fitting: Fitting) -> tuple[IdentifiedParameters, dict[str, Any]]:
     """Find the parameters with which replays come closest to the recorded episodes.
 
     Every iteration replays windows with parameters from a box, fits a causal model to the gaps, moves the
@@ -124,7 +125,7 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
     ranges = config.of_kind(type(wide))
     if not set(ranges.steering).intersection(_varied(ranges)):
         raise BadInputError(f"[compass]: expected a range for at least one of {', '.join(ranges.steering)}")
-    held_out = Recorded.side_by_side(fitting.held_out, config.window)
+    held_out = ReplayWindows.side_by_side(fitting.held_out, config.window)
 
     def held_out_gap(point: Mapping[str, float]) -> dict[str, float]:
         at = parameters_at(point, type(ranges)).unsqueeze(0).to(fitting.device)
@@ -147,7 +148,7 @@ def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
     found = {name: getattr(search.box, name) for name in ranges.steering}
     if config.policy_at == "point":
         found = {name: (value, value) for name, value in search.point.items()}
-    return ranges.model_copy(update=found), {
+    return IdentifiedParameters(ranges.model_copy(update=found)), {
         "replays_per_second": config.iterations * replays / stopwatch.seconds,
         **stopwatch.spent(),
         "mask": search.found[0]["mask"],
@@ -167,7 +168,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     torch.manual_seed(derive(fitting.seed, f"{name} windows"))
     episode, first = beginnings(fitting.training, config.window)
     drawn = torch.randint(len(episode), (config.windows,), device=device)
-    recorded = Recorded.at(fitting.training, episode[drawn], first[drawn], config.window)
+    recorded = ReplayWindows.at(fitting.training, episode[drawn], first[drawn], config.window)
     contexts, noise = box.draw(config.contexts, device), derive(fitting.seed, f"{name} noise")
     gaps = trajectory_gaps(fitting.task, recorded, contexts, noise)
     of_window = gaps.mean(0)

@@ -11,8 +11,10 @@ from astra_data.core.config import Config, Count, Positive
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.diagnostics import correction_r2
-from astra_data.grounding.fit import Fitting, scatter_factor
+from astra_data.grounding.fit import Fitting
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.raw import scatter_factor
+from astra_data.grounding.residual import ResidualGrounding
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.methods.method import Method, Table
 
@@ -30,7 +32,7 @@ class GolemoConfig(Config):
     """Of Adam, constant."""
 
 
-def fit_residual(fitting: Fitting) -> tuple[ResidualModel, dict[str, Any]]:
+def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:
     """Fit the residual model to whole episodes; return it and its telemetry.
 
     The squared error is of residuals divided by their deviation in the training episodes.
@@ -48,7 +50,7 @@ def fit_residual(fitting: Fitting) -> tuple[ResidualModel, dict[str, Any]]:
     held_out = fitting.held_out
     residual = held_out.windows.next_state - _corrected(model, held_out)
     model.residual_factor.copy_(scatter_factor(held_out.steps(residual)))
-    return model, metrics
+    return ResidualGrounding(model), metrics
 
 
 def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> dict[str, Any]:

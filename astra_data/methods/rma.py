@@ -32,7 +32,7 @@ class TeacherThenStudent(InSimulator):
         if not isinstance(config, PpoTrainConfig):
             raise BadInputError(f'rma: expected train.learner "ppo", got "{config.learner}"')
         settings = training.settings if isinstance(training.settings, RmaConfig) else RmaConfig()
-        env, simulation = self.world(training, tells_parameters=True)
+        env, simulation = self.world(training, shows_parameters=True)
         torch.manual_seed(derive(seed, "policy"))
         shape = AdaptiveShape(
             observation_size=env.observation_size - env.parameter_count,

@@ -14,13 +14,12 @@ from astra_data.core.digest import file_digest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
-from astra_data.grounding.grounding_file import load_history_model
+from astra_data.grounding.files import load_history_model, save_target_encoder
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.target_encoder_file import save_target_encoder
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
 from astra_data.learning.networks.grounding import GroundingModel
-from astra_data.learning.networks.paired_windows import Windows
+from astra_data.learning.networks.paired_windows import PairedWindows
 
 _KEEP_EVERY = 50
 
@@ -31,7 +30,7 @@ class AlignConfig(DescentConfig):
     updates: Count = 600
     """Gradient updates in all."""
     batch_windows: Count = 32
-    """Windows per update."""
+    """PairedWindows per update."""
     window: Count = 100
     """Steps per window, in backpropagation through time."""
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
@@ -112,7 +111,7 @@ def align(
 
 
 def _losses(
-    model: GroundingModel, encoder: TargetEncoder, windows: Windows, state: Tensor, bandwidths: Tensor
+    model: GroundingModel, encoder: TargetEncoder, windows: PairedWindows, state: Tensor, bandwidths: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the mean MMD² between p^s_i and p^t_i, and the mean squared distance of paired latents."""
     with torch.no_grad():

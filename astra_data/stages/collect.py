@@ -33,8 +33,8 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
-from astra_data.grounding.grounding_file import load_grounding
-from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.behaviors import Behavior, PolicyBehavior, RandomCommands, WallWatch
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.worlds.batched import TargetEnv
@@ -197,9 +197,9 @@ def _behavior(
         return PolicyBehavior(deploy(task, policy)), told
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
-    model = load_grounding(files["grounding"]) if "grounding" in files else None
+    grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
     encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
-    deployed = deploy(task, trained, model, encoder)
+    deployed = deploy(task, trained, grounding, encoder)
     if deployed.observation_size != trained.policy.shape.observation_size:
         raise BadInputError(
             f"{files['policy']} sees {trained.policy.shape.observation_size} values, the task shows "

@@ -24,9 +24,9 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.build import simulator_of
-from astra_data.grounding.grounding_file import Grounding, load_grounding
-from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
 from astra_data.training.build_env import WorldParts, training_world
@@ -114,7 +114,9 @@ def evaluate(
         shown_abstract = True
     else:
         trained = PolicyFile.load(policy / "policy.safetensors")
-        model = load_grounding(grounding / "grounding.safetensors") if grounding else None
+        model: Grounding = NO_GROUNDING
+        if grounding:
+            model = load_grounding(grounding / "grounding.safetensors")
         source = deploy(world, trained, model)
         begin = partial(_start, source, source.act_in_simulator)
         robots = {"source": partial(_start, source, source.act)}
@@ -211,18 +213,18 @@ def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str
 
 
 def _own_world(
-    task: Task, simulation: Simulation, grounding: Grounding | None, config: EvaluateConfig
+    task: Task, simulation: Simulation, grounding: Grounding, config: EvaluateConfig
 ) -> SimulatorWorld:
     parts = WorldParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
     return training_world(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
 
 
 def _shared_worlds(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorWorld]:
-    groundings: dict[str, Grounding | None] = {"raw": None}
+    groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
         groundings["grounded"] = load_grounding(reference / "grounding.safetensors")
     return {
-        name: SimulatorWorld(task.objective, simulator_of(task, grounding, config.episodes, "cpu"))
+        name: SimulatorWorld(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()
     }
 

@@ -9,8 +9,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.files import save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
-from astra_data.grounding.grounding_file import save_grounding
 from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named

@@ -10,8 +10,9 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.files import load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
@@ -73,7 +74,7 @@ def train(
     episodes = PairedEpisodes.load(dataset, device)
     grounding_file = grounding and grounding / "grounding.safetensors"
     initial_file = initial and initial / "policy.safetensors"
-    correction = load_grounding(grounding_file, device) if grounding_file else None
+    correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
     told = as_json(
         task=task,

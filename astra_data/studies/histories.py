@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
-from astra_data.learning.networks.paired_windows import Windows
+from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.studies.predictors import Predictor, bounded
 from astra_data.studies.walks import Stretch
 
@@ -72,7 +72,7 @@ class HistoryModel(Predictor):
             return stretch.motion.new_zeros(())
         motion, simulated = stretch.past_motion, stretch.past_simulated
         nearer = _nearer(stretch.past_ball)
-        windows = Windows(
+        windows = PairedWindows(
             state=motion[:, :-1],
             action=stretch.past_action[:, 1:],
             previous_action=stretch.past_action[:, :-1],

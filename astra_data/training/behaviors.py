@@ -1,4 +1,4 @@
-"""Behaviours: what acts in the target while data is collected."""
+"""Behaviours: controllers that act in the target while data is collected."""
 
 from typing import Protocol
 
@@ -13,7 +13,7 @@ from astra_data.worlds.task import Task
 
 _FORESIGHT_S = 1.0
 _CHOICES = 16
-"""Commands that somebody who steers clear of walls chooses from."""
+"""Random commands to choose one from that stays clear of walls."""
 
 
 class Behavior(Protocol):
@@ -29,15 +29,15 @@ class Behavior(Protocol):
 
 
 class WallWatch:
-    """Foresees in the abstract simulator how near commands lead to the walls within a second."""
+    """Predicts with the abstract simulator how close to walls commands lead within a second."""
 
     def __init__(self, task: Task, clearance_m: float) -> None:
-        """Watch that robots stay `clearance_m` away from the walls of the task's maze."""
+        """Keep robots `clearance_m` away from the walls of the task's maze."""
         self.clearance_m = clearance_m
         self._task, self._maze = task, task.maze
 
     def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the least clearance in m (B, K) on the ways of `commands` (B, K, A) from `state` (B, S)."""
+        """Return the least clearance in m (B, K) if `commands` (B, K, A) are held from `state` (B, S)."""
         task, (count, choices, _) = self._task, commands.shape
         simulator = task.simulator(count * choices)
         simulator.reset_to(task.abstraction(state).repeat_interleave(choices, dim=0))
@@ -53,7 +53,7 @@ class RandomCommands:
     """Commands from U[-1, 1] per axis, each held for a random number of steps."""
 
     def __init__(self, action_size: int, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
-        """Hold commands (A,) from the fewest to the most steps, or until `watch` foresees a wall."""
+        """Hold commands (A,) for `hold_steps` (fewest, most), or until `watch` predicts a wall."""
         self._size = action_size
         self._hold_steps = hold_steps
         self._watch = watch
@@ -65,7 +65,7 @@ class RandomCommands:
         self._left = np.zeros(count, dtype=int)
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return commands (B, A); goals do not matter, nor do states unless walls are watched for."""
+        """Return commands (B, A); goals are ignored, and so are states unless walls are watched for."""
         over = self._left == 0
         if self._watch is not None:
             over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
@@ -77,7 +77,10 @@ class RandomCommands:
         return torch.from_numpy(self._command).float()
 
     def _drawn(self, state: Tensor, due: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Draw commands (n, A) for the robots `due` (n,): of some, the first that stays clear or clearest."""
+        """Draw commands (n, A) for the robots `due` (n,).
+
+        With a watch, take the first of 16 that stays clear of walls, or else the clearest.
+        """
         if self._watch is None:
             return self._rng.uniform(-1.0, 1.0, (len(due), self._size))
         choices = self._rng.uniform(-1.0, 1.0, (len(due), _CHOICES, self._size))

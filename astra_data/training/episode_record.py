@@ -1,4 +1,4 @@
-"""What happened in N episodes that were run side by side."""
+"""Outcomes of N episodes that are run side by side."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Outcome:
-    """What happened in N episodes: a list per quantity, and every path.
+    """Outcomes of N episodes: a list per quantity, and every path.
 
     Attributes:
         success: 1 or 0.
@@ -38,14 +38,14 @@ class Outcome:
 
 
 class EpisodeRecord:
-    """Follow N episodes until each has ended, in success or badly.
+    """Record N episodes until each has ended, in success or failure.
 
     Attributes:
-        active: (N,) bool, not ended yet. total_steps: of all episodes so far.
+        active: (N,) bool, not ended yet. total_steps: of all episodes together so far.
     """
 
     def __init__(self, position: Tensor) -> None:
-        """Begin at `position` (N, 2 K)."""
+        """Start at `position` (N, 2 K)."""
         count = len(position)
         self.active = torch.ones(count, dtype=torch.bool)
         self.total_steps = 0
@@ -53,7 +53,7 @@ class EpisodeRecord:
         self._positions = [position.clone()]
 
     def add(self, position: Tensor, reward: Tensor, success: Tensor, failed: Tensor, contact: Tensor) -> None:
-        """Add one step; what ended episodes do is ignored."""
+        """Add one step; rows of ended episodes are ignored."""
         active = self.active
         self._success += success & active
         self._failed += failed & active
@@ -65,7 +65,7 @@ class EpisodeRecord:
         self.active = active & ~success & ~failed
 
     def outcome(self) -> Outcome:
-        """Return what happened so far."""
+        """Return the outcomes so far."""
         return Outcome(
             success=self._success.tolist(),
             failed=self._failed.tolist(),

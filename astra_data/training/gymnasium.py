@@ -1,8 +1,8 @@
-"""Gymnasium's faces of the batched worlds: an `Env` of one robot and a `VectorEnv` of B.
+"""Gymnasium adapters of the batched environments: an `Env` of one robot and a `VectorEnv` of B.
 
 Observations are (31,) in the target (state, goal) and (8,) in the abstract simulator (see
-`world.policy_observation`); actions are velocity commands (2,) in [-1, 1] m/s. `info` tells of the step
-whether the goal was reached ("success") and whether a wall was touched ("wall_contact").
+`simulator_env.policy_observation`); actions are velocity commands (2,) in [-1, 1] m/s. `info` has whether the
+step reached the goal ("success") and whether it touched a wall ("wall_contact").
 """
 
 from typing import Any, Protocol
@@ -16,7 +16,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.grounding.build import Simulator
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.training.simulator_env import SimulatorWorld
 from astra_data.worlds.batched import BatchedEnv, Step
 from astra_data.worlds.objective import Objective
@@ -41,8 +42,8 @@ class World(BatchedEnv, Protocol):
 class SeededSimulatorWorld(SimulatorWorld):
     """The task in an abstract simulator, with starts and goals from a seed of its own."""
 
-    def __init__(self, objective: Objective, simulator: Simulator) -> None:
-        """Put the task into `simulator`."""
+    def __init__(self, objective: Objective, simulator: EpisodeSimulator) -> None:
+        """Set the task in `simulator`."""
         super().__init__(objective, simulator)
         self.reseed(_fresh_seed())
 
@@ -63,10 +64,10 @@ class SeededSimulatorWorld(SimulatorWorld):
 
 
 class WorldEnv(gymnasium.Env[Array, Array]):
-    """One row of a world. Nothing is cut off here: `gymnasium.make` adds the time limit."""
+    """One row of a batched environment. There is no time limit here: `gymnasium.make` adds it."""
 
     def __init__(self, world: World) -> None:
-        """Show `world`, of one row."""
+        """Wrap `world`, which has one row."""
         self.world = world
         self.observation_space, self.action_space = _spaces(world)
 
@@ -87,7 +88,7 @@ class WorldEnv(gymnasium.Env[Array, Array]):
 
 
 class WorldVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
-    """All rows of a world; a finished one starts anew in the same step.
+    """All rows of a batched environment; a finished one starts anew in the same step.
 
     Its last observation and info are in the infos "final_obs" and "final_info", as in `SyncVectorEnv`.
     """
@@ -95,7 +96,7 @@ class WorldVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as Gymnasium declares it
 
     def __init__(self, world: World, max_episode_steps: int) -> None:
-        """Show `world`, whose episodes are truncated after `max_episode_steps`."""
+        """Wrap `world`; its episodes are truncated after `max_episode_steps`."""
         self.world = world
         self.num_envs = world.num_envs
         self.max_episode_steps = max_episode_steps
@@ -107,7 +108,7 @@ class WorldVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start all episodes, from one seed for all (of a list, the first); `options` are not used."""
+        """Start all episodes from one seed (of a list, the first); `options` are not used."""
         first = seed[0] if isinstance(seed, list) else seed
         super().reset(seed=first)
         if first is not None:
@@ -172,10 +173,11 @@ def ant_maze_vector(
 def point_maze(task: str) -> WorldEnv:
     """Build one abstract environment of `task`."""
     found = task_named(task)
-    return WorldEnv(SeededSimulatorWorld(found.objective, found.simulator(1)))
+    return WorldEnv(SeededSimulatorWorld(found.objective, NO_GROUNDING.simulator(found, 1)))
 
 
 def point_maze_vector(num_envs: int, task: str, max_episode_steps: int) -> WorldVectorEnv:
     """Build `num_envs` abstract environments of `task`."""
     found = task_named(task)
-    return WorldVectorEnv(SeededSimulatorWorld(found.objective, found.simulator(num_envs)), max_episode_steps)
+    simulator = NO_GROUNDING.simulator(found, num_envs)
+    return WorldVectorEnv(SeededSimulatorWorld(found.objective, simulator), max_episode_steps)

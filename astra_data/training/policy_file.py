@@ -1,4 +1,4 @@
-"""Policies on disk: one safetensors file with the networks and how to put them to work."""
+"""Policies on disk: one safetensors file with the networks and all that is needed to run them."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Any
 from torch import Tensor
 
 from astra_data.core.checkpoint import save_tensors, understood
-from astra_data.grounding.grounding_file import Grounding
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
-from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.training.build_env import WorldConfig
@@ -33,8 +33,8 @@ class Simulation:
     Attributes:
         thinness: of the data, (height, width); None where there is no maze.
         scatter: factor of the noise added in training, (X, X); zeros where there was none.
-        world: the switches of the training world.
-        variation: of the simulator's parameters from episode to episode.
+        world: the switches of the environment.
+        variation: ranges of the simulator's parameters, drawn for each episode.
     """
 
     thinness: Tensor | None
@@ -49,10 +49,10 @@ class PolicyFile:
 
     Attributes:
         policy: the networks.
-        simulation: where it was trained; None for a policy trained in the target or on data alone.
-        dataset, content_hash: the dataset that everything was learned from; None for one that was learned
-            from none, to collect one.
-        observed: what it is shown of the target.
+        simulation: the simulator that it was trained in; None if it was trained in the target, or on data.
+        dataset, content_hash: the dataset that everything was learned from; None for a policy that was
+            trained to collect one.
+        observed: which part of the target's state it observes.
     """
 
     policy: Policy
@@ -64,7 +64,7 @@ class PolicyFile:
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
         tensors = {f"policy.{name}": tensor for name, tensor in self.policy.state_dict().items()}
-        told: dict[str, Any] = {
+        metadata: dict[str, Any] = {
             "kind": next(kind for kind, (made, _) in _KINDS.items() if type(self.policy) is made),
             "shape": asdict(self.policy.shape),
             "dataset": self.dataset,
@@ -76,22 +76,22 @@ class PolicyFile:
             if self.simulation.thinness is not None:
                 tensors["thinness"] = self.simulation.thinness
             variation = self.simulation.variation
-            told["simulation"] = {
+            metadata["simulation"] = {
                 "world": self.simulation.world.model_dump(mode="json"),
                 "variation": variation.model_dump() if variation else None,
             }
-        save_tensors(path, tensors, told)
+        save_tensors(path, tensors, metadata)
 
     @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> "PolicyFile":
+    def load(cls, path: Path | str, device: str = "cpu") -> "PolicyFile":
         """Read a policy; its parameters are frozen.
 
         Raises:
-            BadInputError: it is something else, or from an older version.
+            BadInputError: the file is missing, holds something else, or is from an older version.
         """
-        with understood(path, "a policy", _KINDS, device) as (tensors, told):
-            shape = told["shape"] | {"hidden_sizes": tuple(told["shape"]["hidden_sizes"])}
-            made, shaped = _KINDS[told["kind"]]
+        with understood(Path(path), "a policy", _KINDS, device) as (tensors, metadata):
+            shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
+            made, shaped = _KINDS[metadata["kind"]]
             policy = made(shaped(**shape))
             prefix = "policy."
             policy.load_state_dict(
@@ -102,15 +102,15 @@ class PolicyFile:
                 }
             )
             simulation = None
-            if said := told.get("simulation"):
-                varied = said["variation"]
+            if recorded := metadata.get("simulation"):
+                variation = recorded["variation"]
                 simulation = Simulation(
                     tensors.get("thinness"),
                     tensors["scatter"],
-                    WorldConfig(**said["world"]),
-                    Variation.of_json(varied) if varied else None,
+                    WorldConfig(**recorded["world"]),
+                    Variation.of_json(variation) if variation else None,
                 )
-            read = cls(policy, simulation, told["dataset"], told["hash"], told["observed"])
+            read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
         policy.to(device).requires_grad_(False)
         return read
 
@@ -118,15 +118,15 @@ class PolicyFile:
 def deploy(
     task: Task,
     trained: PolicyFile,
-    grounding: Grounding | None = None,
+    grounding: Grounding = NO_GROUNDING,
     target_encoder: TargetEncoder | None = None,
 ) -> DeployedPolicy:
-    """Return the policy, ready to be started; its latents, if any, come from ψ^t, or from ψ^s without one."""
+    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
     world = trained.simulation.world if trained.simulation else WorldConfig()
     return DeployedPolicy(
         task,
         trained.policy,
-        grounding if isinstance(grounding, GroundingModel) else None,
+        grounding.encoder,
         target_encoder,
         command_limit_m_s=world.command_limit_m_s,
         observed=trained.observed,

@@ -1,4 +1,4 @@
-"""Policies that were stopped early: better than chance, far from good."""
+"""Suboptimal policies, to collect data with: trained in the target, and stopped early."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -24,23 +24,23 @@ from astra_data.worlds.task import Task
 
 _PPO_ENVS = 128
 _SAC_ENVS = 32
-"""Targets that they are trained in."""
+"""Target environments stepped side by side."""
 
 _SAC = SacConfig(discount=0.99, reward_scale=0.1, learning_rate=3e-4)
-"""With which the humanoid learns to stay up: rewards are 5 a step there."""
+"""Settings with which the humanoid learns to stay up; its rewards are 5 a step."""
 _SAC_SIZES = (256, 256)
 """Hidden layers of actor and critics."""
 
-type Told = dict[str, Any]
+type Metadata = dict[str, Any]
 """What a dataset records about the behaviour."""
 
 _TRIALS = 32
-"""Episodes after each iteration, which tell how long they last by now."""
+"""Test episodes after each iteration."""
 
 
 def suboptimal_by_ppo(
     task: Task, *, steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
-) -> tuple[PolicyFile, Told]:
+) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
 
     A checkpoint in `folder` lets the same call go on after an interruption.
@@ -58,7 +58,7 @@ def suboptimal_by_ppo(
         return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
 
     spent = _train(ppo, world, judge, folder, progress)
-    return _finished(policy, "abstract"), _told(ppo, policy, config, spent)
+    return _finished(policy, "abstract"), _metadata(ppo, policy, config, spent)
 
 
 def suboptimal_by_sac(
@@ -70,7 +70,7 @@ def suboptimal_by_sac(
     folder: Path,
     num_threads: int | None,
     progress: Progress,
-) -> tuple[PolicyFile, Told]:
+) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory by SAC in the target, on its full state.
 
     Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest. A checkpoint in
@@ -80,7 +80,7 @@ def suboptimal_by_sac(
         the policy, and how it was trained.
 
     Raises:
-        BadInputError: success ends the task's episodes, so that how long they last tells nothing.
+        BadInputError: the task's episodes end in success, so that lasting long is not good.
     """
     if not task.objective.is_lasting:
         raise BadInputError(f"in {task.name} good episodes are short: take 'suboptimal_ppo'")
@@ -96,7 +96,7 @@ def suboptimal_by_sac(
         return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
 
     spent = _train(sac, world, judge, folder, progress)
-    return _finished(actor, "full"), _told(sac, actor, config, spent)
+    return _finished(actor, "full"), _metadata(sac, actor, config, spent)
 
 
 def _train(
@@ -106,10 +106,10 @@ def _train(
     folder: Path,
     progress: Progress,
 ) -> dict[str, float]:
-    """Train until `judge`, given the figures of an iteration, says that a share of 1 is done, and a note.
+    """Train until `judge`, given the figures of an iteration, returns a share done of 1, with a note.
 
     Returns:
-        the time that it took, with that before an interruption.
+        the time spent, including that before an interruption.
     """
 
     def go_on(state: dict[str, Any]) -> None:
@@ -128,9 +128,9 @@ def _train(
 
 
 def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:
-    """Return how many steps episodes of the policy last that draws its actions, on average.
+    """Return how many steps episodes last on average with actions drawn from the policy.
 
-    Episodes that end while it learns tell that too late: they began when it was worse.
+    Training episodes would underestimate it: they began when the policy was worse.
     """
     behavior, task = PolicyBehavior(deployed), deployed.task
     env = task.target(_TRIALS, seed=derive(seed, "starts"), num_threads=num_threads)
@@ -149,7 +149,7 @@ def _finished(policy: Policy, observed: Observed) -> PolicyFile:
     return PolicyFile(policy.requires_grad_(False), None, None, None, observed)
 
 
-def _told(learner: Ppo | Sac, policy: Policy, config: Config, spent: Mapping[str, float]) -> Told:
+def _metadata(learner: Ppo | Sac, policy: Policy, config: Config, spent: Mapping[str, float]) -> Metadata:
     sizes = list(policy.shape.hidden_sizes)
     settings = {"num_envs": learner.env.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
     return {"trained_steps": learner.steps, "learner": settings, "spent": spent}

@@ -1,4 +1,4 @@
-"""The task in the target itself, seen as a policy sees it: where policies are trained without a simulator."""
+"""The task in the target itself, with a policy's observations: to train policies without a simulator."""
 
 from dataclasses import dataclass
 
@@ -33,9 +33,14 @@ class TargetStarts:
 class TargetWorld:
     """B target environments whose observation (B, O) is made of their state and the goal.
 
-    The physics runs on the CPU, whatever the device that observations are on and actions come from. All
-    randomness comes from torch's global generator.
+    The physics runs on the CPU, whatever the device of observations and actions. All randomness comes from
+    torch's global generator.
+
+    Attributes:
+        penalty_scale: without effect, as there are no penalties here.
     """
+
+    penalty_scale = 1.0
 
     def __init__(
         self,
@@ -53,7 +58,7 @@ class TargetWorld:
         Args:
             task: the task.
             num_envs: B.
-            observed: whether φ of the state is shown, or that state in full.
+            observed: whether φ of the state is observed, or the full state.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
             device: torch device of observations and actions.
@@ -92,7 +97,7 @@ class TargetWorld:
         return target_observation(self._task, env.state, env.goal, None, self._observed).to(self._device)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return everything that a later `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to go on from here."""
         return self._env.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:

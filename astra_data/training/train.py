@@ -1,12 +1,12 @@
-"""Training: what a method is given to learn a policy from, and the way that most methods take.
+"""Train a policy: what a method is given to do it, and how most methods do it.
 
-That way is PPO, or SAC, in the abstract simulator: raw, varied, or as the method's grounding makes it
+Most train by PPO, or by SAC, in the abstract simulator: raw, varied, or corrected by the method's grounding
 (Algorithm 2).
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal, Protocol, Self
@@ -19,8 +19,8 @@ from astra_data.core.config import Config, Count, Number, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
-from astra_data.grounding.grounding_file import Grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import Grounding
 from astra_data.learning.learner import Learner
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.policy import Policy, PolicyShape
@@ -40,11 +40,16 @@ class TrainConfig(WorldConfig):
     """How policies are trained, but for the learner's own settings."""
 
     num_envs: Count = 256
-    """Worlds stepped side by side."""
+    """Environments stepped side by side."""
     hidden_sizes: tuple[Count, ...] = (64, 64)
-    """Of actor and critic."""
+    """Hidden layers of actor and critic."""
     memory_size: Number = 64
-    """Of the policy's own GRU, where no grounding provides a latent."""
+    """Size of the policy's own GRU, where no grounding provides a latent."""
+
+    @property
+    def imitates(self) -> bool:
+        """Whether the learner also imitates recorded actions."""
+        return False
 
 
 class PpoTrainConfig(TrainConfig, PpoConfig):
@@ -53,6 +58,20 @@ class PpoTrainConfig(TrainConfig, PpoConfig):
     learner: Literal["ppo"] = "ppo"
     """Proximal policy optimisation."""
 
+    def make_learner(
+        self,
+        env: BatchedEnv,
+        shape: PolicyShape,
+        device: str,
+        *,
+        horizon: int,
+        seed: int,
+        recorded: Recorded | None,
+    ) -> Ppo:
+        """Build the learner and a new policy of `shape`; nothing `recorded` is imitated."""
+        policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(device)
+        return Ppo(env, policy, self, horizon=horizon, seed=seed)
+
 
 class SacTrainConfig(TrainConfig, SacConfig):
     """Training by SAC."""
@@ -60,7 +79,25 @@ class SacTrainConfig(TrainConfig, SacConfig):
     learner: Literal["sac"]
     """Soft actor-critic."""
     num_envs: Count = 32
-    """Worlds stepped side by side."""
+    """Environments stepped side by side."""
+
+    @property
+    def imitates(self) -> bool:
+        """Whether the learner also imitates recorded actions."""
+        return self.imitation_weight > 0
+
+    def make_learner(
+        self,
+        env: BatchedEnv,
+        shape: PolicyShape,
+        device: str,
+        *,
+        horizon: int,
+        seed: int,
+        recorded: Recorded | None,
+    ) -> Sac:
+        """Build the learner and a new policy of `shape`, which imitates what was `recorded`."""
+        return Sac(env, SoftActor(shape).to(device), self, horizon=horizon, seed=seed, recorded=recorded)
 
     @model_validator(mode="after")
     def _learns_from_one_reward(self) -> Self:
@@ -70,7 +107,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
 
 
 def _learner(settings: object) -> str:
-    """Return which of the tables below `settings` are; by default PPO's."""
+    """Return the tag of the model below that `settings` are for; by default PPO."""
     if isinstance(settings, Mapping):
         return choice(str(settings.get("learner", "ppo")))
     return choice(str(getattr(settings, "learner", "ppo")))
@@ -80,21 +117,21 @@ AnyTrainConfig = Annotated[
     Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
     Discriminator(_learner),
 ]
-"""Training as its `learner` says, by default by PPO."""
+"""Training by the `learner` that is named, by default PPO."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What a method has to learn a policy from.
+    """What a method is given to train a policy.
 
     Attributes:
         task: the task. config: the recipe's `[train]`, or `[plus]`.
         settings: the method's own table of the recipe, if it has one.
-        episodes: paired. grounding: what the method's fit gave, if it fits anything.
+        episodes: paired episodes. grounding: of the method; `NO_GROUNDING` where it fits none.
         initial: the policy that the method goes on from, if it names one.
         seed: of all randomness. device: of the networks.
         folder: for checkpoints; what is left in it becomes part of the artefact.
-        progress: told the share done, the rate and the figure that matters.
+        progress: called with the share done and a note.
         num_threads: of the target's physics, for methods that train in the target; None is one per core.
     """
 
@@ -102,7 +139,7 @@ class Training:
     config: PpoTrainConfig | SacTrainConfig
     settings: Config | None
     episodes: PairedEpisodes
-    grounding: Grounding | None
+    grounding: Grounding
     initial: PolicyFile | None
     seed: int
     device: str
@@ -112,7 +149,7 @@ class Training:
 
     @property
     def simulated_steps(self) -> int:
-        """After how many steps simulated episodes start anew."""
+        """Steps after which simulated episodes are cut off."""
         return self.config.episode_steps or self.task.objective.horizon
 
 
@@ -121,10 +158,16 @@ Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]
 
 
 class ResumableEnv(BatchedEnv, Protocol):
-    """A world that a training can be resumed in."""
+    """A batched environment in which a training can be resumed.
+
+    Attributes:
+        penalty_scale: factor on penalties in the reward, which the training may ramp up.
+    """
+
+    penalty_scale: float
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return everything that a later `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to go on from here."""
         ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
@@ -138,8 +181,8 @@ class InSimulator:
 
     Attributes:
         reward: where the reward comes from, unless the recipe says.
-        ranges: which of the task's ranges the simulator's parameters are drawn from, unless a grounding is a
-            variation or the method's own settings are one; None where they stay plain.
+        ranges: which of the task's ranges the simulator's parameters are drawn from, unless the grounding has
+            ranges or the method's own settings are ranges; None where they stay plain.
     """
 
     reward: RewardSource = "abstract"
@@ -151,15 +194,15 @@ class InSimulator:
         memory_size = 0 if env.latent_size else training.config.memory_size
         episodes = training.episodes
         config, recorded = training.config, None
-        if isinstance(config, SacTrainConfig) and config.imitation_weight:
+        if config.imitates:
             recorded = recorded_steps(training.task, episodes, training.grounding)
         policy, curve = train_in(env, config, memory_size, training, training.simulated_steps, recorded)
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
     def world(
-        self, training: Training, *, tells_parameters: bool = False
+        self, training: Training, *, shows_parameters: bool = False
     ) -> tuple[SimulatorWorld, Simulation]:
-        """Return the world to train in, and what a policy file says of it."""
+        """Return the environment to train in, and what a policy file records about it."""
         config, settings = training.config, training.settings
         switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
         switches = switches.model_copy(update={"reward": switches.reward or self.reward})
@@ -173,7 +216,7 @@ class InSimulator:
             training.grounding,
             num_envs=config.num_envs,
             device=training.device,
-            tells_parameters=tells_parameters,
+            shows_parameters=shows_parameters,
         )
         return env, Simulation(parts.thinness, parts.scatter, switches, parts.variation)
 
@@ -188,19 +231,14 @@ def train_in(
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`; return it and its learning curve.
 
-    The policy has a memory of `memory_size`; episodes start anew after `horizon` steps. SAC imitates what was
-    `recorded`.
+    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps. What was `recorded`
+    is imitated, if the learner does that.
     """
     torch.manual_seed(derive(training.seed, "policy"))
-    sizes = env.observation_size, env.action_size, memory_size
-    seed = training.seed
-    learner: Ppo | Sac
-    if isinstance(config, SacTrainConfig):
-        actor = SoftActor(PolicyShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)
-        learner = Sac(env, actor, config, horizon=horizon, seed=seed, recorded=recorded)
-    else:
-        policy = ActorCritic(ActorCriticShape(*sizes, hidden_sizes=config.hidden_sizes)).to(training.device)
-        learner = Ppo(env, policy, config, horizon=horizon, seed=seed)
+    shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
+    learner = config.make_learner(
+        env, shape, training.device, horizon=horizon, seed=training.seed, recorded=recorded
+    )
     return learner.policy, optimise(learner, env, config.ramp, training)
 
 
@@ -213,7 +251,7 @@ def optimise(
 ) -> dict[str, Any]:
     """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
 
-    The checkpoint of the end is left in the folder, for what comes after.
+    The last checkpoint is left in the folder, for what comes after.
     """
 
     def go_on(state: dict[str, Any]) -> None:
@@ -224,13 +262,12 @@ def optimise(
     points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
     is_lasting = training.task.objective.is_lasting
     while not learner.done:
-        if isinstance(env, SimulatorWorld):
-            env.caution = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
+        env.penalty_scale = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
         metrics = learner.iterate()
-        # JSON knows no NaN: what is undefined, such as the success of no episodes, is null.
+        # JSON has no NaN: what is undefined, such as the success rate of no episodes, is null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
         if is_lasting:
-            # Horizons pass unseen here: what ended is what failed.
+            # Success is to last to the horizon, which is not an end here: all ends are failures.
             known["success"] = None
         points.append({"steps": learner.steps, **known})
         rate = learner.steps / stopwatch.seconds
@@ -248,7 +285,7 @@ def optimise(
 
 
 def _lately(points: Sequence[Mapping[str, float | None]], figure: str) -> str:
-    """Tell the mean of a `figure`, "success" or "episode_steps", over the last of the `points`."""
+    """Return a note of the mean of a `figure`, "success" or "episode_steps", over the last `points`."""
     recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
     if figure == "success":
         return f"success of training episodes {f'{fmean(recent):.2f}' if recent else 'unknown yet'}"

@@ -11,14 +11,15 @@ from astra_data.training.train import Training, train_in
 
 
 class TargetConfig(Config):
-    """What may differ from `[train]` in the target, whose steps are slow; not in the paper."""
+    """Settings that may differ from `[train]` in the target, whose steps are slow; not in the paper."""
 
     total_steps: Count | None = None
-    """Environment steps in all; by default as many."""
+    """Environment steps in all; by default as in `[train]`."""
     num_envs: Count | None = None
-    """Target environments stepped side by side; by default as many."""
+    """Target environments stepped side by side; by default as in `[train]`."""
     memory_size: Number | None = None
-    """Of the policy's own GRU; by default as large. A policy that sees the complete state needs none."""
+    """Size of the policy's own GRU; by default as in `[train]`. A policy that observes the full state needs
+    none."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class InTarget:
     """Train in the target, from its own rewards.
 
     Attributes:
-        observed: whether the policy sees φ of the state or all of it.
+        observed: whether the policy observes φ of the state or the full state.
     """
 
     observed: Observed

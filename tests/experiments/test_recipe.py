@@ -59,7 +59,10 @@ def test_rows_that_predict_no_reward_are_not_trained_with_it() -> None:
         ({"train": SAC, "plus": {"learner": "ppo"}}, "expected that of [train], 'sac', got 'ppo'"),
         ({"train": SAC | {"ramp": 0.4}}, "train: ramp: expected 0 with SAC"),
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
-        ({"train": {"doubt_penalty": 1.0}}, "doubt_penalty: expected ground.correction_heads of 2 or more"),
+        (
+            {"train": {"disagreement_penalty": 1.0}},
+            "disagreement_penalty: expected ground.correction_heads of 2 or more",
+        ),
         ({"train": 3}, "train: expected a table, got 3"),
         ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),

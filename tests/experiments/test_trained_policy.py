@@ -8,8 +8,7 @@ from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.experiments.trained_policy import load_policy
-from astra_data.grounding.grounding_file import load_grounding
-from astra_data.grounding.target_encoder_file import load_target_encoder
+from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.stages.align import align
 from astra_data.stages.collect import collect
 from astra_data.stages.ground import ground

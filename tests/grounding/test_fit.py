@@ -1,11 +1,11 @@
 import torch
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.fit import what_rewards_lack
+from astra_data.grounding.fit import residual_rewards
 from astra_data.worlds.registry import TASKS
 
 
-def test_rewards_lack_what_abstract_states_do_not_tell() -> None:
+def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     """Steps: ahead, into the goal, failing unseen, into a goal that only abstract states show, none."""
     task = TASKS["antmaze-umaze"]
     goal = torch.tensor(task.maze.cell_centre(*task.maze.goal)).float()
@@ -27,6 +27,6 @@ def test_rewards_lack_what_abstract_states_do_not_tell() -> None:
         reward=going_on + failing,
         terminated=terminated[None],
     )
-    lacking = what_rewards_lack(task, episodes).windows.reward[0]
-    torch.testing.assert_close(lacking[:, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))
-    torch.testing.assert_close(lacking[:, 1], torch.tensor([0.0, 0.0, -9.0 - ahead, 0.0, 0.0]))
+    residual = residual_rewards(task, episodes).windows.reward[0]
+    torch.testing.assert_close(residual[:, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))
+    torch.testing.assert_close(residual[:, 1], torch.tensor([0.0, 0.0, -9.0 - ahead, 0.0, 0.0]))

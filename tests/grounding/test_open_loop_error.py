@@ -4,6 +4,7 @@ import pytest
 import torch
 from toy_episodes import toy_episodes
 
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.open_loop_error import distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
@@ -30,8 +31,8 @@ def episodes(speed: float) -> PairedEpisodes:
     return toy_episodes(state[:, :-1], action, next_state=state[:, 1:], simulated_next=simulated, mask=mask)
 
 
-def untrained() -> GroundingModel:
-    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(8,)))
+def untrained() -> HistoryGrounding:
+    return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(8,))))
 
 
 def test_quantities_are_measured_apart() -> None:
@@ -66,14 +67,14 @@ def test_a_slow_target_is_left_behind_in_proportion_to_the_horizon() -> None:
 
 
 def test_a_constant_correction_closes_a_constant_gap() -> None:
-    model = untrained()
+    grounding = untrained()
     slow = episodes(speed=0.5)
     # The same command throughout, so that one number corrects each step.
     one = slow.select(torch.tensor([0]))
     error = (one.windows.next_state - one.windows.simulated_next)[0]
     assert error.std(0).max() < 1e-4
     with torch.no_grad():
-        list(model.corrections.parameters())[-1].copy_(error.mean(0))
-    report = gap_report(TASK, model, one, seed=0)
+        list(grounding.model.corrections.parameters())[-1].copy_(error.mean(0))
+    report = gap_report(TASK, grounding, one, seed=0)
     assert report["raw"]["position_m"]["mean"][-1] > 0.5
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=2e-3)

@@ -65,7 +65,8 @@ def fitting(
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Variation, dict[str, Any]]:
-    return identify(fitting(tmp_path_factory.mktemp("compass")))
+    grounding, metrics = identify(fitting(tmp_path_factory.mktemp("compass")))
+    return grounding.variation, metrics
 
 
 def test_planted_parameters_are_found(found: tuple[Variation, dict[str, Any]]) -> None:
@@ -93,7 +94,7 @@ def test_planted_joints_are_found(tmp_path: Path) -> None:
     settings = CompassConfig(
         **wide.model_dump(), contexts=64, windows=60, window=15, updates=1500, iterations=4
     )
-    variation, metrics = identify(fitting(tmp_path, settings, task=task, planted=planted))
+    grounding, metrics = identify(fitting(tmp_path, settings, task=task, planted=planted))
     point = metrics["point"]
     assert point["action_scale"] == pytest.approx(0.03, abs=0.01)
     assert point["timestep_scale"] == pytest.approx(1.3, abs=0.05)
@@ -102,7 +103,7 @@ def test_planted_joints_are_found(tmp_path: Path) -> None:
     # The scale of what is shown is not asked about, and drawn from its range while the policy is trained.
     assert metrics["mask"].keys() == planted.keys()
     ends = {name: (value, value) for name, value in point.items()}
-    assert variation == wide.model_copy(update=ends)
+    assert grounding.variation == wide.model_copy(update=ends)
 
 
 def test_the_mask_tells_causes_from_bystanders(found: tuple[Variation, dict[str, Any]]) -> None:

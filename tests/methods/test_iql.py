@@ -10,6 +10,7 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.iql import IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.methods import METHODS, iql
@@ -77,7 +78,7 @@ def learn(episodes: PairedEpisodes, tmp_path: Path) -> Learn:
                 config=PpoTrainConfig(memory_size=8, hidden_sizes=(16,)),
                 settings=CONFIG.model_copy(update=settings),
                 episodes=episodes,
-                grounding=None,
+                grounding=NO_GROUNDING,
                 initial=initial,
                 seed=3,
                 device="cpu",
@@ -111,7 +112,7 @@ def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
     assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "0")
     assert [(point["steps"], point["success"]) for point in curve["points"]] == [(20, None)]
     assert curve["updates_per_second"] > 0
-    deployed = deploy(TASK, trained, None)
+    deployed = deploy(TASK, trained)
     deployed.start(3)
     assert deployed.act(torch.randn(3, 29), torch.randn(3, 2)).abs().max() <= 1.0
 

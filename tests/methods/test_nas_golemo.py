@@ -50,7 +50,8 @@ def test_learns_a_constant_offset_and_how_what_is_left_scatters(tmp_path: Path) 
     offset = torch.tensor([0.3, -0.2, 0.0, 1.0])
     noise = torch.tensor([0.1, 0.1, 0.02, 0.2]) * torch.randn(48, STEPS, 4)
     given = fitting(episodes(48, offset + noise, torch.randn(48, STEPS, 2)), tmp_path)
-    model, metrics = fit_residual(given)
+    grounding, metrics = fit_residual(given)
+    model = grounding.model
     windows = given.held_out.windows
     memory = model.initial_memory(len(windows.state))
     corrected, _ = model.correct(windows.state, windows.action, windows.simulated_next, memory)
@@ -72,7 +73,7 @@ def test_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> None:
     lacking[..., 2:] = 0.01 * torch.randn(32, STEPS, 2)
     given = fitting(episodes(32, lacking, action), tmp_path)
     # Scales apart, the last two entries are noise: compare the first two alone.
-    model, _ = fit_residual(given)
+    model = fit_residual(given)[0].model
     model.correction_std[2:] = 1e6
     assert explained(model, given.held_out, forgets=False) > 0.8
     assert explained(model, given.held_out, forgets=True) < 0.2
@@ -85,7 +86,7 @@ def test_what_lies_beyond_an_episodes_end_teaches_nothing(tmp_path: Path) -> Non
     models = []
     for name in ("zeros", "numbers"):
         (tmp_path / name).mkdir()
-        models.append(fit_residual(fitting(both, tmp_path / name, config))[0])
+        models.append(fit_residual(fitting(both, tmp_path / name, config))[0].model)
         both.windows.next_state[0, 25:] = 100.0
     for ours, theirs in zip(models[0].parameters(), models[1].parameters(), strict=True):
         assert torch.equal(ours, theirs)

@@ -8,8 +8,8 @@ from small_run import ALIGN
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
+from astra_data.grounding.files import load_target_encoder
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.target_encoder_file import load_target_encoder
 from astra_data.stages.align import align
 
 

@@ -11,13 +11,14 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding import fit as stage
 from astra_data.grounding.diagnostics import telemetry
-from astra_data.grounding.grounding_file import load_grounding, load_history_model
+from astra_data.grounding.files import load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.methods.compass import CompassConfig
 from astra_data.stages.ground import ground
 from astra_data.stages.train import train
-from astra_data.worlds.variation import WIDE_RANGES, Variation
+from astra_data.worlds.variation import WIDE_RANGES
 
 
 def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
@@ -207,8 +208,10 @@ def test_identified_parameters_are_an_artefact_that_policies_are_trained_with(
     files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}
     assert {file.name for file in (tmp_path / "ground").iterdir()} == files
     found = load_grounding(tmp_path / "ground" / "grounding.safetensors")
-    assert isinstance(found, Variation)
+    assert isinstance(found, IdentifiedParameters)
     metrics = json.loads((tmp_path / "ground" / "metrics.json").read_text())
-    assert {name: (value, value) for name, value in metrics["point"].items()}.items() <= dict(found).items()
+    assert {name: (value, value) for name, value in metrics["point"].items()}.items() <= dict(
+        found.variation
+    ).items()
     train(task, "compass", TRAIN, grounding=tmp_path / "ground", out=tmp_path / "train", **given)  # type: ignore[arg-type]
     assert (tmp_path / "train" / "policy.safetensors").is_file()

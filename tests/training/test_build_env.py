@@ -5,14 +5,16 @@ import torch
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
+from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.simulator import GroundedSimulator
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.build_env import WorldConfig, training_world, world_parts
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
-from astra_data.worlds.scattered import RandomizedSimulator
 
 TASK = TASKS["antmaze-umaze"]
 HERE = torch.tensor(TASK.maze.cell_centre(1, 2), dtype=torch.float32)
@@ -38,19 +40,27 @@ def episodes() -> PairedEpisodes:
 
 
 @pytest.fixture
-def model() -> GroundingModel:
+def grounding() -> HistoryGrounding:
     torch.manual_seed(0)
-    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
 
 
-def test_without_switches_it_is_the_plain_simulator(episodes: PairedEpisodes, model: GroundingModel) -> None:
+def test_without_switches_it_is_the_plain_simulator(
+    episodes: PairedEpisodes, grounding: HistoryGrounding
+) -> None:
     config = WorldConfig()
-    for kind, grounding in ((PointMass, None), (GroundedSimulator, model)):
-        parts = world_parts(TASK, config, episodes, grounding)
+    kinds: dict[type[EpisodeSimulator], Grounding] = {
+        EpisodeSimulator: NO_GROUNDING,
+        GroundedSimulator: grounding,
+    }
+    for kind, used in kinds.items():
+        parts = world_parts(TASK, config, episodes, used)
         assert not parts.scatter.any()
         assert parts.starts is None
-        world = training_world(TASK, config, parts, grounding, num_envs=4, device="cpu")
+        world = training_world(TASK, config, parts, used, num_envs=4, device="cpu")
         assert type(world.simulator) is kind
+        assert type(world.simulator.simulator) is PointMass
+        assert world.simulator.scatter is None
         assert world.reward == "abstract"
         assert world.num_envs == 4
         drawn = torch.get_rng_state()
@@ -59,20 +69,20 @@ def test_without_switches_it_is_the_plain_simulator(episodes: PairedEpisodes, mo
 
 
 def test_scatter_is_what_the_simulator_does_not_explain(
-    episodes: PairedEpisodes, model: GroundingModel
+    episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     config = WorldConfig(residual_noise=2.0)
-    parts = world_parts(TASK, config, episodes, None)
-    world = training_world(TASK, config, parts, None, num_envs=1, device="cpu")
-    assert isinstance(world.simulator, RandomizedSimulator)
+    parts = world_parts(TASK, config, episodes, NO_GROUNDING)
+    world = training_world(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
+    assert world.simulator.scatter is parts.scatter
     deviations = (parts.scatter @ parts.scatter.T).diagonal().sqrt()
     torch.testing.assert_close(deviations, 2 * torch.tensor([0.01, 0.02, 0.1, 0.2]), rtol=0.1, atol=0)
-    model.residual_factor.copy_(torch.eye(4))
-    assert torch.equal(world_parts(TASK, config, episodes, model).scatter, 2 * torch.eye(4))
+    grounding.model.residual_factor.copy_(torch.eye(4))
+    assert torch.equal(world_parts(TASK, config, episodes, grounding).scatter, 2 * torch.eye(4))
 
 
 def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
-    thinness = world_parts(TASK, WorldConfig(), episodes, None).thinness
+    thinness = world_parts(TASK, WorldConfig(), episodes, NO_GROUNDING).thinness
     assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     far = HERE + torch.tensor([[1.5, 0.0], [0.0, -1.5]])
@@ -83,8 +93,8 @@ def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
 
 def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> None:
     config = WorldConfig(support_penalty=0.3)
-    parts = world_parts(TASK, config, episodes, None)
-    world = training_world(TASK, config, parts, None, num_envs=1, device="cpu")
+    parts = world_parts(TASK, config, episodes, NO_GROUNDING)
+    world = training_world(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.thinness is not None and parts.thinness is not None
     torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
 
@@ -92,24 +102,24 @@ def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> N
 def test_what_needs_a_maze_is_refused_without_one(episodes: PairedEpisodes) -> None:
     nowhere = replace(TASK, plane=None)
     plain, *asked = WorldConfig(), WorldConfig(support_penalty=0.3), WorldConfig(command_limit_m_s=1.0)
-    parts = world_parts(nowhere, plain, episodes, None)
+    parts = world_parts(nowhere, plain, episodes, NO_GROUNDING)
     assert parts.thinness is None
-    world = training_world(nowhere, plain, parts, None, num_envs=1, device="cpu")
+    world = training_world(nowhere, plain, parts, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.thinness is None
     for config in asked:
         with pytest.raises(BadInputError, match="expected a task in a maze"):
-            training_world(nowhere, config, parts, None, num_envs=1, device="cpu")
+            training_world(nowhere, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
 
 
 def test_recorded_starts_come_with_the_history_before_them(
-    episodes: PairedEpisodes, model: GroundingModel
+    episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     config = WorldConfig(data_start_share=1.0)
-    starts = world_parts(TASK, config, episodes, model).starts
+    starts = world_parts(TASK, config, episodes, grounding).starts
     assert starts is not None
     assert starts.hidden is not None
     assert len(starts.state) == len(starts.hidden) == 700
-    windows = episodes.windows
+    windows, model = episodes.windows, grounding.model
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
     hidden = torch.zeros(1, 8)
     for step in range(5):
@@ -121,14 +131,14 @@ def test_recorded_starts_come_with_the_history_before_them(
 
 
 def test_a_recorded_start_is_one_of_the_recorded_moments(
-    episodes: PairedEpisodes, model: GroundingModel
+    episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     few = replace(
         episodes, windows=replace(episodes.windows, mask=(torch.arange(400) < 3) * torch.ones(2, 1))
     )
     config = WorldConfig(data_start_share=1.0)
-    parts = world_parts(TASK, config, few, model)
-    world = training_world(TASK, config, parts, model, num_envs=64, device="cpu")
+    parts = world_parts(TASK, config, few, grounding)
+    world = training_world(TASK, config, parts, grounding, num_envs=64, device="cpu")
     world.reset()
     moments = few.steps(few.windows.state)
     assert len(moments) == 6

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import astra_data.envs
-from astra_data.grounding.build import simulator_of
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
 from astra_data.worlds.registry import TASKS
@@ -146,7 +146,7 @@ def test_ants_in_a_vector_env() -> None:
 def test_a_grounded_simulator_shows_its_latents() -> None:
     task = TASKS["antmaze-umaze"]
     model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
-    grounded = simulator_of(task, model.requires_grad_(False), 3, "cpu")
+    grounded = HistoryGrounding(model.requires_grad_(False)).simulator(task, 3)
     env = WorldVectorEnv(SeededSimulatorWorld(task.objective, grounded), max_episode_steps=5)
     raw = point_mazes(3, max_episode_steps=5)
     first, _ = env.reset(seed=1)

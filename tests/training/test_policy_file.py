@@ -6,7 +6,10 @@ from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.grounding_file import Grounding, save_grounding
+from astra_data.grounding.files import save_grounding
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.parameters import IdentifiedParameters
+from astra_data.grounding.protocols import FittedGrounding
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
@@ -54,9 +57,12 @@ def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("grounding", "kind"),
-    [(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)), "history"), (PlanarVariation(), "variation")],
+    [
+        (HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8))), "history"),
+        (IdentifiedParameters(PlanarVariation()), "variation"),
+    ],
 )
-def test_a_grounding_is_no_policy(grounding: Grounding, kind: str, tmp_path: Path) -> None:
+def test_a_grounding_is_no_policy(grounding: FittedGrounding, kind: str, tmp_path: Path) -> None:
     path = tmp_path / "policy.safetensors"
     save_grounding(path, grounding, no_episodes())
     with pytest.raises(
@@ -74,7 +80,7 @@ def test_a_grounding_is_no_policy(grounding: Grounding, kind: str, tmp_path: Pat
 def test_a_policy_of_an_older_version_is_told(lacks: str, found: str, tmp_path: Path) -> None:
     path = tmp_path / "policy.safetensors"
     PolicyFile(ActorCritic(ActorCriticShape(3, 2, memory_size=8)), None, "toy@data-1.0.0", "abc").save(path)
-    tensors, told = load_tensors(path)
-    save_tensors(path, tensors, {key: value for key, value in told.items() if key != lacks})
+    tensors, metadata = load_tensors(path)
+    save_tensors(path, tensors, {key: value for key, value in metadata.items() if key != lacks})
     with pytest.raises(BadInputError, match=f"expected a policy .*found {found}: run that stage again$"):
         PolicyFile.load(path)

@@ -1,7 +1,9 @@
 import pytest
 import torch
 
-from astra_data.grounding.simulator import GroundedSimulator
+from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.simulator_env import DataStarts, SimulatorWorld, policy_observation
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -15,7 +17,7 @@ TASK = Navigation(U_MAZE, horizon=700)
 
 
 def world(num_envs: int = 4, **options: float | torch.Tensor) -> SimulatorWorld:
-    simulator = PointMass(U_MAZE, num_envs, timestep_s=0.05)
+    simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
     return SimulatorWorld(TASK, simulator, **options)  # type: ignore[arg-type]
 
 
@@ -52,13 +54,13 @@ def test_resumes_where_it_was() -> None:
 @pytest.mark.parametrize("is_varied", [False, True])
 def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
     task = TASKS["humanoid-walker2d"]
-    simulator, another = (
-        task.varied_simulator(3, task.varied.wide, "cpu") if is_varied else task.simulator(3, "cpu")
-        for _ in range(2)
+    variation = task.varied.wide if is_varied else None
+    first, second = (
+        SimulatorWorld(task.objective, NO_GROUNDING.simulator(task, 3, variation=variation)) for _ in range(2)
     )
-    first, second = (SimulatorWorld(task.objective, one) for one in (simulator, another))
     first.reset()
-    simulator.reset_to(simulator.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]]))
+    inner = first.simulator.simulator
+    inner.reset_to(inner.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]]))
     for _ in range(4):
         first.step(torch.zeros(3, 4))
     second.load_state_dict(first.state_dict())
@@ -70,7 +72,7 @@ def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
         assert torch.equal(*after)
 
 
-def test_thin_data_costs_what_it_is_said_to() -> None:
+def test_thin_data_costs_its_penalty() -> None:
     thinness = torch.zeros(U_MAZE.fine_walls.shape)
     thinness[:, : thinness.shape[1] // 2] = 0.25  # x < 0
     plain, costly = world(2), world(2, thinness=thinness)
@@ -83,36 +85,36 @@ def test_thin_data_costs_what_it_is_said_to() -> None:
     assert (steps[1].reward - steps[0].reward).tolist() == pytest.approx([-0.25, 0.0])
 
 
-def test_doubt_costs_what_it_is_said_to() -> None:
+def test_disagreement_costs_its_penalty() -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=3))
     with torch.no_grad():
         for offset, head in zip((0.0, 0.0, 0.9), model.corrections, strict=True):
             list(head.parameters())[-1][2:].fill_(offset)
     # The heads differ in two of four entries, by sqrt(0.27 / 2) over all.
-    disagreement = (0.9**2 / 3 / 2) ** 0.5
+    spread = (0.9**2 / 3 / 2) ** 0.5
     rewards = []
     for penalty in (0.0, 0.5):
-        model.usual_disagreement.fill_(disagreement / 3)
+        model.usual_disagreement.fill_(spread / 3)
         grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), model)
-        one = SimulatorWorld(TASK, grounded, doubt_penalty=penalty)
+        one = SimulatorWorld(TASK, grounded, disagreement_penalty=penalty)
         torch.manual_seed(1)
         one.reset()
         rewards.append(one.step(torch.zeros(2, 2)).reward)
-        assert grounded.doubt.tolist() == pytest.approx([2.0, 2.0])
-        model.usual_disagreement.fill_(2 * disagreement)
+        assert grounded.disagreement.tolist() == pytest.approx([2.0, 2.0])
+        model.usual_disagreement.fill_(2 * spread)
         one.step(torch.zeros(2, 2))
-        assert not grounded.doubt.any()  # less than usual
+        assert not grounded.disagreement.any()  # less than usual
     assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-1.0, -1.0])
 
 
 @pytest.mark.parametrize(("heads", "steps"), [(1, 0), (1, 1), (3, 0)])
-def test_without_other_heads_or_a_step_there_is_no_doubt(heads: int, steps: int) -> None:
+def test_without_other_heads_or_a_step_there_is_no_disagreement(heads: int, steps: int) -> None:
     shape = GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=heads)
     grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), GroundingModel(shape))
     for _ in range(steps):
         grounded.step(torch.zeros(2, 2))
-    assert grounded.doubt.tolist() == [0.0, 0.0]
+    assert grounded.disagreement.tolist() == [0.0, 0.0]
 
 
 def test_episodes_may_start_from_recorded_moments() -> None:
@@ -149,10 +151,10 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
     action = torch.tensor([[1.0, 0.0]]).expand(3, 2)
     rewards = []
     for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
-        inner = PointMass(U_MAZE, 3, timestep_s=0.05)
-        one = SimulatorWorld(TASK, GroundedSimulator(inner, model), **options)
+        grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
+        one = SimulatorWorld(TASK, grounded, **options)
         one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
-        latent = one.simulator.latent  # type: ignore[union-attr]
+        latent = grounded.latent
         rewards.append(one.step(action).reward)
     risk = model.topple_risk(latent, action, one.simulator.state).detach()
     assert (risk > 0).all()
@@ -170,7 +172,8 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
     goal = torch.tensor([[1.5, 0.0]]).expand(3, 2)
     one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
-    latent = one.simulator.latent  # type: ignore[union-attr]
+    latent = one.simulator.latent
+    assert latent is not None
     action = torch.zeros(3, 3)
     step = one.step(action)
     own = task.objective.reward(state, one.simulator.state, goal, torch.tensor([False, False, True]))
@@ -208,7 +211,8 @@ def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
     state = torch.tensor([[0.0, 2.0, 0.0, 0.0], [-1.999, 2.0, 0.0, 0.0]])
     goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)]).float().expand(2, 2)
     one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(2, 8)})
-    latent = one.simulator.latent  # type: ignore[union-attr]
+    latent = one.simulator.latent
+    assert latent is not None
     action = torch.tensor([[0.0, 0.0], [-1.0, 0.0]])
     step = one.step(action)
     assert step.terminated.tolist() == one.failed.tolist() == [False, True]
@@ -225,30 +229,30 @@ def test_commands_are_clipped_and_shortened() -> None:
     torch.testing.assert_close(TASK.limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
 
 
-def test_caution_scales_the_penalties() -> None:
+def test_the_penalty_scale_scales_the_penalties() -> None:
     one = world(1, thinness=torch.ones(U_MAZE.fine_walls.shape), command_limit_m_s=0.5)
     state = {"state": torch.tensor([[-4.0, 4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
     rewards = []
-    for caution in (0.0, 0.25, 1.0):
+    for scale in (0.0, 0.25, 1.0):
         one.load_state_dict(state)
-        one.caution = caution
+        one.penalty_scale = scale
         rewards.append(float(one.step(torch.tensor([[1.0, 0.0]])).reward))
     assert one.simulator.state[0].tolist() == pytest.approx([-3.975, 4.0, 0.5, 0.0], abs=1e-5)
     assert [rewards[0] - reward for reward in rewards] == pytest.approx([0.0, 0.25, 1.0], abs=1e-5)
 
 
-def test_parameters_of_the_episode_are_told_where_asked_for() -> None:
+def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
-    assert SimulatorWorld(TASK, simulator).observation_size == 8
-    telling = SimulatorWorld(TASK, simulator, tells_parameters=True)
-    assert (telling.observation_size, telling.parameter_count) == (8 + 7, 7)
-    before = telling.reset()
+    assert SimulatorWorld(TASK, EpisodeSimulator(simulator)).observation_size == 8
+    showing = SimulatorWorld(TASK, EpisodeSimulator(simulator), shows_parameters=True)
+    assert (showing.observation_size, showing.parameter_count) == (8 + 7, 7)
+    before = showing.reset()
     torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
     torch.testing.assert_close(before[:, 13], simulator.parameters[:, 5] / 5.0)
     assert not before[:, [9, 10, 11, 12, 14]].any()  # these do not vary
-    assert torch.equal(telling.step(torch.ones(4, 2)).observation[:, 8:], before[:, 8:])
-    after = telling.reset(torch.tensor([True, False, False, False]))
+    assert torch.equal(showing.step(torch.ones(4, 2)).observation[:, 8:], before[:, 8:])
+    after = showing.reset(torch.tensor([True, False, False, False]))
     assert (after[0, [8, 13]] != before[0, [8, 13]]).all()
     assert torch.equal(after[1:, 8:], before[1:, 8:])
-    assert torch.equal(telling.load_state_dict(telling.state_dict()), after)
+    assert torch.equal(showing.load_state_dict(showing.state_dict()), after)

@@ -20,7 +20,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from astra_data.core.config import load_recipe
 from astra_data.experiments.recipe import Recipe
-from astra_data.grounding.build import simulator_of
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
 from astra_data.training.train import PpoTrainConfig
@@ -51,11 +53,13 @@ def main(algorithm: Algorithm, face: Face) -> None:
     task, config = TASKS[settings.task], settings.train
     assert isinstance(config, PpoTrainConfig)
     shape = GroundingShape(state_size=4, action_size=2, goal_size=2)
-    model = GroundingModel(shape).requires_grad_(False) if algorithm is Algorithm.ppo else None
+    grounding: Grounding = NO_GROUNDING
+    if algorithm is Algorithm.ppo:
+        grounding = HistoryGrounding(GroundingModel(shape).requires_grad_(False))
     horizon = task.objective.horizon
 
     def world(num_envs: int) -> SeededSimulatorWorld:
-        return SeededSimulatorWorld(task.objective, simulator_of(task, model, num_envs, "cpu"))
+        return SeededSimulatorWorld(task.objective, grounding.simulator(task, num_envs))
 
     def single() -> gymnasium.Env[Array, Array]:
         return gymnasium.wrappers.TimeLimit(WorldEnv(world(1)), horizon)

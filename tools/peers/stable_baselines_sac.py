@@ -13,7 +13,7 @@ import typer
 from rows import Rows
 from stable_baselines3 import SAC
 
-from astra_data.grounding.build import simulator_of
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.gymnasium import SeededSimulatorWorld, WorldVectorEnv
 from astra_data.worlds.registry import TASKS
 
@@ -22,7 +22,7 @@ def main(count: int, updates: int, steps: int) -> None:
     """Train on demand."""
     torch.set_num_threads(1)
     task = TASKS["humanoid-walker2d"]
-    world = SeededSimulatorWorld(task.objective, simulator_of(task, None, count, "cpu"))
+    world = SeededSimulatorWorld(task.objective, NO_GROUNDING.simulator(task, count))
     learner = SAC(
         "MlpPolicy",
         Rows(WorldVectorEnv(world, task.objective.horizon)),

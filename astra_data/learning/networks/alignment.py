@@ -12,9 +12,12 @@ from astra_data.learning.networks.history import HistoryEncoder, PositionFeature
 class TargetEncoder(nn.Module):
     """ψ^t: encode histories of full target states into the source encoder's latent space.
 
-    The first two entries of a target state are its planar position in m; they are seen as the source
-    encoder sees them, with `PositionFeatures`. Without these, ψ^t cannot follow what ψ^s makes of walls;
-    with 0 octaves there are none.
+    The first two entries of a target state are its planar position in m, which gets the `PositionFeatures`
+    of the source encoder: without them, ψ^t cannot match how ψ^s represents walls. With 0 octaves there are
+    none.
+
+    Attributes:
+        sizes: the arguments that it was made with.
     """
 
     def __init__(
@@ -28,6 +31,14 @@ class TargetEncoder(nn.Module):
         position_octaves: int = 4,
     ) -> None:
         super().__init__()
+        self.sizes = {
+            "state_size": state_size,
+            "goal_size": goal_size,
+            "action_size": action_size,
+            "embedding_size": embedding_size,
+            "latent_size": latent_size,
+            "position_octaves": position_octaves,
+        }
         self.position_features = PositionFeatures(position_octaves)
         self.encoder = HistoryEncoder(
             state_size + self.position_features.size + goal_size + action_size,
@@ -45,7 +56,7 @@ class TargetEncoder(nn.Module):
     def set_scales(self, state: Tensor, goal: Tensor, unseen: Sequence[int] = ()) -> None:
         """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G).
 
-        The entries `unseen` of states get an infinite one, with which they do not count.
+        The entries `unseen` of states are given an infinite deviation, so that they are always 0 as inputs.
         """
         for name, values in {"state": state, "goal": goal}.items():
             if not values.numel():
@@ -55,7 +66,7 @@ class TargetEncoder(nn.Module):
         self.state_std[list(unseen)] = torch.inf
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
-        """Assemble [s_i, its position's features, goal, a_{i-1}] (..., I)."""
+        """Assemble [s_i, features of its position, goal, a_{i-1}] (..., I)."""
         normal_state = normalised(state, self.state_mean, self.state_std)
         waves = self.position_features(state[..., :2])
         return torch.cat(

@@ -1,6 +1,6 @@
 """ASTRA's grounding model: history encoder, latent dynamics, reward, correction; and their joint loss.
 
-Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: the correction alone.
+Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: only the correction is fitted.
 """
 
 import copy
@@ -14,12 +14,12 @@ from torch.nn import functional
 
 from astra_data.core.numbers import normalised
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures, mlp
-from astra_data.learning.networks.paired_windows import RISK_STEPS, Windows
+from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
 
 TargetKind = Literal["ema", "detach", "online"]
 
 _BALL_M = 0.1
-"""Unit of where the ball lies from the robot: whether it is touched is decided by less than that."""
+"""Unit of the ball's position relative to the robot: less than this decides whether they touch."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class GroundingShape:
 
     Attributes:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
-        position_octaves: of `PositionFeatures`; 0 leaves positions as they are, and is for states without.
-        ball_index: where in the state the position of a ball begins; None where there is none.
-        correction_heads: of f_abs, whose mean corrects.
-        corrects_reward: R_pred is what the task's own reward lacks, not the whole.
-        reward_dropout: share of the latent that R_pred does not see while it learns.
+        position_octaves: of `PositionFeatures`; 0 for none, as in states without a position.
+        ball_index: index in the state where the position of a ball begins; None where there is no ball.
+        correction_heads: K, heads of f_abs, whose mean corrects.
+        corrects_reward: R_pred is fitted to the residual reward: the target's less the task's own.
+        reward_dropout: dropout rate of the latent that R_pred is given in training.
     """
 
     state_size: int
@@ -59,9 +59,9 @@ class GroundingShape:
 
 
 class GroundingModel(nn.Module):
-    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone, plus a topple head that does not shape the latent.
+    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone, plus a topple head without gradient to the latent.
 
-    Scales are buffers, so a checkpoint carries them; `set_scales` and `set_reward_scales` take them from the
+    Scales are buffers, so checkpoints hold them; `set_scales` and `set_reward_scales` take them from the
     training episodes.
     """
 
@@ -123,10 +123,10 @@ class GroundingModel(nn.Module):
 
     @torch.no_grad()
     def set_reward_scales(self, reward: Tensor, failure_weight: float = 1.0) -> None:
-        """Take the scales of `reward` (N, 2) from training steps, in its two parts: see `Windows`.
+        """Take the scales of `reward` (N, 2), in its two parts (see `PairedWindows`), from training steps.
 
-        The reward head begins where it predicts as many failures as there are, and their loss is weighed by
-        how rare they are, times `failure_weight`.
+        The mean and deviation are those of steps that go on. The reward head starts at the rate of failures
+        in the data; their loss is weighted by how rare they are, times `failure_weight`.
         """
         going_on, failing = reward.unbind(-1)
         failed = failing != 0
@@ -140,7 +140,7 @@ class GroundingModel(nn.Module):
             list(self.reward_head.parameters())[-1][1] = rate.logit()
 
     def state_features(self, state: Tensor) -> Tensor:
-        """Normalise abstract states (..., X) and append the features of their position, and of the ball's."""
+        """Normalise abstract states (..., X) and append features of the robot's and the ball's position."""
         position, index = state[..., :2], self.shape.ball_index
         features = [normalised(state, self.state_mean, self.state_std), self.position_features(position)]
         if index is not None:
@@ -157,7 +157,7 @@ class GroundingModel(nn.Module):
         """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
         return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
 
-    def encode(self, windows: Windows) -> tuple[Tensor, Tensor]:
+    def encode(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
         """Return the latents (B, T, Z) and hidden states (B, T, H) of histories that begin with `windows`."""
         latent, hidden = self.encoder(
             self.encoder_input(windows.state, windows.goal, windows.previous_action)
@@ -170,15 +170,21 @@ class GroundingModel(nn.Module):
         low, high = self.shape.log_variance_bounds
         return mean, low + (high - low) * torch.sigmoid(raw)
 
+    def target_reward(self, latent: Tensor, action: Tensor, own: Tensor) -> Tensor:
+        """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states."""
+        predicted = self.predict_reward(latent, action)
+        return predicted + own if self.shape.corrects_reward else predicted
+
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
-        """R_pred: return the target's reward (...), or what the task's own on abstract states lacks of it."""
+        """R_pred: return the target's reward (...), or the residual reward if it was fitted to that."""
         return self.predict_reward_parts(latent, action).sum(-1)
 
     def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Return both parts of the target's reward (..., 2): of going on, and what failing takes from it.
+        """Return the two parts of the predicted reward (..., 2): of going on, and of failing.
 
-        The second is how probably the step fails, times what failing costs: it is rare and large, and as a
-        number of its own it pays as easily as it costs where there is no data, which policies find.
+        The latter is the probability of failing times its cost. Failures are rare and large: regressed as a
+        number, their reward would be as often positive as negative away from the data, and policies would
+        exploit that.
         """
         going_on, log_odds = self._reward_outputs(latent, action)
         parts = [going_on * self.reward_std + self.reward_mean, log_odds.sigmoid() * self.failure_cost]
@@ -191,16 +197,16 @@ class GroundingModel(nn.Module):
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
-        return self.opinions(latent, action, simulated_next).mean(0)
+        return self.ensemble_predictions(latent, action, simulated_next).mean(0)
 
-    def opinions(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
-        """Return the next abstract state as each head corrects it, (K, ..., X)."""
+    def ensemble_predictions(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return the next abstract state as each of the K heads corrects it, (K, ..., X)."""
         inputs = torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
         return torch.stack([simulated_next + head(inputs) * self.correction_std for head in self.corrections])
 
-    def doubt(self, opinions: Tensor) -> Tensor:
-        """Return how many times as much as on the data `opinions` (K, ..., X) differ, (...)."""
-        spread = (opinions / self.correction_std).std(0).square().mean(-1).sqrt()
+    def disagreement(self, predictions: Tensor) -> Tensor:
+        """Return the spread (...) of ensemble predictions (K, ..., X), relative to that on the data."""
+        spread = (predictions / self.correction_std).std(0).square().mean(-1).sqrt()
         return spread / self.usual_disagreement
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
@@ -219,7 +225,7 @@ class GroundingModel(nn.Module):
             for slow, fast in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
                 slow.lerp_(fast, rate)
 
-    def losses(self, windows: Windows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
+    def losses(self, windows: PairedWindows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the joint loss (paper, Section IV-A) and its parts, each a mean over real steps and dims."""
         inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
         latent, _ = self.encoder(inputs)
@@ -243,10 +249,11 @@ class GroundingModel(nn.Module):
         parts["topple"] = _masked_mean(entropy, mask)
         return total + parts["topple"], parts
 
-    def _reward_loss(self, latent: Tensor, windows: Windows) -> Tensor:
-        """Return the mean of both parts' losses: about one, and its weight, where averages are predicted.
+    def _reward_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
+        """Return the mean of the losses of both parts of the reward.
 
-        Without any failures in the data the second is zero.
+        Predicting the averages gives a loss of about one for the steps that go on, and of its weight for the
+        failures; the latter is zero where the data has none.
         """
         if self.shape.reward_dropout:
             latent = functional.dropout(latent, self.shape.reward_dropout, self.training)
@@ -257,12 +264,12 @@ class GroundingModel(nn.Module):
         surprise = functional.binary_cross_entropy_with_logits(log_odds, failed, reduction="none")
         return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
 
-    def _correction_loss(self, latent: Tensor, windows: Windows) -> Tensor:
-        opinions = self.opinions(latent, windows.action, windows.simulated_next)
-        error = ((opinions - windows.next_state) / self.correction_std).square().mean(-1)
+    def _correction_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
+        predictions = self.ensemble_predictions(latent, windows.action, windows.simulated_next)
+        error = ((predictions - windows.next_state) / self.correction_std).square().mean(-1)
         mask = windows.mask.expand_as(error)
-        if len(opinions) > 1:
-            # Heads that are fitted to other halves of every batch differ in what the data leaves open.
+        if len(predictions) > 1:
+            # Each head learns from its own half of every batch, so that heads differ away from the data.
             mask = mask * (torch.rand(*error.shape[:2], 1, device=error.device) < 0.5)
         return _masked_mean(error, mask)
 

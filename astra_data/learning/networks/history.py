@@ -1,6 +1,7 @@
 """The history encoder: a GRU over states and actions whose layer-normalised hidden state is the latent."""
 
 from itertools import pairwise
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -37,10 +38,10 @@ class PositionFeatures(nn.Module):
 class HistoryEncoder(nn.Module):
     """Encode a history (x_1, x_2, ...) into latents (z_1, z_2, ...), one for each step.
 
-    x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). The hidden state is
-    handed in and out, never kept; the latent is the hidden state after a LayerNorm without gain, which
-    fixes each latent's length (the printed latent loss would otherwise shrink it without limit). That
-    different histories keep different latents is up to the target of that loss.
+    x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). The hidden state is an
+    argument and a result, never kept. The latent is the hidden state after a LayerNorm without gain, which
+    fixes the length of each latent: the printed latent loss would otherwise shrink it without limit. What
+    keeps different histories apart is the target of that loss.
     """
 
     def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
@@ -64,9 +65,9 @@ class HistoryEncoder(nn.Module):
         return self._next(functional.elu(self.embedding(inputs)), hidden)
 
     def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
-        """Encode `inputs` (B, T, I), in which episodes begin, from `hidden` (B, Z).
+        """Encode `inputs` (B, T, I) of several episodes one after another, from `hidden` (B, Z).
 
-        `start` (B, T) is 1 where a new episode begins: there the hidden state is emptied.
+        `start` (B, T) is 1 where a new episode begins: there the hidden state is set to zero.
 
         Returns:
             hidden states (B, T, Z) after each step.
@@ -86,3 +87,13 @@ class HistoryEncoder(nn.Module):
     def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:
         (weights,) = self.recurrence.all_weights
         return torch.gru_cell(embedded, hidden, *weights)
+
+
+class LatentEncoder(Protocol):
+    """A network with a history encoder: the source encoder ψ^s, or the target encoder ψ^t."""
+
+    encoder: HistoryEncoder
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble the encoder's input (..., I) of states, goals and the actions that led there."""
+        ...

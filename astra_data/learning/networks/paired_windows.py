@@ -1,25 +1,25 @@
-"""Paired episodes as the grounding model learns from them."""
+"""Windows of paired episodes, which the grounding model learns from."""
 
 from dataclasses import dataclass
 
 from torch import Tensor
 
 RISK_STEPS = 20
-"""The topple head learns from so many steps before each topple: the last step alone is too rare, and by then
-the robot moves as it never does in a simulator that has no topples."""
+"""Steps before each topple that the topple head is fitted to. The last step alone is too rare, and by then
+the robot moves as it never does in a simulator without topples."""
 
 
 @dataclass(frozen=True)
-class Windows:
-    """Stretches of paired episodes; T steps each, the mask marks the real ones.
+class PairedWindows:
+    """B windows of T steps each from paired episodes; the mask marks real steps, not padding.
 
     Attributes:
         state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
-        next_state: φ(s_{i+1}), (B, T, X). topples_soon: (B, T), the target ends
-            badly within `RISK_STEPS`.
-        reward: r_i, or what the task's own lacks of it, in two parts, (B, T, 2): of steps that go on, and of
-            steps that end in failure. That the goal is reached is decided, and rewarded, by the simulator.
+        next_state: φ(s_{i+1}), (B, T, X).
+        topples_soon: (B, T), 1 where the episode fails within `RISK_STEPS`.
+        reward: r_i, or the residual reward, in two parts, (B, T, 2): of steps that go on, and of steps that
+            end in failure; 0 in the other. Reaching the goal is detected and rewarded by the simulator.
         mask: (B, T), 1 on real steps.
     """
 

@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
-from astra_data.learning.networks.paired_windows import Windows
+from astra_data.learning.networks.paired_windows import PairedWindows
 
 NAS = LossWeights(latent=0.0, reward=0.0, state=1.0)
 LATENT_ALONE = LossWeights(latent=1.0, reward=0.0, state=0.0)
 SIZE = 16
 
 
-def lagging_world(episodes: int, steps: int, seed: int) -> Windows:
+def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
     """Return episodes in which the target is dragged along by a low-pass of past actions."""
     generator = torch.Generator().manual_seed(seed)
     action = torch.rand(episodes, steps, 2, generator=generator) * 2 - 1
@@ -24,7 +24,7 @@ def lagging_world(episodes: int, steps: int, seed: int) -> Windows:
         simulated[:, step] = state[:, step] + 0.1 * action[:, step]
         state[:, step + 1] = simulated[:, step] + 0.2 * drag
         drag = 0.7 * drag + 0.3 * action[:, step]
-    return Windows(
+    return PairedWindows(
         state=state[:, :-1],
         action=action,
         previous_action=torch.cat([torch.zeros(episodes, 1, 2), action[:, :-1]], dim=1),
@@ -112,15 +112,15 @@ def test_heads_agree_where_there_is_data_and_nowhere_else() -> None:
     assert error_left(model) < 0.05
     latent, action, landed = latents(model), HELD_OUT.action, HELD_OUT.simulated_next
     with torch.no_grad():
-        opinions = model.opinions(latent, action, landed)
-        model.usual_disagreement.copy_(model.doubt(opinions).mean())
-        torch.testing.assert_close(opinions.mean(0), model.correct(latent, action, landed))
-        assert float(model.doubt(opinions).mean()) == pytest.approx(1.0)
+        predictions = model.ensemble_predictions(latent, action, landed)
+        model.usual_disagreement.copy_(model.disagreement(predictions).mean())
+        torch.testing.assert_close(predictions.mean(0), model.correct(latent, action, landed))
+        assert float(model.disagreement(predictions).mean()) == pytest.approx(1.0)
         # The world is linear: far states and commands are not like any in the data.
-        elsewhere = model.opinions(
+        elsewhere = model.ensemble_predictions(
             latent, 4.0 * action, model.state_mean - 4.0 * model.state_std + 0 * landed
         )
-        assert float(model.doubt(elsewhere).mean()) > 3.0
+        assert float(model.disagreement(elsewhere).mean()) > 3.0
 
 
 def test_it_learns_what_only_the_history_tells() -> None:
@@ -185,7 +185,7 @@ def test_failing_is_predicted_as_often_as_it_happens_and_never_pays(paid: float,
         assert float(model.predict_reward_parts(anywhere, any_action)[:, 1].max()) <= 0.0
 
 
-def failing(share: float) -> Windows:
+def failing(share: float) -> PairedWindows:
     """Return the training windows where `share` of the steps fail, whatever is done."""
     torch.manual_seed(0)
     fails = -10.0 * (torch.rand(TRAINING.mask.shape) < share)
@@ -259,7 +259,7 @@ def test_masked_steps_do_not_count() -> None:
     torch.nn.init.normal_(list(model.corrections.parameters())[-1])
     mask = TRAINING.mask.clone()
     mask[:, 20:] = 0.0
-    cut = Windows(**{name: values[:, :20] for name, values in vars(TRAINING).items()})
+    cut = PairedWindows(**{name: values[:, :20] for name, values in vars(TRAINING).items()})
     spoiled = replace(TRAINING, mask=mask, reward=TRAINING.reward + 1e3 * (1 - mask).unsqueeze(-1))
     _, parts = model.losses(spoiled, LossWeights())
     _, expected = model.losses(cut, LossWeights())

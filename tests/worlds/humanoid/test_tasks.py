@@ -18,7 +18,7 @@ from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import GOAL, SUCCESS
 from astra_data.experiments.run import run
-from astra_data.grounding.grounding_file import load_history_model
+from astra_data.grounding.files import load_history_model
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import CollectConfig, collect

@@ -10,7 +10,8 @@ from humanoid_recipe import RECIPE
 
 from astra_data.core.progress import Progress, silent
 from astra_data.experiments.run import run
-from astra_data.grounding.grounding_file import load_grounding
+from astra_data.grounding.files import load_grounding
+from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.rma import RmaConfig
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair
@@ -68,7 +69,7 @@ def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     point = json.loads((folder / "ground" / "compass" / "seed_0" / "metrics.json").read_text())["point"]
     assert point.keys() == set(JointVariation.steering)
     ends = {name: (value, value) for name, value in point.items()}
-    assert found == JointVariation(**WIDE_RANGES.model_dump() | ends)
+    assert found == IdentifiedParameters(JointVariation(**WIDE_RANGES.model_dump() | ends))
     for method in ("domain_randomization", "compass_uniform", "compass"):
         evaluation = json.loads((folder / "evaluate" / method / "seed_0" / "evaluation.json").read_text())
         for world in ("target", "simulated", "raw"):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from astra_data.grounding.residual_simulator import AugmentedSimulator
+from astra_data.grounding.residual import ResidualSimulator
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
@@ -9,16 +9,22 @@ from astra_data.worlds.plane.point_mass import PointMass
 HERE = (-4.0, 4.0)
 
 
-def simulator(count: int, scatter: torch.Tensor | None = None) -> AugmentedSimulator:
+def simulator(count: int, scatter: torch.Tensor | None = None) -> ResidualSimulator:
     torch.manual_seed(0)
     model = ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=2))
     inner = PointMass(U_MAZE, count, timestep_s=0.05)
-    one = AugmentedSimulator(inner, model, scatter=scatter)
-    one.reset_to(torch.tensor([[*HERE, 0.0, 0.0]]).expand(count, 4), torch.arange(count))
+    one = ResidualSimulator(inner, model, scatter=scatter)
+    start(one, torch.tensor([[*HERE, 0.0, 0.0]]).expand(count, 4), torch.arange(count))
     return one
 
 
-def correct_by(one: AugmentedSimulator, offset: tuple[float, ...]) -> None:
+def start(
+    one: ResidualSimulator, state: torch.Tensor, rows: torch.Tensor, hidden: torch.Tensor | None = None
+) -> None:
+    one.start(state, rows, torch.zeros(len(rows), 2), hidden=hidden)
+
+
+def correct_by(one: ResidualSimulator, offset: tuple[float, ...]) -> None:
     """Let the model add the same offset to every step."""
     with torch.no_grad():
         one.model.output.weight.zero_()
@@ -50,7 +56,7 @@ def test_leaning_on_a_wall_is_a_touch_though_the_correction_draws_away_from_it()
     one = simulator(2)
     correct_by(one, (0.0, -0.2, 0.0, 0.0))
     near_and_far = torch.tensor([[-4.0, 5.89, 0.0, 0.0], [-4.0, 5.0, 0.0, 0.0]])
-    one.reset_to(near_and_far, torch.arange(2))
+    start(one, near_and_far, torch.arange(2))
     state = one.step(torch.tensor([[0.0, 1.0]]).expand(2, 2))
     assert float(state[0, 1]) < 5.75
     assert one.blocked.tolist() == [True, False]
@@ -63,14 +69,14 @@ def test_a_reset_empties_the_memory_of_its_rows_alone() -> None:
     for _ in range(5):
         one.step(torch.randn(3, 2))
     kept = one.hidden.clone()
-    rows, start = torch.tensor([1]), torch.tensor([[*HERE, 0.0, 0.0]])
-    one.reset_to(start, rows)
+    rows, here = torch.tensor([1]), torch.tensor([[*HERE, 0.0, 0.0]])
+    start(one, here, rows)
     assert not one.hidden[1].any()
     assert torch.equal(one.hidden[[0, 2]], kept[[0, 2]])
     action = torch.tensor([[0.3, -0.4]]).expand(3, 2)
     torch.testing.assert_close(one.step(action)[1], fresh.step(action)[1])
     known = torch.randn(1, one.model.shape.memory_size)
-    one.reset_to(start, rows, known)
+    start(one, here, rows, known)
     assert torch.equal(one.hidden[rows], known)
 
 

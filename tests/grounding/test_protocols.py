@@ -3,10 +3,11 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from astra_data.grounding.build import hidden_before, simulator_of, start_simulator
-from astra_data.grounding.grounding_file import Grounding
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.residual import ResidualGrounding
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.learning.networks.paired_windows import Windows
+from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.worlds.registry import TASKS
 
@@ -14,22 +15,22 @@ TASK = TASKS["antmaze-umaze"]
 STEPS, COUNT = 11, 3
 
 
-def history_model() -> GroundingModel:
+def history() -> HistoryGrounding:
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     with torch.no_grad():
         list(model.corrections.parameters())[-2].normal_(std=0.05)
-    return model
+    return HistoryGrounding(model)
 
 
-def residual_model() -> ResidualModel:
+def residual() -> ResidualGrounding:
     model = ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=2))
     with torch.no_grad():
         model.output.weight.normal_(std=0.5)
-    return model
+    return ResidualGrounding(model)
 
 
 @pytest.mark.parametrize("every", [1, 4])
-@pytest.mark.parametrize("make", [history_model, residual_model])
+@pytest.mark.parametrize("make", [history, residual])
 @torch.no_grad()
 def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
     make: Callable[[], Grounding], every: int
@@ -39,8 +40,8 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
     goal, action = torch.randn(COUNT, 2), 2 * torch.rand(COUNT, STEPS, 2) - 1
     start = torch.tensor([[*TASK.maze.cell_centre(1, 1), 0.0, 0.0]]).float().expand(COUNT, 4)
     rows = torch.arange(COUNT)
-    whole = simulator_of(TASK, grounding, COUNT, "cpu")
-    start_simulator(whole, start, rows, goal)
+    whole = grounding.simulator(TASK, COUNT)
+    whole.start(start, rows, goal)
     raw = TASK.simulator(COUNT)
     states, simulated = [start], []
     for step in range(STEPS):
@@ -49,7 +50,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
         states.append(whole.step(action[:, step]))
     previous = torch.cat([torch.zeros(COUNT, 1, 2), action[:, :-1]], dim=1)
     nothing = torch.zeros(COUNT, STEPS)
-    windows = Windows(
+    windows = PairedWindows(
         state=torch.stack(states[:-1], dim=1),
         action=action,
         previous_action=previous,
@@ -60,18 +61,11 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
         topples_soon=nothing,
         mask=torch.ones(COUNT, STEPS),
     )
-    hidden = hidden_before(grounding, windows, every)
+    hidden = grounding.hidden_before(windows, every)
     assert hidden is not None
     assert hidden.shape[:2] == (COUNT, -(-STEPS // every))
     for index, first in enumerate(range(0, STEPS, every)):
-        late = simulator_of(TASK, grounding, COUNT, "cpu")
-        start_simulator(
-            late, states[first], rows, goal, hidden=hidden[:, index], previous_action=previous[:, first]
-        )
+        late = grounding.simulator(TASK, COUNT)
+        late.start(states[first], rows, goal, hidden=hidden[:, index], previous_action=previous[:, first])
         for step in range(first, STEPS):
             torch.testing.assert_close(late.step(action[:, step]), states[step + 1])
-
-
-def test_what_remembers_nothing_has_no_hidden_states() -> None:
-    empty = torch.zeros(1, 1)
-    assert hidden_before(None, Windows(*[empty] * 9)) is None

@@ -1,0 +1,66 @@
+"""Groundings and target encoders on disk: safetensors files with metadata."""
+
+from pathlib import Path
+from typing import cast
+
+from astra_data.core.checkpoint import save_tensors, understood
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.parameters import IdentifiedParameters
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.residual import ResidualGrounding
+from astra_data.learning.networks.alignment import TargetEncoder
+from astra_data.learning.networks.grounding import GroundingModel
+
+KINDS: dict[str, type[FittedGrounding]] = {
+    kind.kind: kind for kind in (HistoryGrounding, ResidualGrounding, IdentifiedParameters)
+}
+"""The groundings that can be read, by what their files call them."""
+
+_TARGET_ENCODER = "target encoder"
+
+
+def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
+    """Write `grounding`, which was fitted to `episodes`, to `path`."""
+    tensors, metadata = grounding.to_file()
+    save_tensors(path, tensors, episodes.named | {"kind": grounding.kind} | metadata)
+
+
+def load_grounding(path: Path | str, device: str = "cpu") -> FittedGrounding:
+    """Read a grounding; the parameters of its networks are frozen.
+
+    Raises:
+        BadInputError: the file is missing, holds something else, or is from an older version.
+    """
+    with understood(Path(path), "a grounding", KINDS, device) as (tensors, metadata):
+        return KINDS[metadata["kind"]].from_file(tensors, metadata, device)
+
+
+def load_history_model(path: Path | str, device: str = "cpu") -> GroundingModel:
+    """Read a grounding that has to be a history model.
+
+    Raises:
+        BadInputError: as `load_grounding`, and if it is another grounding.
+    """
+    grounding = load_grounding(path, device)
+    if grounding.kind != HistoryGrounding.kind:
+        raise BadInputError(f"{path}: expected a history model, got a grounding without latents")
+    return cast(HistoryGrounding, grounding).model
+
+
+def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
+    """Write `encoder` to `path`."""
+    save_tensors(path, encoder.state_dict(), {"kind": _TARGET_ENCODER, "sizes": encoder.sizes})
+
+
+def load_target_encoder(path: Path | str, device: str = "cpu") -> TargetEncoder:
+    """Read a target encoder; its parameters are frozen.
+
+    Raises:
+        BadInputError: the file is missing, holds something else, or is from an older version.
+    """
+    with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), device) as (tensors, metadata):
+        encoder = TargetEncoder(**metadata["sizes"])
+        encoder.load_state_dict(tensors)
+    return encoder.to(device).requires_grad_(False).eval()

@@ -1,0 +1,166 @@
+"""A grounding by a history model: each step is corrected given a latent of the history (Algorithm 2)."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.paired_windows import PairedWindows
+from astra_data.worlds.protocols import PlacedSimulator
+from astra_data.worlds.task import Task
+from astra_data.worlds.variation import Variation
+
+
+class GroundedSimulator(EpisodeSimulator):
+    """Step the simulator, correct where it landed, set it there, and encode the longer history.
+
+    Attributes:
+        model: the trained grounding model; only read.
+        hidden: of its encoder, (B, Z). goal: (B, G).
+    """
+
+    def __init__(
+        self,
+        simulator: PlacedSimulator,
+        model: GroundingModel,
+        *,
+        scatter: Tensor | None = None,
+    ) -> None:
+        """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
+        super().__init__(simulator, scatter=scatter)
+        self.model = model
+        shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
+        self.latent_size = shape.latent_size
+        self.hidden = torch.zeros(count, shape.latent_size, device=device)
+        self.goal = torch.zeros(count, shape.goal_size, device=device)
+        self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
+        self._predictions = torch.zeros(1, count, shape.state_size, device=device)
+
+    @property
+    def latent(self) -> Tensor:
+        """The latents (B, Z) of the histories so far."""
+        return self.model.encoder.latent(self.hidden)
+
+    @property
+    def disagreement(self) -> Tensor:
+        """By how much more than on the data the correction's heads disagreed on the last step, (B,).
+
+        Zero before the first step, and where there is only one head.
+        """
+        if len(self._predictions) == 1:
+            return torch.zeros_like(self._predictions[0, :, 0])
+        return (self.model.disagreement(self._predictions) - 1.0).clamp_min(0.0)
+
+    @torch.no_grad()
+    def start(
+        self,
+        state: Tensor,
+        rows: Tensor,
+        goal: Tensor,
+        *,
+        hidden: Tensor | None = None,
+        previous_action: Tensor | None = None,
+    ) -> None:
+        """Start episodes in `rows` (n,); see `EpisodeSimulator.start`."""
+        super().start(state, rows, goal)
+        self.goal[rows] = goal
+        shape = self.model.shape
+        if previous_action is None:
+            previous_action = torch.zeros(len(state), shape.action_size, device=state.device)
+        if hidden is None:
+            hidden = torch.zeros(len(state), shape.latent_size, device=state.device)
+        inputs = self.model.encoder_input(state, goal, previous_action)
+        self.hidden[rows] = self.model.encoder.step(inputs, hidden)
+
+    @torch.no_grad()
+    def step(self, action: Tensor) -> Tensor:
+        """Apply `action` (B, A); return the corrected states (B, X)."""
+        before = self.state
+        self._last = self.latent, action
+        landed = self.simulator.step(action)
+        self._predictions = self.model.ensemble_predictions(*self._last, landed)
+        state = self._settle(before, self._predictions.mean(0))
+        self.hidden = self.model.encoder.step(self.model.encoder_input(state, self.goal, action), self.hidden)
+        return state
+
+    @torch.no_grad()
+    def topple_risk(self) -> Tensor:
+        """Return the probability (B,) that the target toppled in the last step."""
+        return self.model.topple_risk(*self._last, self.state)
+
+    @torch.no_grad()
+    def predicted_reward(self, own: Tensor) -> Tensor:
+        """Return the target's reward (B,) of the last step, by R_pred; see `EpisodeSimulator`."""
+        return self.model.target_reward(*self._last, own)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all that `load_state_dict` needs to go on from here."""
+        return super().state_dict() | {"goal": self.goal, "hidden": self.hidden}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state`."""
+        super().load_state_dict(state)
+        self.goal, self.hidden = state["goal"].clone(), state["hidden"].clone()
+
+
+@dataclass(frozen=True)
+class HistoryGrounding:
+    """Correct each step by a history model, whose latents policies observe."""
+
+    kind: ClassVar[str] = "history"
+    start_stride: ClassVar[int] = 1
+
+    model: GroundingModel
+
+    @property
+    def encoder(self) -> GroundingModel:
+        """The model, whose encoder is ψ^s."""
+        return self.model
+
+    def simulator(
+        self,
+        task: Task,
+        num_envs: int,
+        device: str = "cpu",
+        *,
+        variation: Variation | None = None,
+        scatter: Tensor | None = None,
+    ) -> GroundedSimulator:
+        """Build `num_envs` corrected simulators; see `Grounding.simulator`."""
+        inner = abstract_simulator(task, num_envs, device, variation)
+        return GroundedSimulator(inner, self.model, scatter=scatter)
+
+    @torch.no_grad()
+    def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
+        """Return the encoder's hidden states before every so many-th step, (E, ceil(T / every), Z)."""
+        _, after = self.model.encode(windows)
+        return functional.pad(after[:, :-1], (0, 0, 1, 0))[:, ::every]
+
+    def scatter(self, episodes: PairedEpisodes) -> Tensor:
+        """Return the factor (X, X) of the scatter around the correction, as fitted on held-out episodes."""
+        return self.model.residual_factor
+
+    def for_replay(self) -> "HistoryGrounding":
+        """Return itself."""
+        return self
+
+    def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return weights and sizes."""
+        return self.model.state_dict(), {"shape": asdict(self.model.shape), "target": self.model.target}
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
+        """Read what `to_file` returned; JSON made lists of tuples."""
+        shape: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in metadata["shape"].items()
+        }
+        model = GroundingModel(GroundingShape(**shape), metadata["target"])
+        model.load_state_dict(tensors)
+        return cls(model.to(device).requires_grad_(False).eval())

@@ -1,0 +1,86 @@
+"""What a grounding is: what a method learned about a simulator, and how it changes that simulator."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, Self
+
+from torch import Tensor
+
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.learning.networks.history import LatentEncoder
+from astra_data.learning.networks.paired_windows import PairedWindows
+from astra_data.worlds.task import Task
+from astra_data.worlds.variation import Variation
+
+
+class Grounding(Protocol):
+    """How an abstract simulator is corrected, if it is.
+
+    Attributes:
+        start_stride: episodes may start from every so many-th recorded step.
+    """
+
+    start_stride: ClassVar[int]
+
+    @property
+    def encoder(self) -> LatentEncoder | None:
+        """The source encoder ψ^s, whose latents policies observe; None where there are none."""
+        ...
+
+    def simulator(
+        self,
+        task: Task,
+        num_envs: int,
+        device: str = "cpu",
+        *,
+        variation: Variation | None = None,
+        scatter: Tensor | None = None,
+    ) -> EpisodeSimulator:
+        """Build `num_envs` abstract simulators of `task`, corrected.
+
+        Args:
+            task: the task.
+            num_envs: B.
+            device: torch device.
+            variation: ranges of the simulator's parameters, unless the grounding has its own.
+            scatter: factor (X, X) of noise that is added after each step.
+        """
+        ...
+
+    def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
+        """Return what it remembers before every so many-th step, (E, ceil(T / every), H); None if nothing.
+
+        Histories begin where `windows` (E, T, ...) do.
+        """
+        ...
+
+    def scatter(self, episodes: PairedEpisodes) -> Tensor:
+        """Return the factor (X, X) of the target's scatter around the corrected simulator."""
+        ...
+
+    def for_replay(self) -> "Grounding":
+        """Return the grounding to replay recorded actions with: without noise of sensors and actions."""
+        ...
+
+
+class FittedGrounding(Grounding, Protocol):
+    """A grounding that was fitted to pairs, and can be saved.
+
+    Attributes:
+        kind: names the class in files; see `files.KINDS`.
+    """
+
+    kind: ClassVar[str]
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
+        ...
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
+        """Rebuild it on `device`, with frozen parameters.
+
+        Raises:
+            KeyError, TypeError, ValueError, RuntimeError: something is missing or of another shape.
+        """
+        ...

@@ -1,0 +1,55 @@
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.config import load_recipe
+from astra_data.experiments.recipe import Recipe
+from astra_data.experiments.renamed import with_current_keys
+
+RECIPE = """
+task = "antmaze-umaze"
+methods = ["astra_plus"]
+seeds = [0]
+ground.correction_heads = 2
+train.{train} = 0.5
+plus.{plus} = 2.0
+"""
+
+
+def test_old_keys_are_taken_with_a_message_each(capsys: pytest.CaptureFixture[str]) -> None:
+    tables = {
+        "task": "a",
+        "train": {"ramp": 0.1, "doubt_penalty": 0.5},
+        "plus": {"doubt_penalty": 1.0},
+        "align": {},
+    }
+    for _ in range(2):
+        current = with_current_keys(tables, Path("old.toml"))
+    assert current == tables | {
+        "train": {"ramp": 0.1, "disagreement_penalty": 0.5},
+        "plus": {"disagreement_penalty": 1.0},
+    }
+    assert capsys.readouterr().err.splitlines() == [
+        f"old.toml: {table}.doubt_penalty is now called disagreement_penalty: please rename it"
+        for table in ("train", "plus")
+    ]
+
+
+def test_current_keys_are_taken_without_a_word(capsys: pytest.CaptureFixture[str]) -> None:
+    tables = {"train": {"disagreement_penalty": 0.5}, "plus": {}}
+    assert with_current_keys(tables, Path("new.toml")) == tables
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("train", ["doubt_penalty", "disagreement_penalty"])
+@pytest.mark.parametrize("plus", ["doubt_penalty", "disagreement_penalty"])
+def test_recipes_with_either_name_are_the_same_and_recorded_by_the_old_one(
+    train: str, plus: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(RECIPE.format(train=train, plus=plus))
+    recipe = load_recipe(path, Recipe)
+    assert (recipe.train.disagreement_penalty, recipe.plus.disagreement_penalty) == (0.5, 2.0)
+    recorded = recipe.settings
+    assert [recorded[table]["doubt_penalty"] for table in ("train", "plus")] == [0.5, 2.0]  # type: ignore[index, call-overload]
+    assert Recipe.model_validate(recipe.model_dump()) == recipe

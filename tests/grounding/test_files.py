@@ -1,0 +1,154 @@
+from pathlib import Path
+
+import pytest
+import torch
+from toy_episodes import no_episodes
+
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.files import (
+    KINDS,
+    load_grounding,
+    load_history_model,
+    load_target_encoder,
+    save_grounding,
+    save_target_encoder,
+)
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.parameters import IdentifiedParameters
+from astra_data.grounding.residual import ResidualGrounding
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.alignment import TargetEncoder
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.residual import ResidualModel, ResidualShape
+from astra_data.training.policy_file import PolicyFile
+from astra_data.worlds.variation import BallVariation
+
+
+def small() -> HistoryGrounding:
+    return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
+
+
+def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
+    shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
+    model = GroundingModel(shape, "detach")
+    model.set_scales({"state": torch.randn(50, 4)})
+    model.set_reward_scales(torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1))
+    assert torch.isfinite(model.failure_weight)
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, HistoryGrounding(model), no_episodes())
+    for loaded in (load_history_model(path), load_history_model(str(path))):
+        assert (loaded.shape, loaded.target, loaded.training) == (shape, "detach", False)
+        assert not any(parameter.requires_grad for parameter in loaded.parameters())
+        latent, action, state = torch.randn(3, 8), torch.randn(3, 2), torch.randn(3, 4)
+        assert torch.equal(loaded.correct(latent, action, state), model.correct(latent, action, state))
+        assert torch.equal(loaded.predict_reward(latent, action), model.predict_reward(latent, action))
+    tensors, metadata = load_tensors(path)
+    assert tensors.keys() == model.state_dict().keys()
+    assert (metadata["kind"], metadata["dataset"], metadata["hash"]) == ("history", "toy@data-1.0.0", "abc")
+
+
+def test_a_residual_model_comes_back_frozen(tmp_path: Path) -> None:
+    model = ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=2))
+    model.set_scales(torch.randn(50, 4), torch.randn(50, 4))
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, ResidualGrounding(model), no_episodes())
+    found = load_grounding(str(path))
+    assert isinstance(found, ResidualGrounding)
+    loaded = found.model
+    assert (loaded.shape, loaded.training) == (model.shape, False)
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
+    given = torch.randn(3, 5, 4), torch.randn(3, 5, 2), torch.randn(3, 5, 4), model.initial_memory(3)
+    # Not to the bit: torch's LSTM rounds differently in training.
+    for ours, theirs in zip(model.correct(*given), loaded.correct(*given), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
+        load_history_model(path)
+
+
+def test_identified_parameters_come_back(tmp_path: Path) -> None:
+    grounding = IdentifiedParameters(BallVariation(friction=(0.9, 1.1), ball_friction=(0.5, 0.5)))
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, grounding, no_episodes())
+    assert load_grounding(path) == grounding
+    tensors, _ = load_tensors(path)
+    assert torch.equal(tensors["ranges"][0], torch.tensor([0.9, 1.1]))
+
+
+def test_a_grounding_of_the_users_own_is_read_once_it_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Own(IdentifiedParameters):
+        kind = "own"
+
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, Own(BallVariation()), no_episodes())
+    with pytest.raises(BadInputError, match="found kind own"):
+        load_grounding(path)
+    monkeypatch.setitem(KINDS, "own", Own)
+    assert load_grounding(path) == Own(BallVariation())
+
+
+def test_a_policy_is_no_grounding(tmp_path: Path) -> None:
+    path = tmp_path / "grounding.safetensors"
+    policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8))
+    PolicyFile(policy, None, "toy@data-1.0.0", "abc").save(path)
+    with pytest.raises(
+        BadInputError,
+        match=r"grounding.safetensors: expected a grounding \(kind history or residual or variation\), "
+        r"found kind actor_critic: run that stage again$",
+    ):
+        load_grounding(path)
+
+
+@pytest.mark.parametrize(
+    ("lacks", "found"),
+    [("kind", "a file without a kind"), ("shape", "no 'shape'"), ("target", "no 'target'")],
+)
+def test_a_grounding_of_an_older_version_is_refused(lacks: str, found: str, tmp_path: Path) -> None:
+    path = tmp_path / "grounding.safetensors"
+    save_grounding(path, small(), no_episodes())
+    tensors, metadata = load_tensors(path)
+    save_tensors(path, tensors, {key: value for key, value in metadata.items() if key != lacks})
+    with pytest.raises(BadInputError, match=f"expected a grounding .*found {found}: run that stage again$"):
+        load_grounding(path)
+
+
+def test_a_grounding_with_other_sizes_or_weights_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "grounding.safetensors"
+    model = ResidualModel(ResidualShape(4, 2, hidden_size=8))
+    save_grounding(path, ResidualGrounding(model), no_episodes())
+    tensors, metadata = load_tensors(path)
+    save_tensors(path, tensors, metadata | {"shape": metadata["shape"] | {"depth": 2}})
+    with pytest.raises(BadInputError, match=r"found .* unexpected keyword argument 'depth': run that stage"):
+        load_grounding(path)
+    save_tensors(path, {"weight": torch.zeros(1)}, metadata)
+    with pytest.raises(BadInputError, match=r'found .*Unexpected key.*"weight".*: run that stage again$'):
+        load_grounding(path)
+
+
+def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
+    encoder = TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8, position_octaves=3)
+    state, goal, action = torch.randn(5, 29), torch.randn(5, 2), torch.randn(5, 3)
+    encoder.set_scales(3 * state, goal)
+    path = tmp_path / "encoder.safetensors"
+    save_target_encoder(path, encoder)
+    loaded = load_target_encoder(str(path))
+    assert not loaded.training and not any(parameter.requires_grad for parameter in loaded.parameters())
+    inputs = loaded.encoder_input(state, goal, action)
+    assert torch.equal(inputs, encoder.encoder_input(state, goal, action))
+    assert torch.equal(loaded.encoder(inputs[None])[0], encoder.encoder(inputs[None])[0])
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [("kind", r"\(kind target encoder\), found a file without a kind"), ("sizes", "found no 'sizes'")],
+)
+def test_what_is_no_target_encoder_is_refused(missing: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "encoder.safetensors"
+    save_target_encoder(path, TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8))
+    tensors, metadata = load_tensors(path)
+    del metadata[missing]
+    save_tensors(path, tensors, metadata)
+    with pytest.raises(BadInputError, match=f"expected a target encoder .*{message}"):
+        load_target_encoder(path)
