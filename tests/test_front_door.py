@@ -86,7 +86,7 @@ def test_examples_run(name: str, folder: Path, tmp_path: Path, monkeypatch: pyte
 
 def test_an_unknown_name_is_answered_with_the_known_ones() -> None:
     with pytest.raises(AttributeError, match=r"no attribute 'Datset'; it has Column, Dataset, "):
-        astra_data.Datset  # type: ignore[attr-defined] # noqa: B018
+        astra_data.Datset  # noqa: B018
 
 
 def test_importing_the_package_loads_nothing() -> None:

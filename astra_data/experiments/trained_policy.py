@@ -7,6 +7,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method, place
 from astra_data.experiments.plan import grounded_as
 from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.policy_file import PolicyFile, deploy
@@ -51,6 +52,6 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
     return deploy(
         task_named(json.loads(recipe.read_text())["task"]),
         PolicyFile.load(files["train"]),
-        load_grounding(files["ground"]) if method.grounds else None,
+        load_grounding(files["ground"]) if method.grounds else NO_GROUNDING,
         load_target_encoder(files["align"]) if method.aligns else None,
     )
