@@ -12,7 +12,7 @@ from astra_data.grounding.build import Simulator, remembering_within, start_simu
 from astra_data.grounding.residual_simulator import AugmentedSimulator
 from astra_data.grounding.simulator import GroundedSimulator
 from astra_data.worlds.batched import Step
-from astra_data.worlds.objective import Objective, PlanarObjective
+from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.free_space import FreeSpace
 
 RewardSource = Literal["abstract", "predicted", "blend"]
@@ -98,10 +98,8 @@ class SimulatorWorld:
         self.caution = 1.0
         self.risk_weight = risk_weight
         self.command_limit_m_s = command_limit_m_s
-        self.free, self._ends_at_walls = None, False
-        if isinstance(objective, PlanarObjective):
-            self.free = FreeSpace.of_maze(objective.maze, radius_m=0.0, device=str(simulator.state.device))
-            self._ends_at_walls = objective.ends_at_walls
+        maze, device = objective.layout, str(simulator.state.device)
+        self.free = None if maze is None else FreeSpace.of_maze(maze, radius_m=0.0, device=device)
         self.thinness = thinness
         self.doubt_penalty = doubt_penalty
         self.starts = starts
@@ -159,7 +157,7 @@ class SimulatorWorld:
         after = self.simulator.step(action)
         success = self.objective.reached(after, self.goal)
         self.failed = self.objective.missed(after, self.goal)
-        if self._ends_at_walls:
+        if self.objective.ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
         decided = success | self.failed
         penalty = torch.zeros(self.num_envs, device=self.device)
