@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.worlds.batched import Step
-from astra_data.worlds.objective import Objective, PlanarObjective
+from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.free_space import FreeSpace
 
 RewardSource = Literal["abstract", "predicted", "blend"]
@@ -96,10 +96,8 @@ class SimulatorWorld:
         self.penalty_scale = 1.0
         self.risk_weight = risk_weight
         self.command_limit_m_s = command_limit_m_s
-        self.free, self._ends_at_walls = None, False
-        if isinstance(objective, PlanarObjective):
-            self.free = FreeSpace.of_maze(objective.maze, radius_m=0.0, device=str(simulator.state.device))
-            self._ends_at_walls = objective.ends_at_walls
+        maze, device = objective.layout, str(simulator.state.device)
+        self.free = None if maze is None else FreeSpace.of_maze(maze, radius_m=0.0, device=device)
         self.thinness = thinness
         self.disagreement_penalty = disagreement_penalty
         self.starts = starts
@@ -151,7 +149,7 @@ class SimulatorWorld:
         after = self.simulator.step(self.objective.limit_command(action, self.command_limit_m_s))
         success = self.objective.reached(after, self.goal)
         self.failed = self.objective.missed(after, self.goal)
-        if self._ends_at_walls:
+        if self.objective.ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
         decided = success | self.failed
         penalty = torch.zeros(self.num_envs, device=self.device)

@@ -1,4 +1,4 @@
-"""What a task asks for, on abstract states: the same in every world, so that rewards compare."""
+"""What a task asks for, on abstract states: the same in target and simulator, so that rewards compare."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -19,9 +19,10 @@ class Objective(ABC):
 
     Attributes:
         horizon: steps until an episode is cut off.
-        success_reward: for reaching the goal. failure_reward: for ending badly.
+        success_reward: for reaching the goal. failure_reward: for a failure.
+        ends_at_walls: whether touching a wall is a failure, which ends an episode.
         is_lasting: whether success is to last to the horizon, not to reach something before.
-        action_size: A. goal_size: G, 0 where there is nothing to tell apart.
+        action_size: A. goal_size: G, 0 where all episodes have the same goal.
 
     Example:
         >>> import numpy as np
@@ -38,6 +39,12 @@ class Objective(ABC):
     horizon: int = field(kw_only=True)
     success_reward: float = field(default=10.0, kw_only=True)
     failure_reward: float = field(default=-10.0, kw_only=True)
+    ends_at_walls: bool = field(default=False, kw_only=True)
+
+    @property
+    def layout(self) -> Maze | None:
+        """The maze that it happens in; None by default."""
+        return None
 
     @property
     def scores(self) -> tuple[Score, ...]:
@@ -54,10 +61,10 @@ class Objective(ABC):
 
     @abstractmethod
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Assemble what a policy sees of states (..., X) and goals (..., G), each part about one long."""
+        """Assemble what a policy sees of states (..., X) and goals (..., G), each part scaled to about 1."""
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
-        """Clip actions (..., A) to ±1; a `limit` in m/s is for velocities alone, and without effect here."""
+        """Clip actions (..., A) to ±1; `limit`, in m/s, has no effect on actions that are no velocities."""
         return action.clamp(-1.0, 1.0)
 
     @abstractmethod
@@ -65,11 +72,17 @@ class Objective(ABC):
         """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
 
     def places(self, state: Tensor) -> Tensor:
-        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of nothing, K = 0."""
+        """Return x and y in m of the K bodies that move in the plane, (..., 2 K); by default K = 0."""
         return state[..., :0]
 
     def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
-        """Tell which episodes (B,) succeed in their `step`, from 1 on, that `reached` or `failed` (B,)."""
+        """Tell which episodes (B,) succeed in their `step`, counted from 1.
+
+        Args:
+            reached: whether the goal was reached in it, (B,) bool.
+            failed: whether it was a failure, (B,) bool.
+            step: its number.
+        """
         return ~failed if self.is_lasting and step >= self.horizon else reached
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -78,7 +91,7 @@ class Objective(ABC):
 
     @abstractmethod
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
-        """Return the reward (B,) of a step between states (B, X), which perhaps ended badly (B,)."""
+        """Return the reward (B,) of a step between states (B, X), a failure where `failed` (B,)."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +100,17 @@ class PlanarObjective(Objective):
 
     Attributes:
         maze: where it happens.
-        ends_at_walls: whether touching a wall is a failure, which ends an episode.
     """
 
     action_size = 2
     goal_size = 2
 
     maze: Maze
-    ends_at_walls: bool = field(default=False, kw_only=True)
+
+    @property
+    def layout(self) -> Maze:
+        """The maze that it happens in."""
+        return self.maze
 
     @abstractmethod
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -108,5 +124,5 @@ class PlanarObjective(Objective):
         return torch.cat([command * shorten, rest], dim=-1)
 
     def places(self, state: Tensor) -> Tensor:
-        """Return x and y in m of what moves in states (..., X), (..., 2 K): by default of the robot alone."""
+        """Return x and y in m of the bodies in states (..., X); by default of the robot alone, (..., 2)."""
         return state[..., :2]

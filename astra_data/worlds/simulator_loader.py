@@ -1,4 +1,4 @@
-"""What pairing needs of an abstract simulator: those of the tasks, and your own."""
+"""Load the abstract simulator that a dataset is paired with: of a task, or from a file of the user's."""
 
 import importlib.util
 import sys
@@ -23,9 +23,9 @@ class Pairing:
     """An abstract simulator, and the map φ to its states.
 
     Attributes:
-        id: names the simulator in the dataset.
-        origin: where it comes from: the task that it belongs to, or the sha256 of the file.
-        maze: the one that it has, if it belongs to a task with one.
+        id: the simulator's name in the dataset.
+        origin: the task that it belongs to, or the sha256 of its file.
+        maze: that of the task; None where there is none.
         abstract_state: the column of abstract states, with names, units, frames and roles.
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
         simulator: builds B simulators.
@@ -40,13 +40,12 @@ class Pairing:
 
 
 def pairing_named(name: str) -> Pairing:
-    """Return the simulator of the task `name`, or the class `path.py:MySim` of a file of yours.
+    """Return the simulator of the task `name`, or the class `path.py:MySim` of a user's file.
 
-    Your class is built as `MySim(num_envs)`, is an `AbstractSimulator`, and has two attributes more:
-    `abstract_state`, a `Column`, and `abstraction`, a static method.
+    The class is an `OwnSimulator` of `astra_data.worlds.protocols`.
 
     Raises:
-        BadInputError: there is no such task, file or class, or the class lacks something.
+        BadInputError: there is no such task, file or class, or the class lacks an attribute.
     """
     if ".py:" not in name:
         if name not in TASKS and name.endswith(".py"):
@@ -61,7 +60,8 @@ def pairing_named(name: str) -> Pairing:
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]
     if missing:
         raise BadInputError(
-            f"{name} has no {', '.join(missing)}; see astra_data.worlds.protocols and .pairing"
+            f"{name} has no {', '.join(missing)}: expected what astra_data.worlds.protocols asks of an "
+            "OwnSimulator"
         )
     column = made.abstract_state
     if not isinstance(column, Column):
@@ -77,8 +77,8 @@ def _load_class(path: Path, kind: str) -> Any:  # noqa: ANN401 - any class
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for it
-    with explained(f"{path}, imported,"):
+    sys.modules[spec.name] = module  # dataclasses look it up there
+    with explained(f"importing {path}"):
         spec.loader.exec_module(module)
     if not hasattr(module, kind):
         known = [key for key, value in vars(module).items() if isinstance(value, type)]
@@ -88,7 +88,7 @@ def _load_class(path: Path, kind: str) -> Any:  # noqa: ANN401 - any class
 
 @contextmanager
 def explained(what: str) -> Iterator[None]:
-    """Turn an exception of a user's code into one line that begins with `what`.
+    """Turn an exception of the user's code into an error of one line that begins with `what`.
 
     Raises:
         BadInputError: for any exception.
@@ -105,7 +105,7 @@ def built(pairing: Pairing, count: int) -> AbstractSimulator:
     """Build `count` simulators.
 
     Raises:
-        BadInputError: that fails, or they lack what an `AbstractSimulator` has.
+        BadInputError: building them fails, or their states or parameters are of the wrong kind.
     """
     with explained(f"{pairing.id}({count})"):
         batch = pairing.simulator(count)
@@ -123,7 +123,7 @@ def checked_abstraction(pairing: Pairing, state: Array) -> Array:
     """Return φ(state), (B, X) float32, for `state` (B, S).
 
     Raises:
-        BadInputError: φ does not take such states, or does not give abstract states.
+        BadInputError: φ fails on such states, or returns another shape.
     """
     expected = (len(state), pairing.abstract_state.size)
     with explained(f"the abstraction of {pairing.id}, given states {state.shape},"):

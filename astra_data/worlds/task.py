@@ -11,7 +11,7 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
 from astra_data.worlds.batched import TargetEnv
-from astra_data.worlds.objective import Objective, PlanarObjective
+from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import TaskSimulator, VariableSimulator
 from astra_data.worlds.variation import Variation, VariedSimulator
@@ -124,9 +124,9 @@ class Task:
         Raises:
             BadInputError: there is none.
         """
-        if not isinstance(self.objective, PlanarObjective):
+        if self.objective.layout is None:
             raise self.without_maze()
-        return self.objective.maze
+        return self.objective.layout
 
     def without_maze(self) -> BadInputError:
         """Return the error of who asks for something planar though there is no maze."""

@@ -1,14 +1,9 @@
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.methods.follower import careful
-from astra_data.training.behaviors import WallWatch
-from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.registry import TASKS, task_named
 from astra_data.worlds.task import Task
@@ -75,35 +70,6 @@ def test_an_unknown_task_answers_with_the_known_ones() -> None:
         task_named("antmaze-umase")
 
 
-def test_who_asks_for_a_maze_where_there_is_none_is_told() -> None:
-    nowhere = TASKS["humanoid-walker2d"]
-    asked: list[Callable[[], object]] = [
-        lambda: nowhere.maze,
-        lambda: WallWatch(nowhere, 0.2),
-        lambda: careful(nowhere, torch.zeros(1, 0)),
-    ]
-    for ask in asked:
-        with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):
-            ask()
-
-
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_a_task_in_a_maze_has_an_objective_there(task: Task) -> None:
-    assert isinstance(task.objective, PlanarObjective) == (task.plane is not None)
-
-
-@pytest.mark.parametrize(("name", "metres"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])
-def test_names_tell_rewards_apart(name: str, metres: float) -> None:
-    task = TASKS[f"antmaze-umaze{name}"]
-    start = torch.tensor([task.maze.cell_centre(*task.maze.start)])
-    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)])
-    # Half a metre straight at the goal, which is behind a wall: the path round the wall's corner, 6 m to the
-    # right of the start and 2 m down, is sqrt(6² + 2²) - sqrt(6² + 1.5²) metres shorter.
-    after = start + torch.tensor([[0.0, -0.5]])
-    reward = task.objective.reward(start, after, goal, torch.zeros(1))
-    assert float(reward) == pytest.approx(metres, abs=0.04)
-
-
-def test_only_the_kicking_tasks_have_a_ball() -> None:
-    balls = {name: task.ball_index for name, task in TASKS.items() if task.ball_index is not None}
-    assert balls == {"nao-kick": 4}
+    assert (task.objective.layout is None) == (task.plane is None)

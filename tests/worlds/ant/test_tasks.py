@@ -1,0 +1,73 @@
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE
+from astra_data.worlds.ant.body import ant_model
+from astra_data.worlds.ant.tasks import ANTMAZE_TASKS
+from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE
+from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.registry import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+
+
+def test_two_mazes_with_three_rewards_each() -> None:
+    names = ["antmaze-umaze", "antmaze-long"]
+    assert [task.name for task in ANTMAZE_TASKS] == [
+        f"{name}{reward}" for name in names for reward in ("", "-euclidean", "-sparse")
+    ]
+    assert [task.maze for task in ANTMAZE_TASKS] == [U_MAZE] * 3 + [LONG_MAZE] * 3
+    assert [task.objective.horizon for task in ANTMAZE_TASKS] == [700] * 3 + [1000] * 3
+
+
+def test_states_are_named_as_mujoco_orders_them() -> None:
+    model = ant_model()
+    columns = {column.name: column for column in TASK.state_columns}
+    joints = [model.joint(joint).name for joint in range(1, model.njnt)]
+    expected = ("x", "y", "z", "qw", "qx", "qy", "qz", *joints)
+    rates = ("vx", "vy", "vz", "wx", "wy", "wz", *(f"{joint}_rate" for joint in joints))
+    assert columns[STATE].names == columns[NEXT_STATE].names == (*expected, *rates)
+    assert columns[STATE].size == model.nq + model.nv
+    assert (columns[GOAL].size, columns[ACTION].size) == (2, 2)
+    data = mujoco.MjData(model)
+    data.qvel[3:6] = [0.0, 0.0, 1.0]
+    data.qpos[3:7] = [0.5**0.5, 0.5**0.5, 0.0, 0.0]  # rolled by 90 degrees: its z axis points along -y
+    mujoco.mj_forward(model, data)
+    world = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, world, 0)
+    np.testing.assert_allclose(world[:3], [0.0, -1.0, 0.0], atol=1e-12)
+    # So the angular velocity is told in the body's frame, as the column says.
+    words = columns[STATE].astra or {}
+    assert words["frame"][18:21] == ["body"] * 3 and words["frame"][15:18] == ["world"] * 3
+
+
+def test_the_point_mass_is_as_fast_as_the_longest_command() -> None:
+    assert TASK.simulator(1).parameters == {"timestep_s": 0.05, "radius_m": 0.1, "speed_m_s": 1.0}
+    assert TASK.abstract_state.names == ("x", "y", "vx", "vy")
+    assert {name: list(group) for name, group in TASK.quantities.items()} == {
+        "position_m": [0, 1],
+        "velocity_m_s": [2, 3],
+    }
+    assert TASK.planar.wall_reach_m == 1.3
+
+
+@pytest.mark.parametrize(("name", "metres"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])
+def test_names_tell_rewards_apart(name: str, metres: float) -> None:
+    task = TASKS[f"antmaze-umaze{name}"]
+    start = torch.tensor([task.maze.cell_centre(*task.maze.start)])
+    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)])
+    # Half a metre straight at the goal, which is behind a wall: the path round the wall's corner, 6 m to the
+    # right of the start and 2 m down, is sqrt(6² + 2²) - sqrt(6² + 1.5²) metres shorter.
+    after = start + torch.tensor([[0.0, -0.5]])
+    reward = task.objective.reward(start, after, goal, torch.zeros(1))
+    assert float(reward) == pytest.approx(metres, abs=0.04)
+
+
+def test_starts_of_the_sparse_task_are_those_of_the_others() -> None:
+    objectives = [task.objective for task in ANTMAZE_TASKS[:3]]
+    assert all(isinstance(objective, Navigation) for objective in objectives)
+    starts = [objective.draw_starts(np.random.default_rng(0), 4) for objective in objectives]
+    np.testing.assert_array_equal(starts[0], starts[1])
+    np.testing.assert_array_equal(starts[0], starts[2])

@@ -1,0 +1,106 @@
+"""Every target keeps the promises of `TargetEnv` that collecting, evaluating and learning rely on."""
+
+import inspect
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.worlds.batched import BatchedEnv, TargetEnv
+from astra_data.worlds.registry import TASKS
+
+TARGETS = {name: TASKS[name] for name in ("antmaze-umaze", "nao-navigation", "nao-kick", "humanoid-extended")}
+COUNT = 3
+
+
+def target(name: str, seed: int = 0) -> TargetEnv:
+    env = TARGETS[name].target(COUNT, seed=seed, num_threads=1)
+    env.reset()
+    return env
+
+
+def actions(env: TargetEnv, steps: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return 2 * torch.rand(steps, COUNT, env.action_size, generator=generator) - 1
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_shapes_and_types_are_those_of_the_protocol(name: str) -> None:
+    env = target(name)
+    for protocol in (BatchedEnv, TargetEnv):
+        for member, value in vars(protocol).items():
+            assert member.startswith("_") or not inspect.isfunction(value) or callable(getattr(env, member))
+    observation = env.reset()
+    step = env.step(actions(env, 1)[0])
+    assert observation.shape == step.observation.shape == (COUNT, env.observation_size)
+    assert env.num_envs == COUNT and env.position.shape[0] == COUNT and env.state.shape[0] == COUNT
+    for values in (observation, step.observation, step.reward, env.state, env.position, env.goal):
+        assert values.dtype == torch.float32
+    for flags in (step.terminated, step.success, env.failed, env.wall_contact):
+        assert flags.dtype == torch.bool and flags.shape == (COUNT,)
+    assert step.reward.shape == (COUNT,)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_rows_outside_of_a_mask_go_on(name: str) -> None:
+    env, other = target(name), target(name)
+    for action in actions(env, 3):
+        before = env.step(action).observation
+        other.step(action)
+    after = env.reset(torch.tensor([False, True, False]))
+    assert (after == before).all(1).tolist() == [True, False, True]
+    env.reset(torch.zeros(COUNT, dtype=torch.bool))
+    state = env.state
+    step = env.step(actions(env, 1)[0], torch.tensor([True, True, False]))
+    assert torch.equal(env.state[2], state[2])
+    assert not torch.equal(env.state[:2], state[:2])
+    assert torch.equal(step.observation[2], after[2])
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_nothing_restarts_by_itself(name: str) -> None:
+    env = target(name)
+    for action in actions(env, 2):
+        step = env.step(action)
+        assert torch.equal(step.observation, env.reset(torch.zeros(COUNT, dtype=torch.bool)))
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_seeds_repeat_starts_and_goals(name: str) -> None:
+    env, other = target(name, 1), target(name, 2)
+    assert not torch.equal(env.state, other.state)
+    for one in (env, other):
+        one.reseed(7)
+        one.reset()
+    assert torch.equal(env.goal, other.goal)
+    assert torch.equal(env.state, other.state)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_it_goes_on_from_a_saved_state(name: str) -> None:
+    env, fresh = target(name), target(name)
+    for action in actions(env, 4):
+        env.step(action)
+    fresh.reset()
+    fresh.step(actions(env, 5)[4])
+    saved = {key: values.clone() for key, values in env.state_dict().items()}
+    first = [env.step(action) for action in actions(env, 3)]
+    fresh.load_state_dict(saved)
+    assert torch.equal(fresh.goal, env.goal)
+    for step, action in zip(first, actions(env, 3), strict=True):
+        again = fresh.step(action)
+        assert torch.equal(again.observation, step.observation)
+        assert torch.equal(again.reward, step.reward)
+        assert torch.equal(again.terminated, step.terminated)
+
+
+@pytest.mark.parametrize("name", ["antmaze-umaze", "humanoid-extended"])
+def test_a_target_set_to_a_recorded_state_shows_it(name: str) -> None:
+    env = target(name)
+    for action in actions(env, 3):
+        env.step(action)
+    recorded = env.state
+    env.reset()
+    env.reset_to(np.array([2, 0]), recorded[[2, 0]].double().numpy())
+    assert torch.equal(env.state[[2, 0]], recorded[[2, 0]])
+    assert not torch.equal(env.state[1], recorded[1])

@@ -1,0 +1,112 @@
+import hashlib
+import sys
+from pathlib import Path
+
+import my_simulator
+import numpy as np
+import pytest
+import torch
+
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.simulator_loader import built, checked_abstraction, explained, pairing_named
+
+MINE = Path(my_simulator.__file__)
+STATES = np.arange(87, dtype=np.float32).reshape(3, 29)
+
+
+def test_a_task_brings_its_own_simulator() -> None:
+    pairing, task = pairing_named("antmaze-umaze"), TASKS["antmaze-umaze"]
+    assert (pairing.id, pairing.origin, pairing.maze) == ("point_mass", {"task": "antmaze-umaze"}, U_MAZE)
+    assert pairing.abstract_state == task.abstract_state
+    assert built(pairing, 5).state.shape == (5, 4)
+    np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
+    assert pairing_named("humanoid-kinematics").maze is None
+
+
+def test_a_class_of_a_file_is_known_by_its_name_and_the_files_digest() -> None:
+    pairing = pairing_named(f"{MINE}:Glider")
+    assert (pairing.id, pairing.maze) == ("Glider", None)
+    assert pairing.origin == {"file_sha256": hashlib.sha256(MINE.read_bytes()).hexdigest()}
+    batch = built(pairing, 2)
+    batch.reset_to(torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
+    batch.reset_to(torch.tensor([[5.0, 6.0]]), torch.tensor([1]))
+    assert batch.step(torch.tensor([[2.0, 0.0], [0.0, -2.0]])).tolist() == pytest.approx(
+        np.array([[1.1, 2.0], [5.0, 5.9]])
+    )
+    np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, :2])
+
+
+def test_abstract_states_are_stored_as_float32_under_their_own_name(tmp_path: Path) -> None:
+    file = tmp_path / "sim.py"
+    file.write_text(
+        "import my_simulator\n"
+        "from astra_data.dataset.columns import Column\n"
+        "class Wide(my_simulator.Glider):\n"
+        "    abstract_state = Column('place', size=2)\n"
+        "    @staticmethod\n"
+        "    def abstraction(state):\n"
+        "        return state[:, 1::-1].astype('float64')\n"
+    )
+    pairing = pairing_named(f"{file}:Wide")
+    assert pairing.abstract_state.name == "abstract.state"
+    abstract = checked_abstraction(pairing, STATES)
+    assert abstract.dtype == np.float32 and abstract.flags.c_contiguous
+    np.testing.assert_array_equal(abstract, STATES[:, [1, 0]])
+    assert "simulator_of_sim" in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("1 / 0", r"importing .*sim.py fails with ZeroDivisionError: division by zero; ASTRA_DATA_DEBUG=1"),
+        ("class Other: pass", r"sim.py has no class 'Mine'; it has Other$"),
+        (
+            "class Mine: pass",
+            r"has no abstract_state, abstraction, parameters, reset_to, step: expected what a",
+        ),
+        (
+            "class Mine:\n    abstract_state = abstraction = parameters = reset_to = step = 1",
+            r"sim.py:Mine.abstract_state is a int, expected a Column",
+        ),
+    ],
+)
+def test_a_file_without_a_simulator_is_refused(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "sim.py").write_text(text)
+    with pytest.raises(BadInputError, match=told):
+        pairing_named(f"{tmp_path}/sim.py:Mine")
+
+
+def test_a_file_without_a_class_is_no_task() -> None:
+    with pytest.raises(BadInputError, match=r"mine.py: expected the class after a colon, as in mine.py:My"):
+        pairing_named("mine.py")
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("Narrow", r"Narrow\(4\).state has shape \(4, 1\), expected \(4, 2\)"),
+        ("Bare", r"Bare.parameters: expected numbers or texts for maze"),
+        ("Clumsy", r"Clumsy\(4\) fails with TypeError"),
+    ],
+)
+def test_a_batch_of_another_kind_is_refused(kind: str, told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        built(pairing_named(f"{MINE}:{kind}"), 4)
+
+
+def test_a_map_to_another_shape_is_refused() -> None:
+    with pytest.raises(BadInputError, match=r"Wide makes \(3, 3\) of states \(3, 29\), expected \(3, 2\)"):
+        checked_abstraction(pairing_named(f"{MINE}:Wide"), STATES)
+    with pytest.raises(BadInputError, match=r"Greedy, given states \(3, 29\), fails with IndexError"):
+        checked_abstraction(pairing_named(f"{MINE}:Greedy"), STATES)
+
+
+def test_errors_of_the_users_code_keep_their_cause() -> None:
+    with (
+        pytest.raises(BadInputError, match=r"^the wheel fails with ValueError: flat; ") as caught,
+        explained("the wheel"),
+    ):
+        raise ValueError("flat")
+    assert isinstance(caught.value.__cause__, ValueError)

@@ -1,0 +1,73 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Column
+from astra_data.methods.follower import careful
+from astra_data.training.behaviors import WallWatch
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import roles
+from astra_data.worlds.variation import BallVariation, PlanarVariation
+
+ANT, WALKER, KICK = (TASKS[name] for name in ("antmaze-umaze", "humanoid-walker2d", "nao-kick"))
+
+
+def test_what_needs_a_maze_is_refused_where_there_is_none() -> None:
+    assert ANT.maze is U_MAZE and ANT.planar is ANT.plane
+    asked: list[Callable[[], object]] = [
+        lambda: WALKER.maze,
+        lambda: WALKER.planar,
+        lambda: WallWatch(WALKER, 0.2),
+        lambda: careful(WALKER, torch.zeros(1, 0)),
+    ]
+    for ask in asked:
+        with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):
+            ask()
+
+
+def test_targets_are_shared_by_the_tasks_that_say_so() -> None:
+    assert WALKER.shares_target(TASKS["humanoid-kinematics"])
+    assert not WALKER.shares_target(ANT)
+    assert not ANT.shares_target(ANT) and not ANT.shares_target(TASKS["antmaze-long"])
+
+
+def test_steps_per_second_are_whole_numbers() -> None:
+    assert [task.fps for task in (ANT, WALKER, KICK)] == [20, 67, 5]
+
+
+def test_only_quantities_of_a_ball_make_a_ball() -> None:
+    assert (ANT.ball_index, WALKER.ball_index, KICK.ball_index) == (None, None, 4)
+    shifted = replace(KICK, quantities={"ball_position_m": (6, 7)})
+    assert shifted.ball_index == 6
+
+
+def test_the_target_gets_the_objective_and_the_options() -> None:
+    env = ANT.target(3, seed=0, num_threads=1, leg_scale=1.25)
+    assert env.num_envs == 3
+    assert (env.objective, env.leg_scale) == (ANT.objective, 1.25)  # type: ignore[attr-defined]
+
+
+def test_ranges_are_completed_to_those_that_the_simulator_has() -> None:
+    varied = KICK.varied_simulator(2, PlanarVariation(friction=(0.5, 0.5)))
+    assert isinstance(varied, VariedPlanar)
+    assert varied.variation == BallVariation(friction=(0.5, 0.5))
+    expected = torch.tensor([0.5, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0])
+    assert torch.equal(varied.parameters, expected.expand(2, 11))
+    start = torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]]).expand(2, 8)
+    varied.reset_to(start)
+    # 0.25 m/s at half the friction's factor.
+    assert varied.step(torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3))[0, 2].item() == pytest.approx(0.125)
+
+
+def test_roles_become_what_a_column_takes() -> None:
+    words = roles(("a", "b"), ["m", "m"], ["world", "world"], ["position", "position"])
+    column = Column("place", size=2, **words)
+    assert column.names == ("a", "b")
+    assert column.astra == {"unit": ["m", "m"], "frame": ["world"] * 2, "role": ["position"] * 2}
+    mirrored = roles(("a",), ["rad"], ["joint"], ["invariant"], ["-a"])
+    assert mirrored["astra"]["mirror"] == ["-a"]
