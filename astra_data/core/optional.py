@@ -1,4 +1,4 @@
-"""Packages that not everybody needs."""
+"""Packages of the optional extras."""
 
 from importlib import import_module
 from typing import Any
@@ -7,7 +7,7 @@ from astra_data.core.errors import BadInputError
 
 
 def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
-    """Import a module of one of the optional extras.
+    """Import `module`, which is installed with the optional extra `extra`.
 
     Raises:
         BadInputError: it is not installed; the message says how to install it.
