@@ -1,1 +1,1 @@
-"""What every room uses: no robot and no data is known here."""
+"""Foundations of all other rooms; nothing here knows robots or datasets."""

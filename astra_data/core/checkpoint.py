@@ -1,4 +1,4 @@
-"""Weights and training states on disk: safetensors and JSON, whole or not at all, nothing unpickled."""
+"""Weights and training states on disk, as safetensors and JSON: written atomically, never pickled."""
 
 import json
 import os
@@ -19,11 +19,11 @@ from astra_data.core.errors import BadInputError
 type Nested = (
     Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
 )
-"""What a training state is made of, such as an optimizer's `state_dict()`."""
+"""A training state, such as an optimizer's `state_dict()`."""
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write `tensors` and `metadata` (JSON values) to `path`; a file already there is replaced at once.
+    """Write `tensors` and `metadata` (JSON values) to `path`; an existing file is replaced atomically.
 
     Raises:
         BadInputError: there are no tensors.
@@ -32,8 +32,8 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
         raise BadInputError(f"{path}: expected at least one tensor to save")
     partial = path.with_name(f".{path.name}.partial")
     # safetensors refuses tensors that share memory, such as tied weights or views.
-    own = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
-    data = save(own, {key: json.dumps(value) for key, value in metadata.items()})
+    copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
+    data = save(copies, {key: json.dumps(value) for key, value in metadata.items()})
     partial.write_bytes(_with_sorted_metadata(data))
     os.replace(partial, path)
 
@@ -69,11 +69,10 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 @contextmanager
 def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Yield the state in `checkpoint`, as `flatten` took it, and the metadata; the block goes on from them.
+    """Yield the state (as passed to `flatten`) and the metadata of `checkpoint`; the block resumes from them.
 
     Raises:
-        BadInputError: it cannot be read, or the block does not find in it what it needs, as in one from an
-            older version.
+        BadInputError: it cannot be read, or lacks something that the block needs, as one of an older version.
     """
     try:
         tensors, metadata = load_tensors(checkpoint)
@@ -83,7 +82,7 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
         yield unflatten(tensors), metadata
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise BadInputError(
-            f"{checkpoint}: expected what this version began, found something else ({error}): "
+            f"{checkpoint}: expected a checkpoint of this version, found something else ({error}): "
             f"remove {checkpoint.parent}"
         ) from error
 
@@ -97,12 +96,12 @@ def understood(
     Args:
         path: written by `save_tensors`.
         what: for messages, such as "a policy".
-        kinds: what the metadata's "kind" may be.
+        kinds: accepted values of the metadata's "kind".
         device: torch device.
 
     Raises:
-        BadInputError: the file cannot be read, is of another kind, or the block does not find in it what it
-            needs, as in one from an older version.
+        BadInputError: the file cannot be read, is of another kind, or lacks something that the block needs,
+            as one of an older version.
     """
     tensors, metadata = load_tensors(path)
     kind = metadata.get("kind")
@@ -126,33 +125,33 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
     """Yield a working folder that becomes `out` when the block succeeds.
 
     After a failure the working folder, `.<name>.partial` beside `out`, stays: the next call yields it again
-    with all that it holds, so that a training can go on from its last checkpoint. What replaces an older
-    `out` begins empty instead; the older one waits as `.<name>.old` until the new one is in its place.
+    with its contents, so that training can resume from its last checkpoint. With `replace` it begins empty
+    instead; the older `out` is kept as `.<name>.old` until the new one is in its place.
 
     Args:
         out: the finished folder.
-        replace: whether an `out` that is already there is replaced.
-        config: what it is made with, written to `config.json`; what was begun otherwise is refused.
+        replace: replace an existing `out`.
+        config: the settings as JSON, written to `config.json`; a working folder with others is refused.
 
     Raises:
-        BadInputError: `out` is already there and is not to be replaced, or was begun otherwise.
+        BadInputError: `out` exists and `replace` is not set, or was begun with other settings.
     """
     partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
     if old.exists() and not out.exists():  # a kill came between the two renames below
         os.replace(old, out)
     if out.exists() and not replace:
-        raise BadInputError(f"{out} is finished already: remove it to make it anew")
+        raise BadInputError(f"{out} is finished already: remove it to run the stage again")
     if replace:
         _remove(partial, old)
     partial.mkdir(parents=True, exist_ok=True)
     if config is not None:
-        told = partial / "config.json"
+        settings = partial / "config.json"
         is_begun = any(partial.iterdir())
-        if is_begun and not (told.exists() and told.read_text() == config):
+        if is_begun and not (settings.exists() and settings.read_text() == config):
             raise BadInputError(
                 f"{partial} was begun with other settings, see its config.json if it has one: remove it"
             )
-        told.write_text(config)
+        settings.write_text(config)
     yield partial
     if out.exists():
         os.replace(out, old)
@@ -169,9 +168,8 @@ def _remove(*folders: Path) -> None:
 def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:
     """Turn nested containers of tensors and numbers into flat, named tensors; `unflatten` is the inverse.
 
-    A path's parts say what held them, so that every type comes back: `key`, `#3` (an int key), `[0]` (in a
-    list), `(0)` (in a tuple). `=` ends the path of a number; `=none`, `={}`, `=[]` and `=()` those of what
-    is empty.
+    The parts of a name encode the containers: `key` and `#3` (an int key) of a dict, `[0]` of a list, `(0)`
+    of a tuple. The suffix `=` marks a number; `=none`, `={}`, `=[]` and `=()` mark None and empty containers.
 
     Raises:
         BadInputError: a key has other characters than letters, digits, `_`, `.` and `-`, or a value is
@@ -181,7 +179,7 @@ def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:
 
 
 def unflatten(flat: Mapping[str, Tensor]) -> dict[Any, Any]:
-    """Turn what `flatten` returned back into nested containers."""
+    """Restore the nested containers from the result of `flatten`."""
     tree: dict[str, Any] = {}
     for path, tensor in flat.items():
         *parents, last = path.split("/")

@@ -1,4 +1,4 @@
-"""Recipes: TOML files read into strict, frozen models, with every fault of a file told at once."""
+"""Recipes: TOML files read into strict, frozen models; one message lists every fault of a file."""
 
 import json
 import re
@@ -24,7 +24,7 @@ _UNNAMED = ""
 
 
 def choice(name: str) -> str:
-    """Return the tag of a model among those that a table may be; messages leave it out of a key's name."""
+    """Return the tag of one of a table's alternative models; messages omit it from a key's name."""
     return f"<{name}>"
 
 
@@ -33,10 +33,9 @@ def _is_choice(part: int | str) -> bool:
 
 
 class Config(BaseModel):
-    """Settings of one part: frozen, without unknown keys and without silent conversions.
+    """Settings of one component: frozen, without unknown keys and silent conversions.
 
-    An int is taken where a float is expected; nothing else is converted. Each field is described by the
-    string under it.
+    An int is accepted as a float; nothing else is converted. The string under a field is its description.
     """
 
     model_config = ConfigDict(
@@ -44,9 +43,9 @@ class Config(BaseModel):
     )
 
 
-def as_json(**told: Config | str | int | None) -> str:
-    """Return settings, and what else is told, by their names; of a part that has none, null."""
-    plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in told.items()}
+def as_json(**settings: Config | str | int | None) -> str:
+    """Return settings as JSON, by their names."""
+    plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in settings.items()}
     return json.dumps(plain, indent=1)
 
 
@@ -122,10 +121,10 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
         )
         return f"{key}: unknown key{hint}"
     if kind == "union_tag_invalid":
-        told = error["ctx"]
-        known, got = (told[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
+        context = error["ctx"]
+        known, got = (context[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
         choices = known.replace(", ", " or ")
-        return f"{key}.{told['discriminator'].strip('()_')}: expected {choices}, got '{got}'"
+        return f"{key}.{context['discriminator'].strip('()_')}: expected {choices}, got '{got}'"
     if kind == "missing":
         return f"{key}: expected a value, but the key is missing"
     if kind == "value_error":
@@ -137,7 +136,7 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def _choice_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
-    """Return a clause that names the other choice of a table that has the key at `location`, if one does."""
+    """Return a clause that names another alternative of the table which has the key at `location`, if any."""
     if len(location) < 2 or not _is_choice(location[-2]):
         return ""
     parent = _section(model, location[:-3])
@@ -171,12 +170,12 @@ def _section(model: type[BaseModel], location: Iterable[int | str]) -> type[Base
 
 
 def _nested_models(annotation: Any) -> dict[str, type[BaseModel]]:  # noqa: ANN401 - an annotation is any object
-    """Return the models that `annotation` allows, by the names of the choices where there are several."""
+    """Return the models that `annotation` allows, by their tags where there are several."""
     found: dict[str, type[BaseModel]] = {}
     for candidate in (annotation, *get_args(annotation)):
-        kind, *told = get_args(candidate) if get_origin(candidate) is Annotated else (candidate,)
+        kind, *marks = get_args(candidate) if get_origin(candidate) is Annotated else (candidate,)
         if isinstance(kind, type) and issubclass(kind, BaseModel):
-            found[next((mark.tag for mark in told if isinstance(mark, Tag)), _UNNAMED)] = kind
+            found[next((mark.tag for mark in marks if isinstance(mark, Tag)), _UNNAMED)] = kind
     return found
 
 

@@ -1,4 +1,4 @@
-"""How much of the machine this process may use."""
+"""Processor cores of this process."""
 
 import os
 

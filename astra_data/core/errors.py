@@ -1,16 +1,16 @@
-"""What can go wrong, in one tree.
+"""The exceptions that the toolkit raises.
 
-AstraDataError          anything the toolkit reports on purpose: one clear line, exit code 1
+AstraDataError          all expected errors; the command line prints one line and exits with 1
 ├── BadInputError       a value, file or column is not what was expected
-├── RecipeError         a recipe does not say what it should
+├── RecipeError         a recipe is missing, malformed or contradicts itself
 ├── MissingStageError   an earlier stage has not been run yet
 ├── CorruptDatasetError a dataset on disk is incomplete or was altered
-└── SharingError        a place where datasets are shared cannot be reached, refuses, or holds something else
+└── SharingError        a remote storage cannot be reached, refuses, or holds something else
 """
 
 
 class AstraDataError(Exception):
-    """Anything that the toolkit reports on purpose; the command line prints it without a traceback."""
+    """Any expected error; the command line prints it without a traceback."""
 
 
 class BadInputError(AstraDataError):
@@ -18,7 +18,7 @@ class BadInputError(AstraDataError):
 
 
 class RecipeError(AstraDataError):
-    """A recipe does not say what it should."""
+    """A recipe is missing, malformed or contradicts itself."""
 
 
 class MissingStageError(AstraDataError):
@@ -30,4 +30,4 @@ class CorruptDatasetError(AstraDataError):
 
 
 class SharingError(AstraDataError):
-    """A place where datasets are shared cannot be reached, refuses, or holds something else."""
+    """A remote storage cannot be reached, refuses, or holds something else."""

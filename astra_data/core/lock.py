@@ -1,4 +1,4 @@
-"""A folder held by one process at a time."""
+"""File locks on folders."""
 
 import fcntl
 import os
@@ -9,9 +9,11 @@ from pathlib import Path
 
 @contextmanager
 def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold the lock of `folder`, which dies with its process.
+    """Hold the lock of `folder`, which the system releases when the process ends; yield whether it is held.
 
-    If another process holds it, yield False, or with `wait` do so only once it is free.
+    Args:
+        folder: an existing folder.
+        wait: wait while another process holds the lock, instead of yielding False.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:

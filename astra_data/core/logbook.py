@@ -1,4 +1,4 @@
-"""What a training remembers beside what it trains: its points and its time, kept in a checkpoint with it."""
+"""The log of a training run: measured points and time spent, kept in its checkpoint."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -8,43 +8,43 @@ from astra_data.core.checkpoint import flatten, resumed, save_tensors
 from astra_data.core.stopwatch import Alarm, Stopwatch
 
 CHECKPOINT_SECONDS = 60.0
-"""After so long, a checkpoint is due."""
+"""Time between checkpoints."""
 
 
 class Logbook:
-    """The log of a training that can be interrupted.
+    """The log of a training run that can be interrupted.
 
     Attributes:
-        points: what was measured on the way, of JSON values.
-        stopwatch: runs from the beginning, on top of what was spent before an interruption.
+        points: measurements, of JSON values.
+        stopwatch: measures from the start, including the time before an interruption.
     """
 
     def __init__(self, checkpoint: Path | None, go_on: Callable[[dict[str, Any]], object]) -> None:
-        """Begin, or go on from the `checkpoint` if it is there.
+        """Start, or resume from `checkpoint` if it exists.
 
         Args:
             checkpoint: the file that `keep` writes; None to write none.
-            go_on: sets the training back to a state that was given to `keep`.
+            go_on: restores a state that was passed to `keep`.
 
         Raises:
-            BadInputError: the checkpoint cannot be read, or `go_on` does not find in it what it needs.
+            BadInputError: the checkpoint cannot be read, or lacks something that `go_on` needs.
         """
         self._checkpoint = checkpoint
         self.points, spent = list[dict[str, Any]](), None
         if checkpoint and checkpoint.exists():
-            with resumed(checkpoint) as (state, told):
+            with resumed(checkpoint) as (state, metadata):
                 go_on(state)
-                self.points, spent = told["points"], told["spent"]
+                self.points, spent = metadata["points"], metadata["spent"]
         self.stopwatch, self._alarm = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS)
 
     @property
     def is_due(self) -> bool:
-        """Whether the last checkpoint is so old that another is due."""
+        """Whether the next checkpoint is due."""
         return self._alarm.rings
 
     def keep(self, state: Mapping[str, Any]) -> None:
-        """Write a checkpoint: `state`, which `flatten` can take, the points and the time spent."""
+        """Write a checkpoint: `state` (see `flatten`), the points and the time spent."""
         if self._checkpoint is not None:
-            told = {"points": self.points, "spent": self.stopwatch.spent()}
-            save_tensors(self._checkpoint, flatten(state), told)
+            metadata = {"points": self.points, "spent": self.stopwatch.spent()}
+            save_tensors(self._checkpoint, flatten(state), metadata)
         self._alarm.reset()

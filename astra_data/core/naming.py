@@ -1,6 +1,6 @@
-"""Rows of the results: a method by its name, or followed by `_plus`, trained with the `[plus]` settings.
+"""Names of result rows, and of the folders of seeds.
 
-And where in a stage's folder what belongs to one seed of a row lies.
+A row is a method's name, or that name followed by `_plus`: the method trained with the `[plus]` settings.
 """
 
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ PLUS = "_plus"
 
 
 def is_plus(row: str) -> bool:
-    """Tell whether a row is the variant of its method."""
+    """Return whether a row is trained with the `[plus]` settings."""
     return row.endswith(PLUS)
 
 
@@ -19,13 +19,13 @@ def base_method(row: str) -> str:
 
 
 def reference_of(rows: Iterable[str]) -> str | None:
-    """Return the method in whose grounded simulator all `rows` are tested: NAS, the plainest, if among them.
+    """Return the method in whose grounded simulator all `rows` are tested: NAS, if it is among them.
 
-    Otherwise they have none in common, and each is tested in its own.
+    None otherwise: each row is then tested in its own grounded simulator.
     """
     return "nas" if "nas" in map(base_method, rows) else None
 
 
 def place(seed: int, percent: int | None = None) -> str:
-    """Return the folder of a seed, within that of the dataset's size where there are several."""
+    """Return the folder of a seed, inside that of the dataset size in per cent where there are several."""
     return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"

@@ -1,4 +1,4 @@
-"""Packages of the optional extras: import them, or say how to install them."""
+"""Packages of the optional extras."""
 
 from importlib import import_module
 from typing import Any
@@ -23,7 +23,7 @@ EXTRAS = {
 
 
 def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
-    """Import a module of one of the optional extras.
+    """Import `module`, which is installed with the optional extra `extra`.
 
     Raises:
         BadInputError: it is not installed; the message says how to install it.

@@ -1,4 +1,4 @@
-"""Where an artefact comes from: commit, package versions and machine."""
+"""Provenance of artefacts: commit, package versions and machine."""
 
 import os
 import platform
@@ -12,18 +12,18 @@ from astra_data.core.cores import cores
 
 ROOT = Path(__file__).parents[2]
 CODE = ("astra_data", "pyproject.toml", "uv.lock")
-"""What makes a checkout differ from its commit; notes and recipes do not."""
+"""Changes of these make a checkout dirty; changes of notes and recipes do not."""
 
 PACKAGES = (
     *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
     *("numpy", "rliable", "scipy", "torch", "torchrl"),
 )
-"""Packages whose versions can move a result."""
+"""Packages whose versions can change a result."""
 
 
 @cache
 def package_versions() -> dict[str, str]:
-    """Return the versions of Python and of `PACKAGES`, where installed; asked once."""
+    """Return the versions of Python and of the installed `PACKAGES`; cached."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -37,7 +37,7 @@ def package_versions() -> dict[str, str]:
 def git_commit() -> str | None:
     """Return the commit of the checkout that this process runs from, with "-dirty" if its code was changed.
 
-    Asked once: what is committed later is not what this process loaded.
+    Cached, because later commits are not the code that this process has loaded. None outside of a checkout.
     """
     if not (ROOT / ".git").exists():
         return None
@@ -54,7 +54,7 @@ def _git(*arguments: str) -> str:
 
 
 def origin(device: str = "cpu") -> dict[str, Any]:
-    """Return what every artefact says of its making; ask when a stage begins."""
+    """Return the provenance that every artefact records; call it when a stage begins."""
     return {"git_commit": git_commit(), "packages": package_versions(), "machine": machine(device)}
 
 
@@ -78,6 +78,6 @@ def _cpu_name() -> str:
 
 
 def _gpu_name(device: str) -> str:
-    import torch  # seconds, which reading a dataset can do without
+    import torch  # slow; only needed on GPUs
 
     return torch.cuda.get_device_name(device)

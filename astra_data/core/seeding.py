@@ -1,7 +1,7 @@
-"""One seed in, one independent stream of random numbers per purpose out.
+"""Independent random streams per purpose, derived from one seed.
 
-A stream depends on the seed and the purpose's name alone, so adding a purpose changes no other stream,
-and the same seed gives the same numbers in every process and on every machine.
+A stream depends on the seed and the purpose's name alone: adding a purpose changes no other stream, and the
+same seed gives the same numbers in every process and on every machine.
 """
 
 import hashlib

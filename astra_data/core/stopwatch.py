@@ -1,11 +1,11 @@
-"""How long work takes, of the clock and of the processor; and when it is time again."""
+"""Wall-clock and processor time of a job, and a timer for periodic work."""
 
 import time
 from collections.abc import Mapping
 
 
 class Stopwatch:
-    """Measure from now on, on top of what was `spent` before an interruption."""
+    """Measure time from now on, added to the time `spent` before an interruption."""
 
     def __init__(self, spent: Mapping[str, float] | None = None) -> None:
         before = spent or {"wall_seconds": 0.0, "cpu_seconds": 0.0}
@@ -23,17 +23,17 @@ class Stopwatch:
 
 
 class Alarm:
-    """Tells when it is time for what is to be done every few `seconds`, such as a checkpoint."""
+    """A timer for work that is done every few `seconds`, such as writing a checkpoint."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self.reset()
 
     def reset(self) -> None:
-        """Let the time begin anew: what it is for has been done."""
+        """Restart the timer, once the work is done."""
         self._began = time.perf_counter()
 
     @property
     def rings(self) -> bool:
-        """Whether the time is up."""
+        """Whether the time has elapsed."""
         return time.perf_counter() - self._began >= self._seconds

@@ -2,12 +2,12 @@
 
 <root>/meta/info.json  stats.json  tasks.parquet  episodes/chunk-000/file-000.parquet
 <root>/data/chunk-000/file-000.parquet          one row group per episode
-<root>/meta/astra/dataset.json                  where the dataset comes from, and its content hash
+<root>/meta/astra/dataset.json                  the dataset's provenance and content hash
 <root>/meta/astra/episodes.parquet              one row of metadata per episode, keyed by episode_uid
 <root>/meta/astra/subsets.json                  the permutation whose prefixes are the nested subsets
 <root>/meta/astra/policy.safetensors            the policy that acted, if it was trained while collecting
 
-For training, `frames.Frames` holds columns as tensors and draws windows and transitions from them.
+For training, `frames.Frames` holds columns as tensors and draws windows and transitions.
 """
 
 from astra_data.dataset.reader import Dataset

@@ -1,4 +1,4 @@
-"""Does an episode fit the dataset that it is added to?"""
+"""Validation of the episodes that are added to a dataset."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,7 +8,7 @@ from astra_data.dataset.format import METADATA_KEYS
 
 
 class Admission:
-    """Checks one episode after another against the dataset's columns and against the earlier ones.
+    """Checks each new episode against the dataset's columns and against the episodes before it.
 
     Attributes:
         metadata_types: type of each metadata key seen so far.
@@ -20,7 +20,7 @@ class Admission:
         self.metadata_types: dict[str, type] = {}
 
     def admit(self, episode: Episode) -> None:
-        """Remember `episode`, or refuse it.
+        """Accept `episode`, or refuse it.
 
         Raises:
             BadInputError: it does not fit; lists every fault.
@@ -41,7 +41,7 @@ class Admission:
             if found is not known:
                 faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
             if key in METADATA_KEYS:
-                faults.append(f"metadata {key}: is the writer's, leave it out")
+                faults.append(f"metadata {key}: is filled in by the writer, leave it out")
         faults += _outcome_faults(episode.columns)
         if episode.uid in self._uids:
             faults.append("an earlier episode has the same uid")
@@ -49,7 +49,7 @@ class Admission:
 
 
 def _outcome_faults(columns: Mapping[str, Array]) -> list[str]:
-    """List what is wrong with the ends: only the last step of an episode ends it."""
+    """List faults of the flags that end an episode: only its last step may."""
     faults = []
     for name in (TERMINATED, TRUNCATED, DONE):
         ends = columns.get(name)

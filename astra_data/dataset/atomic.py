@@ -1,4 +1,4 @@
-"""Folders and files that appear finished or not at all."""
+"""Folders and files that are written atomically."""
 
 import glob
 import itertools
@@ -16,8 +16,8 @@ from astra_data.core.lock import held
 def atomic_folder(target: Path) -> Iterator[Path]:
     """Yield an empty hidden folder beside `target`, which is renamed to `target` when the block ends.
 
-    After an exception the folder is removed. After a kill it stays, hidden, and the next call with the same
-    target removes it: a folder is held by a file lock, which dies with its process.
+    After an exception the folder is removed. After a kill it stays, hidden, until the next call with the same
+    target removes it: the folder of a live process is held by a file lock.
 
     Raises:
         BadInputError: `target` exists, or another process is writing it.
@@ -67,7 +67,7 @@ def publish(folder: Path, target: Path) -> None:
     try:
         os.replace(folder, target)
     except OSError:
-        # Another process may have been faster by a hair.
+        # Another process may have created it in between.
         _refuse(target)
         raise
     sync(target.parent)
@@ -101,7 +101,7 @@ def _own_folder(target: Path) -> Iterator[Path]:
                 f"{target} cannot be written: {error.strerror}; choose another place."
             ) from None
         with ExitStack() as stack:
-            # A process that sweeps may have come between: it holds the new folder, or has removed it.
+            # Between mkdir and lock another process's sweep may have locked or removed the folder.
             try:
                 ours = stack.enter_context(held(folder))
             except FileNotFoundError:
@@ -112,7 +112,7 @@ def _own_folder(target: Path) -> Iterator[Path]:
 
 
 def _sweep(target: Path) -> None:
-    """Remove what killed processes left of earlier attempts at `target`."""
+    """Remove the hidden folders that killed processes left beside `target`."""
     for folder in target.parent.glob(f".{glob.escape(target.name)}.tmp-*"):
         with suppress(FileNotFoundError, NotADirectoryError), held(folder) as ours:
             if ours:
@@ -120,7 +120,7 @@ def _sweep(target: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Have a file or folder on the disk itself before going on."""
+    """Flush a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""Exact statistics in float64, with LeRobot's names and shapes."""
+"""Exact statistics of columns in float64, with LeRobot's names and shapes."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -10,12 +10,12 @@ from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import QUANTILES, STATISTICS, STORED_STATISTICS
 
 BLOCK_VALUES = 2**26
-"""Values that are held in memory at once: 256 MiB of float32."""
+"""Values held in memory at once: 256 MiB of float32."""
 
 
 def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `STATISTICS` (9, size) of `rows` (size, T), which it sorts; quantiles are linear in between."""
-    # Each index has a row of its own: sums are then pairwise and sorting is fast.
+    """Return `STATISTICS` (9, size) of `rows` (size, T), sorted in place; quantiles are interpolated."""
+    # One row per index: numpy then sums pairwise, and sorting is fast.
     mean = rows.mean(axis=1)
     centred = rows - mean[:, None]
     np.square(centred, out=centred)
@@ -41,9 +41,9 @@ def global_statistics(
 ) -> dict[str, dict[str, list[Any]]]:
     """Return meta/stats.json over all `frames`.
 
-    Quantiles are exact, so at least one index is in memory as a whole. Above `BLOCK_VALUES` frames memory
-    grows with them: the index and two float64 copies of it are 20 bytes per frame of float32 (2 GB at 100
-    million frames), however many columns there are.
+    Quantiles are exact, so that at least one index of one column is in memory as a whole. Above
+    `BLOCK_VALUES` frames, memory grows with their number: an index and two float64 copies take 20 bytes per
+    frame of float32 (2 GB for 100 million frames), whatever the number of columns.
 
     Args:
         columns: all stored columns.

@@ -21,13 +21,13 @@ STATE = "observation.state"
 GOAL = "observation.environment_state"
 """(T, G) float32: the goal, where a task has one; LeRobot's own policies need it to train."""
 ACTION = "action"
-"""(T, A) float32: a_t, as given to both worlds."""
+"""(T, A) float32: a_t, as given to the target environment and to the abstract simulator."""
 NEXT_STATE = "next.observation.state"
-"""(T, S) float32: s_{t+1}, explicit, so that nothing has to be shifted."""
+"""(T, S) float32: s_{t+1}, stored so that readers need not shift s_t."""
 REWARD = "next.reward"
 """(T,) float32: the target reward r_t."""
 TERMINATED = "next.terminated"
-"""(T,) bool: the task ended, no value beyond it; learners bootstrap unless this is set."""
+"""(T,) bool: the task ended, in success or failure; learners bootstrap unless this is set."""
 TRUNCATED = "next.truncated"
 """(T,) bool: time ran out."""
 DONE = "next.done"
@@ -39,21 +39,21 @@ ABSTRACT_STATE = "abstract.state"
 ABSTRACT_NEXT_STATE = "abstract.next_state"
 """(T, X) float32: the abstract state of s_{t+1}."""
 ABSTRACT_SIMULATED_NEXT_STATE = "abstract.simulated_next_state"
-"""(T, X) float32: where the abstract simulator lands from the abstract state of s_t under a_t."""
+"""(T, X) float32: the abstract simulator's next state, from the abstract state of s_t under a_t."""
 
 EPISODE_UID = "episode_uid"
-"""(T,) int64: names the episode for good, through every later edit; the writer fills it in."""
+"""(T,) int64: identifies the episode through all later edits; filled in by the writer."""
 TIMESTAMP = "timestamp"
 FRAME_INDEX = "frame_index"
 EPISODE_INDEX = "episode_index"
 INDEX = "index"
 TASK_INDEX = "task_index"
 RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)
-"""Columns that the writer fills in; all but the first are LeRobot's own."""
+"""Columns filled in by the writer; all but the first are LeRobot's own."""
 
 DTYPES = ("float32", "int64", "bool")
 ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
-"""What a change of the planar frame does to an index, see `Column.astra`; and to how many at once."""
+"""How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 
 Array = NDArray[Any]
 Scalar = float | int | bool | str
@@ -64,18 +64,17 @@ class Column:
     """One column of a dataset.
 
     Attributes:
-        name: on disk. LeRobot turns names that begin with "observation" or "action" into policy inputs.
+        name: name on disk. LeRobot makes policy inputs of columns that begin with "observation" or "action".
         dtype: one of `DTYPES`.
         size: values per step.
         names: a name for each of them.
         meaning: one sentence.
-        astra: "unit", "frame", "role" and "mirror", each a list with one word per index. Roles are how a
+        astra: "unit", "frame", "role" and "mirror", each a list with one word per index. A role says how a
             rotation and shift of the planar frame act: "position" and "vector" come as consecutive (x, y)
-            pairs, "heading" is an angle in rad, "quaternion" four consecutive values (w, x, y, z) that turn
-            from the body's frame to the world's, "invariant" is left alone. What is seen from the body is
-            therefore invariant, also its angular rates. A mirror image of the robot follows from the roles
-            too, but for its invariant values: "mirror" names the value that each becomes, "-hip_2" with its
-            sign changed, and is "" elsewhere.
+            pairs, "heading" is an angle in rad, "quaternion" four consecutive values (w, x, y, z) that rotate
+            from the body's frame to the world's, "invariant" values do not change, such as those in the
+            body's frame. Reflections act by role, too, except on invariant values: there "mirror" names the
+            value that each becomes, "-hip_2" with its sign changed; it is "" for all other roles.
 
     Example:
         >>> from astra_data import Column
@@ -92,7 +91,11 @@ class Column:
     astra: Mapping[str, list[str]] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a column that contradicts itself, listing every fault."""
+        """Validate the column.
+
+        Raises:
+            BadInputError: it contradicts itself; lists every fault.
+        """
         faults = []
         if not self.name or "/" in self.name:
             faults.append("the name must not be empty or contain '/'")
@@ -117,7 +120,7 @@ class Column:
 
     @property
     def roles(self) -> list[tuple[str, slice]]:
-        """Each role with the indices that it acts on at once, in order; empty where roles are not told."""
+        """Each role with the indices that it acts on at once, in order; empty if roles are unknown."""
         groups, index, roles = [], 0, (self.astra or {}).get("role", [])
         while index < len(roles):
             width = ROLES[roles[index]]
@@ -127,9 +130,9 @@ class Column:
 
     @property
     def mirror(self) -> tuple[list[int], list[int]] | None:
-        """What a mirror image does to invariant values: the index that each becomes, and its sign, +1 or -1.
+        """How a reflection acts on invariant values: for each index the source index, and the sign, +1 or -1.
 
-        All other values stay where they are. None where it is not told though there are invariant values.
+        All other values keep their index. None if there are invariant values without a mirror image.
         """
         astra = self.astra or {}
         words = astra.get("mirror")
@@ -156,7 +159,7 @@ class Column:
             name: word for name, word, role in zip(names, words, roles, strict=False) if role == "invariant"
         }
         faults = [
-            f"mirror {word!r} of a {role}, expected '': its role says it"
+            f"mirror {word!r} of a {role}, expected '', because its role defines it"
             for word, role in zip(words, roles, strict=False)
             if word and role != "invariant"
         ]
@@ -198,7 +201,7 @@ class Column:
             raise BadInputError(f"Column {name!r}: {feature!r} is no entry of features ({error}).") from error
 
     def faults(self, values: Array) -> list[str]:
-        """List how the dtype and shape of `values` differ from what the column expects; empty if they fit."""
+        """List how the dtype and shape of `values` differ from the column's; empty if they fit."""
         faults = []
         if values.dtype != self.dtype:
             faults.append(f"{self.name}: dtype {values.dtype}, expected {self.dtype}")
@@ -215,7 +218,7 @@ OUTCOME_COLUMNS = (
     Column(DONE, "bool", meaning="terminated or truncated"),
     Column(SUCCESS, "bool", meaning="the goal is reached after the step"),
 )
-"""What every collected dataset says about the outcome of a step."""
+"""The outcome of a step, in every collected dataset."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -223,7 +226,7 @@ class Episode:
     """One episode of T steps.
 
     Attributes:
-        uid: names the episode for good, 0 <= uid < 2^63.
+        uid: identifies the episode through all later edits, 0 <= uid < 2^63.
         columns: name to (T,) or (T, size) contiguous array of one of `DTYPES`; `RESERVED` names excluded.
         metadata: facts about the whole episode (success, return, seed, source_episode, ...).
 
@@ -243,7 +246,7 @@ class Episode:
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse an episode with faults, listing every one."""
+        """Convert numpy scalars and array layouts, and validate the episode."""
         metadata = {
             key: value.item() if isinstance(value, np.generic) else value
             for key, value in self.metadata.items()
@@ -259,8 +262,8 @@ class Episode:
         if not columns:
             faults.append("there are no columns")
         elif len(set(lengths.values())) > 1:
-            told = ", ".join(f"{name} {length}" for name, length in lengths.items())
-            faults.append(f"columns differ in their number of steps ({told})")
+            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            faults.append(f"columns differ in their number of steps ({listed})")
         elif 0 in lengths.values():
             faults.append("there are no steps")
         for key, value in metadata.items():

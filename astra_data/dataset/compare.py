@@ -1,4 +1,4 @@
-"""What differs between two datasets: columns, episodes, origin."""
+"""Differences between two datasets: columns, episodes, provenance."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ class Differences:
         only_in_a: uids of episodes that B lacks, ascending.
         only_in_b: uids of episodes that A lacks, ascending.
         changed: uids of episodes of both whose values or metadata differ, ascending.
-        description: one sentence per difference in origin, such as "config.noise_m: 0.1, then 0.2".
+        description: one sentence per difference in provenance, such as "config.noise_m: 0.1, then 0.2".
     """
 
     schema: list[str]
@@ -32,7 +32,7 @@ class Differences:
 
 
 def differences(a: Dataset, b: Dataset) -> Differences:
-    """Compare two datasets; episodes are compared in the columns that both have."""
+    """Compare two datasets; the values of episodes in the columns that both have."""
     shared = sorted({column.name for column in a.schema} & {column.name for column in b.schema})
     prints_a, prints_b = _fingerprints(a, shared), _fingerprints(b, shared)
     both = prints_a.keys() & prints_b.keys()
@@ -46,18 +46,20 @@ def differences(a: Dataset, b: Dataset) -> Differences:
 
 
 def schema_differences(a: Dataset, b: Dataset) -> list[str]:
-    """List how the columns, the fps and the task of `b` differ from those of `a`; the order is no matter."""
+    """List how the columns, fps and task of `b` differ from those of `a`, whatever the order of columns."""
     ours, theirs = ({column.name: column for column in dataset.schema} for dataset in (a, b))
-    told = [f"column {name}: only in {a.reference}" for name in ours if name not in theirs]
-    told += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
+    found = [f"column {name}: only in {a.reference}" for name in ours if name not in theirs]
+    found += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
     for name in (name for name in ours if name in theirs):
-        told += _value_differences(_facts(ours[name]), _facts(theirs[name]), f"column {name}: ")
-    told += _value_differences({"fps": a.info["fps"], "task": a.task}, {"fps": b.info["fps"], "task": b.task})
-    return told
+        found += _value_differences(_facts(ours[name]), _facts(theirs[name]), f"column {name}: ")
+    found += _value_differences(
+        {"fps": a.info["fps"], "task": a.task}, {"fps": b.info["fps"], "task": b.task}
+    )
+    return found
 
 
 def world_differences(a: Dataset, b: Dataset) -> list[str]:
-    """List how the environment and the simulator that `b` comes from differ from those of `a`."""
+    """List how the environment and the simulator of `b` differ from those of `a`."""
     ours, theirs = (
         {key: dataset.description[key] for key in ("environment", "simulator")} for dataset in (a, b)
     )
@@ -74,11 +76,8 @@ def _described(dataset: Dataset) -> dict[str, Any]:
 
 def _value_differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     for key, before, after in changed_values(a, b, prefix):
-        yield f"{key}: {_told(before)}, then {_told(after)}"
-
-
-def _told(value: object) -> str:
-    return "nothing" if value is None else repr(value)
+        old, new = ("nothing" if value is None else repr(value) for value in (before, after))
+        yield f"{key}: {old}, then {new}"
 
 
 def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, bytes]:

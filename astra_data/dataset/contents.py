@@ -1,4 +1,4 @@
-"""A dataset's table of contents: everything but the values of its columns."""
+"""The contents of a dataset: everything but the values of its columns."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Contents:
-    """What a dataset of E episodes says about itself.
+    """The metadata of a dataset of E episodes.
 
     Attributes:
         root: its folder.
@@ -34,7 +34,7 @@ class Contents:
         starts: first row of each episode, (E,).
         order: the permutation of episode indices whose prefixes are the nested subsets.
         subset_seed: its seed.
-        task: what the episodes do.
+        task: the task of all episodes.
         paths: the data files in order.
     """
 
@@ -52,10 +52,10 @@ class Contents:
 
 
 def read_contents(root: Path) -> Contents:
-    """Read the table of contents of the dataset in folder `root`, and the footers of its data files.
+    """Read the metadata of the dataset in folder `root`, and the footers of its data files.
 
     Raises:
-        CorruptDatasetError: something is missing or does not fit; lists what.
+        CorruptDatasetError: files are missing or contradict each other; lists every fault.
     """
     needed = (
         layout.INFO_PATH,

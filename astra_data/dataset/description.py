@@ -1,4 +1,4 @@
-"""Where a dataset comes from, what it holds, and which episodes its subsets take."""
+"""The description of a dataset (its provenance), its content hash, and the order of its subsets."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ from astra_data.core.provenance import git_commit, package_versions
 from astra_data.dataset.columns import Array
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-"""What datasets may be called."""
+"""Valid names of datasets."""
 
 _DEFAULTS: dict[str, Any] = {
     "name": None,
@@ -26,10 +26,10 @@ _DEFAULTS: dict[str, Any] = {
 
 
 def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what goes to meta/astra/dataset.json, all but the content hash.
+    """Return the contents of meta/astra/dataset.json, without the content hash.
 
     Args:
-        description: "name" and "stage", and where they apply "version" (by default 1.0.0), "parents" (see
+        description: "name" and "stage", and optionally "version" (by default 1.0.0), "parents" (see
             `Dataset.identity`), "config", "seeds", "environment" and "simulator" (ids with parameters).
 
     Raises:
@@ -56,10 +56,10 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class ContentHash:
-    """A running sha256 over the values of all columns, whatever their order and the files' encoding."""
+    """A running sha256 over the values of all columns, independent of their order and the files' encoding."""
 
     def __init__(self) -> None:
-        """Start with no columns."""
+        """Start without columns."""
         self._columns: dict[str, Any] = {}
         self._kinds: dict[str, str] = {}
 
@@ -71,7 +71,7 @@ class ContentHash:
         self._columns[name].update(values.data)
 
     def hexdigest(self) -> str:
-        """Return the hash of everything so far."""
+        """Return the hash of all values so far."""
         total = hashlib.sha256()
         for name in sorted(self._columns):
             total.update(f"{name}\0{self._kinds[name]}\0".encode() + self._columns[name].digest())
@@ -81,7 +81,7 @@ class ContentHash:
 def changed_values(
     before: Mapping[str, Any], after: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the dotted key and both values, None for none, wherever two nested descriptions differ."""
+    """Yield the dotted key and both values (None where absent) wherever two nested descriptions differ."""
     for key in [*before, *(key for key in after if key not in before)]:
         old, new = before.get(key), after.get(key)
         if isinstance(old, Mapping) and isinstance(new, Mapping):
@@ -93,7 +93,7 @@ def changed_values(
 def permutation(uids: Iterable[int], seed: int) -> list[int]:
     """Return `uids` in a random order whose prefixes are the nested subsets.
 
-    Each uid's place follows from (seed, uid) alone, so it is the same in every dataset that derives from
-    the same episodes, whichever are added or removed.
+    The sort key of a uid depends on (seed, uid) alone: in all datasets that derive from the same episodes
+    they come in the same order, whichever were added or removed.
     """
     return sorted(uids, key=lambda uid: hashlib.sha256(f"{seed} {uid}".encode()).digest())

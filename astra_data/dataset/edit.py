@@ -1,7 +1,7 @@
-"""New versions of a dataset with other episodes: a subset, several merged, some deleted, some kept.
+"""New versions of a dataset with other episodes: subset, delete, filter and merge.
 
-Nothing is edited in place; every function streams the episodes that stay into a new dataset and returns its
-folder. Only `out` says where; without it the new version goes to its place at home.
+Nothing is edited in place: every function streams the remaining episodes into a new dataset and returns its
+folder, which is `out`, or by default the new version's folder under `versions.home()`.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
 MOST_UIDS = 8
-"""Uids that a message lists."""
+"""Uids listed in a message."""
 
 
 def subset(
@@ -34,17 +34,17 @@ def subset(
     name: str | None = None,
     out: Path | None = None,
 ) -> Path:
-    """Write a random subset; with one seed, smaller ones lie inside larger ones, also through several steps.
+    """Write a random subset; subsets with the same seed are nested, also subsets of subsets.
 
     Args:
         source: the dataset.
-        episodes: how many; or
-        percent: how many per cent of `of` episodes, which may be more than 100.
-        of: what 100 per cent are, by default all episodes of `source`.
-        seed: of the permutation whose first episodes are taken, by default the one stored in `source`.
+        episodes: number of episodes; or
+        percent: their share of `of` episodes in per cent, which may exceed 100.
+        of: number of episodes that are 100 per cent, by default all of `source`.
+        seed: of the permutation whose first episodes are taken, by default that of `source`.
         stratify: a key of the episodes' metadata; each of its values keeps its share.
-        name: of the new dataset, by default that of `source`, whose next version it is.
-        out: its folder, by default its place at home.
+        name: name of the new dataset; by default it is the next version of `source`.
+        out: its folder, by default under `versions.home()`.
 
     Raises:
         BadInputError: not exactly one of `episodes` and `percent`, or more episodes than there are.
@@ -61,9 +61,9 @@ def subset(
     count = episodes if percent is None else share(percent, of or len(source))
     assert count is not None
     if not 1 <= count <= len(source):
-        asked = f"{count} episodes" if percent is None else f"{percent} % of {of or len(source)} = {count}"
+        wanted = f"{count} episodes" if percent is None else f"{percent} % of {of or len(source)} = {count}"
         raise BadInputError(
-            f"{source.reference} has {len(source)} episodes, a subset of {asked} was asked for: expected 1 "
+            f"{source.reference} has {len(source)} episodes, a subset of {wanted} was asked for: expected 1 "
             f"to {len(source)}. Episodes are never repeated: collect or augment more, or name a smaller --of."
         )
     chosen = source.subset_seed if seed is None else seed
@@ -76,7 +76,7 @@ def subset(
 
 
 def share(percent: int, episodes: int) -> int:
-    """Return how many episodes `percent` per cent of `episodes` are, a half rounded up."""
+    """Return `percent` per cent of `episodes`, rounded half up."""
     return (percent * episodes + 50) // 100
 
 
@@ -108,10 +108,10 @@ def filter_episodes(
     name: str | None = None,
     out: Path | None = None,
 ) -> Path:
-    """Write the episodes of `source` that meet every given condition; both bounds belong to a range.
+    """Write the episodes of `source` that meet all given conditions; bounds are inclusive.
 
-    Success is that of `Dataset.successes`, return that of the episodes' metadata; an episode without them
-    does not meet a condition on them.
+    Success is that of `Dataset.successes`, the return that of the episodes' metadata; episodes without one
+    do not meet conditions on it.
 
     Raises:
         BadInputError: no condition is given, no episode has such metadata, or none meets the conditions.
@@ -148,15 +148,14 @@ def filter_episodes(
 def merge(
     sources: Sequence[Dataset], *, new_uids: bool = False, name: str | None = None, out: Path | None = None
 ) -> Path:
-    """Write the episodes of all `sources` one after another; the first gives name, version and seeds.
+    """Write the episodes of all `sources` one after another; name, version and seeds are those of the first.
 
     Args:
-        sources: two datasets at least, with equal columns, fps, task, environment and simulator.
-        new_uids: whether an episode whose uid an earlier one has gets a new one, the same in every run;
-            its old one is kept as "merged_uid", and a "source_episode" in the same dataset is still named.
-            Otherwise that is refused.
-        name: of the new dataset, by default that of `source`, whose next version it is.
-        out: its folder, by default its place at home.
+        sources: two datasets or more, with equal columns, fps, task, environment and simulator.
+        new_uids: give an episode whose uid an earlier one has a new uid, the same in every run; the old one
+            is kept as "merged_uid", and "source_episode" follows. Otherwise repeated uids are refused.
+        name: name of the new dataset; by default it is the next version of the first.
+        out: its folder, by default under `versions.home()`.
 
     Raises:
         BadInputError: the datasets do not fit together; lists every difference.
@@ -180,7 +179,7 @@ def merge(
     if faults:
         raise BadInputError(
             f"the datasets do not fit together: expected the columns, fps, task, environment and simulator "
-            f"of {first.reference} in all of them; merge those apart that share them:\n  "
+            f"of {first.reference} in all of them; merge only those that share them:\n  "
             + "\n  ".join(faults)
         )
     names = _merged_uids(sources, new_uids)
@@ -246,8 +245,8 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
 def _strata(source: Dataset, key: str, seed: int) -> dict[str, int]:
     """Count the episodes per value of `key`.
 
-    A subset that was stratified in the same way hands its own counts on: with the rounded shares of the
-    subset instead, a subset of it would not be the prefix that a subset of the whole is.
+    A subset that was stratified in the same way passes its own counts on: with the subset's rounded shares
+    instead, a subset of it would differ from the same subset of the whole.
     """
     config = source.description["config"]
     if (config.get("stratify"), config.get("seed")) == (key, seed):
@@ -257,7 +256,7 @@ def _strata(source: Dataset, key: str, seed: int) -> dict[str, int]:
 
 
 def _stratified(source: Dataset, key: str, strata: Mapping[str, int], seed: int) -> list[int]:
-    """Order the uids so that every prefix has its share of each stratum, in the permutation's order."""
+    """Order the uids so that every prefix has its share of each stratum; within one, by the permutation."""
     stratum = dict(zip(_uids(source), map(str, _facts(source, key)), strict=True))
     ranks = dict.fromkeys(strata, 0)
     place = {}
@@ -268,7 +267,7 @@ def _stratified(source: Dataset, key: str, strata: Mapping[str, int], seed: int)
 
 
 def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:
-    """Return, for each of `sources`, the uids that its episodes get, by those that they have."""
+    """Return, for each of `sources`, its episodes' new uids by their old ones."""
     known = {uid for source in sources for uid in _uids(source)}
     repeated: list[int] = []
     taken: set[int] = set()

@@ -1,4 +1,4 @@
-"""meta/episodes: where each episode lies and its statistics, one row per episode."""
+"""meta/episodes: location and statistics of each episode, one row per episode."""
 
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from astra_data.dataset.format import EPISODES_PATH, STATISTICS, STORED_STATISTI
 from astra_data.dataset.parquet import RotatingWriter, to_lists
 
 ROWS_AT_ONCE = 1000
-"""Rows that are held in memory before they are written."""
+"""Rows held in memory before they are written."""
 
 
 class EpisodeRows:
-    """Collects the rows of meta/episodes."""
+    """Writes meta/episodes, one row per `append`."""
 
     def __init__(self, root: Path, columns: list[Column], task: str) -> None:
         """Start for a dataset in `root` with the stored `columns` and one `task`."""

@@ -39,7 +39,7 @@ METADATA_KEYS = ("episode_uid", "length")
 """First columns of `METADATA_PATH`; the others are the episodes' own metadata."""
 
 COMPRESSIONS = ("snappy", "zstd")
-"""Of the data files: snappy is LeRobot's and faster, zstd smaller; every reader takes both."""
+"""Of the data files: snappy, as LeRobot writes, is faster, zstd smaller; every reader supports both."""
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
@@ -82,7 +82,7 @@ def data_schema(columns: Sequence[Column]) -> pa.Schema:
 
 
 def data_encodings(columns: Sequence[Column]) -> dict[str, str]:
-    """Return the parquet encoding of each column by its path in the file: a third smaller than LeRobot's."""
+    """Return the parquet encoding of each column by its path in the file; a third smaller than LeRobot's."""
     return {
         column.name if column.size == 1 else f"{column.name}.list.element": _ENCODINGS[column.dtype]
         for column in columns

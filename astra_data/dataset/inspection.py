@@ -1,4 +1,4 @@
-"""What a dataset holds: its episodes, how its values spread, where its robot was. In one pass over it."""
+"""Summary of a dataset in one pass: episodes, histograms of values, a map of the robot's positions."""
 
 from dataclasses import dataclass
 
@@ -15,19 +15,19 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BINS = 16
-"""Bins of a histogram, from the smallest value to the largest."""
+"""Bins of a histogram, from the smallest to the largest value."""
 CELLS = 64
 """Cells of a map along its longer side."""
 _LARGEST = float(np.finfo(np.float32).max)
-_REMEDY = "astra-data repair makes it anew"
+_REMEDY = "astra-data repair rebuilds it"
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How the values of one column spread.
+    """Range and histogram of one column.
 
     Attributes:
-        column: which.
+        column: the column.
         low, high, mean: of each index, (size,).
         counts: values in each of `BINS` equal bins between low and high, (size, BINS).
     """
@@ -41,7 +41,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Map:
-    """How often the points of a plane were visited.
+    """Visits of the cells of a plane.
 
     Attributes:
         counts: visits of each square cell, indexed [y, x] from the lower left, (height, width).
@@ -63,15 +63,15 @@ class Map:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a dataset of E episodes holds.
+    """Summary of a dataset of E episodes.
 
     Attributes:
         reference: name and version.
         fps: steps per second.
         lengths: steps of each episode, (E,).
-        success: episodes that succeeded; None where the episodes do not say.
+        success: number of successful episodes; None if unknown.
         spreads: one per column.
-        positions: where the robot was, in m; None where the state's roles do not tell.
+        positions: the robot's positions, in m; None if the state has no such role.
         velocities: its planar velocities in m/s, likewise.
     """
 
@@ -85,7 +85,7 @@ class Inspection:
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Read `dataset` once, one episode after the other, and count.
+    """Summarise `dataset`, reading one episode at a time.
 
     Raises:
         CorruptDatasetError: a file cannot be read.
@@ -112,7 +112,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
 
 
 def visited(dataset: Dataset, role: str = "position") -> Map | None:
-    """Count where the robot was, or another planar `role` of its state; None where the state has none.
+    """Map the robot's positions, or another planar `role` of its state; None if the state has none.
 
     Raises:
         CorruptDatasetError: a file cannot be read.
@@ -133,9 +133,9 @@ def _empty_spreads(dataset: Dataset, columns: list[Column]) -> list[Spread]:
         raise CorruptDatasetError(f"{dataset.root}: {STATS_PATH} {ranges}; {_REMEDY}")
     spreads = []
     for column in columns:
-        told = ranges.get(column.name, {})
+        stored = ranges.get(column.name, {})
         try:
-            table = np.array([told[key] for key in ("min", "max", "mean")], dtype=np.float64)
+            table = np.array([stored[key] for key in ("min", "max", "mean")], dtype=np.float64)
         except (KeyError, OverflowError, TypeError, ValueError):
             table = np.empty(0)
         if (
@@ -159,7 +159,7 @@ def _count(spread: Spread, values: Array) -> None:
 
 
 def _empty_map(spreads: list[Spread], role: str) -> tuple[Map, slice] | None:
-    """Return an empty map of the first pair with `role` in the state, and where in the state it is."""
+    """Return an empty map for the first pair with `role` in the state, and the pair's indices."""
     for spread in spreads:
         for found, group in spread.column.roles if spread.column.name == STATE else ():
             if found == role:

@@ -1,4 +1,4 @@
-"""Where a dataset comes from: its parents, theirs, and so on."""
+"""The lineage of a dataset: its parents, their parents, and so on."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ class Ancestor:
     Attributes:
         reference: name and version.
         content_hash: its hash.
-        stage: what made it, "" where its folder was not found.
-        config: how, empty where its folder was not found.
-        parents: what it was made of.
-        folder: where it lies; None where it was not found.
+        stage: the stage that wrote it, "" if its folder was not found.
+        config: the stage's settings, empty if its folder was not found.
+        parents: the datasets that it was made from.
+        folder: its folder; None if it was not found.
     """
 
     reference: str
@@ -37,9 +37,9 @@ class Ancestor:
 
 
 def lineage(dataset: Dataset) -> Ancestor:
-    """Return `dataset` with all its ancestors, looked up at home and in the folders beside it.
+    """Return `dataset` with all its ancestors, looked up in `versions.home()` and in the folders beside it.
 
-    An ancestor counts as found if its content hash is the one that its descendant names.
+    An ancestor is found where name, version and content hash are those that its descendant lists.
 
     Raises:
         CorruptDatasetError: a dataset is named among its own ancestors.
@@ -49,7 +49,7 @@ def lineage(dataset: Dataset) -> Ancestor:
 
 
 def tree_lines(ancestor: Ancestor) -> Iterator[str]:
-    """Yield the tree, one dataset per line, each under what was made of it."""
+    """Yield the tree, one dataset per line, parents indented below their child."""
     yield _line(ancestor)
     for number, parent in enumerate(ancestor.parents, 1):
         is_last = number == len(ancestor.parents)

@@ -1,4 +1,4 @@
-"""The JSON files of our metadata, believed only once they fit strict models."""
+"""The JSON files of the metadata, validated by strict models."""
 
 import re
 from pathlib import Path, PurePosixPath
@@ -17,7 +17,7 @@ _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 
 
 def is_data_path(pattern: object) -> bool:
-    """Tell whether `pattern` takes chunk_index and file_index and names files inside the dataset's folder."""
+    """Return whether `pattern` is a path inside the dataset, of chunk_index and file_index only."""
     if not isinstance(pattern, str) or not _DATA_PATH.fullmatch(pattern):
         return False
     path = PurePosixPath(pattern)
@@ -31,12 +31,12 @@ def _data_path(pattern: str) -> str:
 
 
 class _Open(Config):
-    """Like `Config`, but other keys are left alone: other tools add theirs."""
+    """Like `Config`, but accepts further keys, which other tools may add."""
 
     model_config = ConfigDict(extra="allow")
 
 
-class _Words(Config):
+class _Meaning(Config):
     meaning: str = ""
     unit: tuple[str, ...] = ()
     frame: tuple[str, ...] = ()
@@ -48,7 +48,7 @@ class _Feature(_Open):
     dtype: Literal["float32", "int64", "bool"]
     shape: tuple[Count]
     names: tuple[str, ...] | None = None
-    astra: _Words | None = None
+    astra: _Meaning | None = None
 
 
 class _Info(_Open):
@@ -85,7 +85,7 @@ class _Subsets(_Open):
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return meta/info.json of the dataset in folder `root`, with the features of valid columns.
+    """Return meta/info.json of the dataset in folder `root`; its features are valid columns.
 
     Raises:
         CorruptDatasetError: it is missing or malformed; lists every fault.
@@ -103,7 +103,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def read_description(root: Path) -> dict[str, Any]:
-    """Return meta/astra/dataset.json: all that `complete_description` writes, the content hash, and more.
+    """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more.
 
     Raises:
         CorruptDatasetError: it is missing or malformed; lists every fault.
@@ -127,8 +127,7 @@ def _read(path: Path, name: str, model: type[BaseModel]) -> dict[str, Any]:
     try:
         validated(found, model, name)
     except RecipeError as error:
-        told = str(error).replace(":\n  ", ": ").replace("\n  ", "; ")
-        raise CorruptDatasetError(told) from error
+        raise CorruptDatasetError(str(error).replace(":\n  ", ": ").replace("\n  ", "; ")) from error
     except RecursionError as error:
         raise CorruptDatasetError(f"{name} is nested too deeply") from error
     return found

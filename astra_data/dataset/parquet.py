@@ -14,9 +14,9 @@ from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_M
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
 UNREADABLE = (OSError, ValueError, pa.ArrowException)
-"""What pyarrow raises for damaged files; a ValueError where names are no text."""
+"""Raised by pyarrow for damaged files; ValueError where names are not valid UTF-8."""
 BLOCK_ROWS = 2**16
-"""Rows that are read at once, rounded up to whole row groups."""
+"""Rows read at once, rounded up to whole row groups."""
 
 
 def to_arrow(values: Array, kind: pa.DataType) -> pa.Array:
@@ -33,7 +33,7 @@ def to_lists(values: Array) -> pa.ListArray:
 
 
 def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
-    """Copy an Arrow column of n rows to a contiguous array (n,) or, if `size` > 1, (n, size).
+    """Copy an Arrow column of n rows to a contiguous array (n,), or (n, size) if `size` > 1.
 
     Raises:
         CorruptDatasetError: rows are missing values.
@@ -41,7 +41,7 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
     parts = [chunk.flatten() if size > 1 else chunk for chunk in column.chunks]
     if any(part.null_count for part in parts) or sum(map(len, parts)) != len(column) * size:
         raise CorruptDatasetError(f"expected {size} values in every row, some are missing")
-    # Through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no bits.
+    # Through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no packed bits.
     bits = dtype == "bool"
     values = [np.from_dlpack(part.cast(pa.uint8()) if bits else part) for part in parts]
     flat: Array = np.concatenate(values).astype(dtype, copy=False)
@@ -51,13 +51,12 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
 def read_blocks(
     paths: Sequence[Path], names: Sequence[str] | None = None, wanted: NDArray[np.bool_] | None = None
 ) -> Iterator[pa.Table]:
-    """Yield columns of all files in order, in blocks of whole row groups, so that memory stays bounded.
+    """Yield columns of all files in order, in blocks of whole row groups; memory stays bounded.
 
     Args:
         paths: the files.
         names: the columns, by default all.
-        wanted: marks the rows to be read among all rows of all files, by default all; row groups without
-            any are skipped.
+        wanted: mask over all rows of all files, by default all; row groups without a wanted row are skipped.
 
     Raises:
         CorruptDatasetError: a file cannot be read.
@@ -130,7 +129,7 @@ class RotatingWriter:
         )
 
     def locate(self) -> tuple[int, int]:
-        """Return (chunk_index, file_index) of where the next row group goes."""
+        """Return (chunk_index, file_index) of the next row group, starting a new file if this one is full."""
         if self._file.tell() >= FILE_SIZE_LIMIT:
             self.close()
             self.file_index += 1

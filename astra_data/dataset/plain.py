@@ -1,4 +1,4 @@
-"""A LeRobot dataset as it lies on disk: ours or another's, whole or not, read without believing it."""
+"""Read LeRobot datasets without trusting them: ours or another tool's, whole or damaged."""
 
 import itertools
 import json
@@ -20,11 +20,11 @@ from astra_data.dataset.parquet import UNREADABLE, first_line, to_numpy
 TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own."""
 EPISODES_AT_ONCE = 100
-"""Rows of meta/episodes that are held in memory."""
+"""Rows of meta/episodes held in memory."""
 MOST_FPS = 2**31
-"""Steps per second stay below."""
+"""Upper bound of steps per second."""
 _MOST_VALUES = 2**31
-"""Of a row; what Arrow's lists hold."""
+"""Upper bound of the values of a row, that of Arrow's lists."""
 _NUMBERS = (
     *("bool", "float16", "float32", "float64"),
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
@@ -47,7 +47,7 @@ class PlainColumn:
         return value if self.size == 1 else pa.list_(value, self.size)
 
     def fits(self, kind: pa.DataType) -> bool:
-        """Tell whether a file may store it as `kind`; LeRobot's merge writes lists without their size."""
+        """Return whether a file may store it as `kind`; LeRobot's merge writes lists of variable size."""
         return bool(
             kind == self.arrow_type or (self.size > 1 and kind == pa.list_(self.arrow_type.value_type))
         )
@@ -55,7 +55,7 @@ class PlainColumn:
 
 @dataclass(frozen=True)
 class Run:
-    """Consecutive rows of one file that are one episode, if all is well.
+    """Consecutive rows of one file: one episode, unless the dataset is damaged.
 
     Attributes:
         path: the file.
@@ -71,7 +71,7 @@ class Run:
 
 
 def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[str]]:
-    """Return the columns of `features` that are rows of numbers, and the names of all others."""
+    """Return the numeric columns of `features`, and the names of all others."""
     columns, others = [], []
     for name, feature in features.items():
         try:
@@ -110,7 +110,7 @@ def read_statistics(root: Path) -> dict[str, dict[str, Any]] | str:
 def read_tasks(root: Path) -> dict[int, str] | str:
     """Return the tasks by their task_index, or what is wrong with meta/tasks.parquet.
 
-    Pandas calls the column of their texts after its index.
+    The name of the text column varies: it is the index of a pandas frame.
     """
     table = read_small_table(root / TASKS_PATH)
     if isinstance(table, str):
@@ -122,8 +122,8 @@ def read_tasks(root: Path) -> dict[int, str] | str:
         if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
     ]
     if (table.num_columns, numbers, len(texts)) != (2, [names.TASK_INDEX], 1):
-        told = ", ".join(f"{field.name} ({field.type})" for field in table.schema)
-        return f"has the columns {told}, expected {names.TASK_INDEX} and one of texts"
+        found = ", ".join(f"{field.name} ({field.type})" for field in table.schema)
+        return f"has the columns {found}, expected {names.TASK_INDEX} and one of texts"
     tasks = {row[names.TASK_INDEX]: row[texts[0]] for row in table.to_pylist()}
     if len(tasks) < len(table) or any(column.null_count for column in table.columns):
         return f"lists {table.to_pylist()}, expected one text per {names.TASK_INDEX}"
@@ -137,7 +137,7 @@ def read_small_table(path: Path) -> pa.Table | str:
         with pq.ParquetFile(path) as file:
             table = file.read()
         table.validate(full=True)
-        return table.select(table.column_names)  # raises where names are no text
+        return table.select(table.column_names)  # raises where names are not valid UTF-8
     except FileNotFoundError:
         return "is missing"
     except UNREADABLE as error:
@@ -182,9 +182,10 @@ def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
 
 
 def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:
-    """Cut the rows of one file where episode_index changes and frame_index is 0.
+    """Split the rows of one file where episode_index changes and frame_index is 0.
 
-    A single wrong value of either is then found within an episode. Memory holds the longest run and a block.
+    A single wrong value of either splits nothing, and `run_faults` finds it. Memory holds the longest run and
+    a block.
 
     Raises:
         CorruptDatasetError: the file cannot be read, or values are missing.
@@ -226,7 +227,14 @@ def _values(stored: pa.ChunkedArray, column: PlainColumn) -> Array:
 
 
 def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple[str, str]]:
-    """Yield (column, sentence) for each column of episode `number` with wrong values; `row` is its first."""
+    """Yield (column, sentence) for each column of a run with wrong values.
+
+    Args:
+        run: the rows.
+        number: index of the episode that they should be.
+        row: index of its first row in the dataset.
+        fps: steps per second.
+    """
     frame = np.arange(len(run))
     expected: dict[str, Array] = {
         names.INDEX: row + frame,
@@ -251,7 +259,7 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
 
 
 def flag_faults(run: Run, number: int) -> Iterator[str]:
-    """Yield a sentence for each flag of episode `number` that ends it early, or contradicts the others."""
+    """Yield a sentence for each flag of episode `number` that ends it early or contradicts another."""
     flags = {
         name: values != 0
         for name in _FLAGS
@@ -259,12 +267,12 @@ def flag_faults(run: Run, number: int) -> Iterator[str]:
     }
     for name, values in flags.items():
         if values[:-1].any():
-            told = f"{name} is True in episode {number} frame {values.argmax()}"
-            yield f"{told}, before the last frame {len(run) - 1}"
+            found = f"{name} is True in episode {number} frame {values.argmax()}"
+            yield f"{found}, before the last frame {len(run) - 1}"
     if len(flags) == len(_FLAGS):
         expected = flags[names.TERMINATED] | flags[names.TRUNCATED]
         wrong = flags[names.DONE] != expected
         if wrong.any():
             at = wrong.argmax()
-            told = f"{names.DONE} is {flags[names.DONE][at]} in episode {number} frame {at}"
-            yield f"{told}, expected {expected[at]}: terminated or truncated"
+            found = f"{names.DONE} is {flags[names.DONE][at]} in episode {number} frame {at}"
+            yield f"{found}, expected {expected[at]}: terminated or truncated"

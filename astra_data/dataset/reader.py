@@ -1,4 +1,4 @@
-"""Read a dataset: whole columns as contiguous arrays, or one episode after the other."""
+"""Read a dataset: whole columns as contiguous arrays, or one episode at a time."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -33,8 +33,8 @@ class Dataset(Contents):
         """Open the dataset in folder `root`; `versions.open_dataset` also takes names.
 
         Raises:
-            BadInputError: there is no dataset, or one that is not ours.
-            CorruptDatasetError: it is incomplete or was altered; lists what is wrong.
+            BadInputError: there is no dataset, or a LeRobot dataset without our metadata.
+            CorruptDatasetError: it is incomplete or was altered; lists every fault.
         """
         root = Path(root)
         _refuse_others(root)
@@ -63,7 +63,7 @@ class Dataset(Contents):
 
     @property
     def identity(self) -> dict[str, str]:
-        """What a dataset that is made from this one lists among its parents."""
+        """Name, version and hash, as the datasets made from this one list them among their parents."""
         return {
             "name": self.description["name"],
             "version": self.description["version"],
@@ -83,9 +83,9 @@ class Dataset(Contents):
         """Return whole columns by name, contiguous (n, size), or (n,) where there is one value per step.
 
         Args:
-            names: of the columns.
-            episodes: indices of the episodes whose n steps are read, by default all; whatever their order
-                here, they come in the dataset's.
+            names: names of the columns.
+            episodes: indices of the episodes whose n steps are read, by default all; they come in the
+                dataset's order.
 
         Raises:
             BadInputError: a column or an episode does not exist, or an episode is listed twice.
@@ -105,7 +105,7 @@ class Dataset(Contents):
     def blocks(
         self, names: Sequence[str], episodes: Collection[int] | None = None
     ) -> Iterator[dict[str, Array]]:
-        """Yield the same values piece by piece; memory stays bounded."""
+        """Yield the values of `columns` in blocks of rows; memory stays bounded."""
         specs = self.specs(names)
         wanted = None
         if episodes is not None:
@@ -120,7 +120,7 @@ class Dataset(Contents):
         """Return the episode indices `episodes`, by default all, in the dataset's order.
 
         Raises:
-            BadInputError: one does not exist or is listed twice; lists them.
+            BadInputError: one does not exist or is listed twice; lists every fault.
         """
         if episodes is None:
             return np.arange(len(self))
@@ -137,7 +137,7 @@ class Dataset(Contents):
         return chosen
 
     def episodes(self, names: Sequence[str] | None = None) -> Iterator[Episode]:
-        """Yield all episodes in order with the columns `names`, by default all; memory stays bounded."""
+        """Yield all episodes in order with the columns `names`, by default `schema`; memory stays bounded."""
         specs = self.schema if names is None else self.specs(names)
         rest: dict[str, Array] = {}
         episode = 0
@@ -155,17 +155,17 @@ class Dataset(Contents):
             rest = {name: values[first:] for name, values in rest.items()} if first < rows else {}
 
     def successes(self) -> list[bool | None] | None:
-        """Tell of each episode whether it succeeded, None where nothing does; None if nothing does of any.
+        """Return whether each episode succeeded, None where unknown; None if unknown of all.
 
-        It did if its metadata say so or, where they are silent of some, if a step does in next.success.
+        Taken from the episodes' metadata or, where some episode has none, from the column next.success.
         """
-        told = [
+        known = [
             None if value is None or isinstance(value, str) else bool(value)
             for value in self.metadata.get("success", [None])
         ]
-        if None in told and SUCCESS in self.features:
+        if None in known and SUCCESS in self.features:
             return [bool(episode.columns[SUCCESS].any()) for episode in self.episodes([SUCCESS])]
-        return None if set(told) == {None} else told
+        return None if set(known) == {None} else known
 
     def subset(self, count: int) -> list[int]:
         """Return `count` episode indices; smaller subsets are prefixes of larger ones.
@@ -197,7 +197,7 @@ class Dataset(Contents):
         )
 
     def specs(self, names: Sequence[str]) -> list[Column]:
-        """Return what is known about the columns `names`.
+        """Return the columns `names`.
 
         Raises:
             BadInputError: one does not exist.

@@ -1,8 +1,8 @@
-"""Record episodes that cannot be had again: each is safe on disk at once, and a killed recording goes on.
+"""Record episodes that must not be lost: each is on disk at once, and a killed recording can be resumed.
 
-<parent>/.<name>.staged/plan.json            what is being recorded
+<parent>/.<name>.staged/plan.json            the recording's settings
 <parent>/.<name>.staged/000012.arrow         one finished episode
-<parent>/.<name>.staged/...                  whatever else the recording needs to go on
+<parent>/.<name>.staged/...                  whatever else the recording needs to resume
 """
 
 import json
@@ -31,18 +31,18 @@ _PLAN = "plan.json"
 
 
 class StagedWriter:
-    """Writes a dataset whose episodes must not be lost, such as a robot's.
+    """Writes a dataset whose episodes must not be lost, such as those of a robot.
 
         with StagedWriter(root, columns, fps=20, task="walk", description=..., resume=True) as writer:
             writer.add(episode)
 
-    An episode is safe when `add` returns. Leaving the block turns all of them into the dataset; after an
-    exception or a kill they wait, and a writer with `resume` goes on with them.
+    An episode is safe when `add` returns. Leaving the block writes the dataset; after an exception or a kill
+    the episodes stay staged, and a writer with `resume` continues with them.
 
     Attributes:
-        staged: metadata of the episodes that are safe, by their position in the dataset.
+        staged: metadata of the staged episodes, by their position in the dataset.
         made, policy: as in `DatasetWriter`.
-        folder: where they wait, and whatever else the recording needs to go on after an interruption.
+        folder: the folder of the staged episodes, and of what else the recording needs to resume.
 
     Example:
         >>> from pathlib import Path
@@ -74,12 +74,12 @@ class StagedWriter:
             root: the dataset's folder; must not exist yet.
             columns: as in `DatasetWriter`, like `fps`, `task`, `description` and `subset_seed`.
             fps: steps per second.
-            task: what the episodes do.
-            description: where they come from.
+            task: the task of all episodes.
+            description: the dataset's provenance.
             subset_seed: of the permutation whose prefixes are the nested subsets.
-            resume: go on with what an interrupted recording left, if anything.
-            fsync: have every episode on the disk itself when `add` returns, so that it outlives a power
-                failure, and not only a killed process. Costs about 5 ms per episode.
+            resume: continue an interrupted recording, if there is one.
+            fsync: flush every episode to the disk, so that it survives a power failure and not only a killed
+                process. Costs about 5 ms per episode.
 
         Raises:
             BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
@@ -108,11 +108,11 @@ class StagedWriter:
         self._is_open = False
 
     def __enter__(self) -> "StagedWriter":
-        """Start the recording, or go on with it."""
+        """Start or resume the recording."""
         if self._holds_work() and not self._resume and not self.root.exists():
             raise BadInputError(
                 f"{self.root}: an interrupted recording left {self._left()}; "
-                f"resume it (--resume), or delete {self.folder} to start anew."
+                f"resume it (--resume), or delete {self.folder} to start again."
             )
         self.folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
@@ -149,14 +149,14 @@ class StagedWriter:
                     shutil.rmtree(self.folder)
 
     def add(self, episode: Episode, position: int | None = None) -> None:
-        """Make `episode` safe; one that is refused changes nothing.
+        """Stage `episode`; a refused one changes nothing.
 
         Args:
             episode: the episode.
-            position: its place in the dataset, by default after the last one.
+            position: its position in the dataset, by default after the last one.
 
         Raises:
-            BadInputError: it does not fit the columns, or the place is taken.
+            BadInputError: it does not fit the columns, or the position is taken.
         """
         if not self._is_open:
             raise BadInputError(f"{self.root}: add episodes inside `with StagedWriter(...) as writer:`.")
@@ -164,8 +164,8 @@ class StagedWriter:
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
         self._admission.admit(episode)
-        told = json.dumps({"uid": episode.uid, "metadata": dict(episode.metadata)})
-        schema = self._schema.with_metadata({"episode": told})
+        metadata = json.dumps({"uid": episode.uid, "metadata": dict(episode.metadata)})
+        schema = self._schema.with_metadata({"episode": metadata})
         arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]
         path = self._path(place)
         partial = path.with_suffix(".partial")
@@ -179,16 +179,16 @@ class StagedWriter:
         self.staged[place] = episode.metadata
 
     def _holds_work(self) -> bool:
-        """Tell whether more than the plan waits to be gone on with."""
+        """Return whether there is anything to resume beside the plan."""
         return any(path.name != _PLAN and path.suffix != ".partial" for path in self.folder.glob("*"))
 
     def _left(self) -> str:
-        """Tell what waits to be gone on with."""
+        """Describe what can be resumed."""
         waiting = len(list(self.folder.glob("*.arrow")))
         return f"{waiting} episodes" if waiting else "what it had begun"
 
     def _refuse_root(self) -> None:
-        """Say that `root` exists, and clear what waits only if it is the same recording, finished."""
+        """Refuse an existing `root`; if it is this recording, finished, remove the staged episodes."""
         staged = {
             episode.uid: len(episode) for episode in map(self._load, sorted(self.folder.glob("*.arrow")))
         }
@@ -201,7 +201,7 @@ class StagedWriter:
         )
 
     def _is_finished(self, staged: Mapping[int, int]) -> bool:
-        """Tell whether the episodes `staged`, uid to length, are in the dataset at `root`."""
+        """Return whether the dataset at `root` holds the episodes `staged`, uid to length."""
         try:
             dataset = Dataset.open(self.root)
         except AstraDataError:
@@ -217,13 +217,13 @@ class StagedWriter:
         try:
             with pa.memory_map(str(path)) as source, pa.ipc.open_file(source) as file:
                 table = file.read_all()
-                told = json.loads(table.schema.metadata[b"episode"])
+                metadata = json.loads(table.schema.metadata[b"episode"])
                 values = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in self._columns}
         except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
             raise CorruptDatasetError(
                 f"{path} is no whole episode ({first_line(error)}); delete it and resume the recording."
             ) from error
-        return Episode(told["uid"], values, told["metadata"])
+        return Episode(metadata["uid"], values, metadata["metadata"])
 
     def _agree_on_the_plan(self) -> None:
         path = self.folder / _PLAN

@@ -1,11 +1,11 @@
-"""Which dataset is meant: `name@data-1.2.0`, or its folder.
+"""Versions of datasets, and how they are named: `name@data-1.2.0`, or a folder.
 
-Datasets that are given no folder live at home, which is $ASTRA_DATA_HOME, by default ./datasets:
+Datasets without a folder of their own live at home, which is $ASTRA_DATA_HOME, by default ./datasets:
 
 <home>/<name>/data-<version>/
 
-A version never changes. Of MAJOR.MINOR.PATCH, a change of the columns moves the first number, a change of the
-episodes the second, a change of the description alone the third.
+A version never changes. Of MAJOR.MINOR.PATCH, a change of the columns increments the first number, one of the
+episodes the second, one of the description alone the third.
 """
 
 import os
@@ -45,7 +45,7 @@ class Version:
 
     @property
     def tag(self) -> str:
-        """What folders and tags are called: "data-1.2.0"."""
+        """The name of folders and git tags: "data-1.2.0"."""
         return f"data-{self}"
 
     @classmethod
@@ -58,7 +58,7 @@ class Version:
         return f"{self.major}.{self.minor}.{self.patch}"
 
     def next(self, change: Change, taken: Iterable["Version"] = ()) -> "Version":
-        """Return the version after `change`, beyond all of `taken` that it might be confused with."""
+        """Return the version after `change`, greater than all of `taken` that it could collide with."""
         if change == "columns":
             return Version(max([self.major, *(version.major for version in taken)]) + 1, 0, 0)
         alike = [version for version in (self, *taken) if version.major == self.major]
@@ -69,7 +69,7 @@ class Version:
 
 
 def home() -> Path:
-    """Return where datasets live that are given no folder."""
+    """Return the folder of datasets that have none of their own."""
     return Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
 
 
@@ -132,16 +132,16 @@ def successor(
     parents: Iterable[Dataset] = (),
     **more: Any,  # noqa: ANN401 - JSON
 ) -> tuple[dict[str, Any], Path]:
-    """Describe the version that follows `source`, and say where it goes: to `out`, or to its place at home.
+    """Describe the version that follows `source`, and return its folder: `out`, or by default one at home.
 
     Args:
-        source: what it is made of; its name, seeds, environment and simulator are carried over.
-        change: what moves the version.
-        stage: what makes it.
-        config: how.
-        name: of a dataset of its own, which begins with version 1.0.0; by default that of `source`.
-        out: its folder; versions at home are then not looked at, so that the version is the same anywhere.
-        parents: further datasets that it is made of.
+        source: its first parent; name, seeds, environment and simulator are carried over.
+        change: the kind of change, which determines the version.
+        stage: the stage that writes it.
+        config: the stage's settings.
+        name: of a new dataset, which begins with version 1.0.0; by default that of `source`.
+        out: its folder; the version then does not depend on those at home.
+        parents: further parents.
         more: keys of the description that differ from those of `source`.
 
     Returns:

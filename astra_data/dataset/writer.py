@@ -1,4 +1,4 @@
-"""Write a dataset: episodes stream into a hidden folder, which becomes the dataset when all is well."""
+"""Write a dataset: episodes stream into a hidden folder, which becomes the dataset once it is complete."""
 
 import json
 import shutil
@@ -28,17 +28,16 @@ _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: 
 
 
 class DatasetWriter:
-    """Writes one dataset, all of it or nothing.
+    """Writes one dataset atomically.
 
         with DatasetWriter(root, columns, fps=20, task="reach the goal", description=...) as writer:
             writer.add(episode)
 
-    Leaving the block validates and commits; an exception or a kill at any moment leaves `root` absent.
+    Leaving the block verifies and commits; after an exception or a kill at any moment, `root` does not exist.
 
     Attributes:
-        made: how the dataset was made, such as how long it took, for meta/astra/dataset.json beside the
-            description; to be filled in before leaving the block.
-        policy: file of the policy that acted, if a copy of it belongs to the dataset; as `made`.
+        made: further keys of meta/astra/dataset.json, such as how long it took; set before leaving the block.
+        policy: file of the policy that acted, to be copied into the dataset; set before leaving the block.
 
     Example:
         >>> from pathlib import Path
@@ -69,9 +68,9 @@ class DatasetWriter:
 
         Args:
             root: the dataset's folder; must not exist yet.
-            columns: what every episode holds, without `columns.RESERVED`.
+            columns: the columns of every episode, without `columns.RESERVED`.
             fps: steps per second.
-            task: what the episodes do, a sentence or a name.
+            task: the task of all episodes, a sentence or a name.
             description: see `complete_description`.
             subset_seed: of the permutation whose prefixes are the nested subsets.
             compression: of the data files, one of `format.COMPRESSIONS`.
@@ -81,7 +80,11 @@ class DatasetWriter:
         """
         given = [column.name for column in columns]
         faults = [f"column {name} is given twice" for name in sorted(set(given)) if given.count(name) > 1]
-        faults += [f"column {name} is the writer's, leave it out" for name in given if name in names.RESERVED]
+        faults += [
+            f"column {name}: is filled in by the writer, leave it out"
+            for name in given
+            if name in names.RESERVED
+        ]
         if not given:
             faults.append("no columns")
         if type(fps) is not int or fps < 1:
@@ -119,9 +122,9 @@ class DatasetWriter:
         more: Sequence[Column] = (),
         subset_seed: int | None = None,
     ) -> "DatasetWriter":
-        """Prepare to write to `root` a dataset like `source`, with the columns `more` besides.
+        """Prepare to write to `root` a dataset like `source`, with additional columns `more`.
 
-        The permutation of the subsets is that of `source`, but for another `subset_seed`.
+        The permutation of the subsets is that of `source`, unless `subset_seed` is given.
         """
         return cls(
             root,
@@ -134,7 +137,7 @@ class DatasetWriter:
 
     @property
     def content_hash(self) -> str:
-        """The hash of everything that was added so far."""
+        """The hash of all episodes added so far."""
         return self._hash.hexdigest()
 
     def __enter__(self) -> "DatasetWriter":
@@ -152,12 +155,16 @@ class DatasetWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Commit, or remove every trace."""
+        """Commit, or after an error remove the hidden folder."""
         self._is_open = False
         self._exit.__exit__(kind, error, trace)
 
     def add(self, episode: Episode) -> None:
-        """Append `episode`; one that is refused leaves the dataset as it was."""
+        """Append `episode`; a refused one changes nothing.
+
+        Raises:
+            BadInputError: it does not fit the columns or the earlier episodes; lists every fault.
+        """
         if not self._is_open:
             raise BadInputError(f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`.")
         self._admission.admit(episode)
@@ -184,13 +191,13 @@ class DatasetWriter:
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the data files and, if nothing went wrong, write all other files and validate."""
+        """Close the data files and, unless there was an error, write all other files and verify."""
         self._data.close()
         self._rows.close()
         if error is not None:
             return
         if not self._lengths:
-            raise BadInputError(f"{self.root}: no episodes were added; a dataset needs one at least.")
+            raise BadInputError(f"{self.root}: no episodes were added; a dataset needs at least one.")
         episodes, uids = len(self._lengths), list(self._lengths)
         info = layout.dataset_info(self._stored, fps=self._fps, episodes=episodes, frames=self._frames)
         order = permutation(uids, self._subset_seed)

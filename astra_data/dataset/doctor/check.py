@@ -1,4 +1,4 @@
-"""Everything that can be wrong with a LeRobot dataset, ours or another's, in one report."""
+"""Check a LeRobot dataset, ours or another tool's, and report every fault."""
 
 from collections.abc import Iterator, Mapping
 from itertools import zip_longest
@@ -44,7 +44,7 @@ _META_FILES = (INFO_PATH, STATS_PATH, TASKS_PATH, DATASET_PATH, METADATA_PATH, S
 
 
 def check(root: Path) -> Report:
-    """Check the dataset in folder `root`: its files, every value and, where it is ours, its origin.
+    """Check the dataset in folder `root`: its files, every value and, if it is ours, its provenance.
 
     Raises:
         BadInputError: there is no folder `root`, or it holds no dataset.
@@ -58,7 +58,7 @@ def check(root: Path) -> Report:
         return report
     is_ours = (root / DATASET_PATH).exists()
     if not is_ours:
-        report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset, nothing is known of its origin")
+        report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset of unknown provenance")
     columns = _info_faults(info, report)
     if columns and _files_are_readable(root, info, columns, report):
         checks = EpisodeChecks(root, info, columns, is_ours, report)
@@ -79,7 +79,7 @@ def check(root: Path) -> Report:
 
 
 def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
-    """Check meta/info.json; return the columns whose values can be checked, none if they are too few."""
+    """Check meta/info.json; return the columns whose values can be checked, none if some are missing."""
     version, fps, features = info.get("codebase_version"), info.get("fps"), info.get("features")
     if version != CODEBASE_VERSION:
         report.fault(INFO_PATH, f"{INFO_PATH}: the format is {version}, expected {CODEBASE_VERSION}")
@@ -90,12 +90,12 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
         report.fault(INFO_PATH, f"{INFO_PATH}: features is {features!r}, expected an object")
         return []
     if not is_data_path(data_path := info.get("data_path")):
-        told = f"data_path is {data_path!r}, expected a path inside the folder such as {DATA_PATH}"
-        report.fault(INFO_PATH, f"{INFO_PATH}: {told}")
+        expected = f"expected a path inside the folder such as {DATA_PATH}"
+        report.fault(INFO_PATH, f"{INFO_PATH}: data_path is {data_path!r}, {expected}")
         return []
     columns, others = plain_columns(features)
     if others:
-        report.note("features", f"not checked, for they are not rows of numbers: {', '.join(others)}")
+        report.note("features", f"not checked, because they are not numeric: {', '.join(others)}")
     for column in columns:
         labels = features[column.name].get("names")
         if isinstance(labels, list) and len(labels) != column.size:
@@ -138,12 +138,12 @@ def _files_are_readable(
 
 
 def _strangers(root: Path, report: Report) -> None:
-    """Tell files that LeRobot does not know; in the metadata they may be another tool's."""
+    """Report unknown files: in data/ as faults, in meta/, where other tools may add some, as notes."""
     known = {root / path for path in _META_FILES} | {*data_files(root), *episodes_files(root)}
     for path in sorted([*(root / "data").rglob("*"), *(root / "meta").rglob("*")]):
         if path.is_file() and path not in known:
-            tell = report.fault if path.is_relative_to(root / "data") else report.note
-            tell("files", f"{path.relative_to(root)} does not belong to it")
+            add = report.fault if path.is_relative_to(root / "data") else report.note
+            add("files", f"{path.relative_to(root)} does not belong to it")
 
 
 def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -> None:
@@ -168,8 +168,8 @@ def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -
 def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
     try:
         description = read_description(root)
-        if (found := checks.hash.hexdigest()) != (stored := description["content_hash"]):
-            report.fault("origin", f"the content hash is {found}, expected {stored}")
+        if (content := checks.hash.hexdigest()) != (stored := description["content_hash"]):
+            report.fault("origin", f"the content hash is {content}, expected {stored}")
         _policy_faults(root, description.get("behavior"), report)
     except CorruptDatasetError as error:
         report.fault("origin", str(error))
@@ -177,11 +177,11 @@ def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
     if isinstance(table, str):
         report.fault(METADATA_PATH, f"{METADATA_PATH} {table}")
     else:
-        told = [(row.get("episode_uid"), row.get("length")) for row in table.to_pylist()]
+        listed = [(row.get("episode_uid"), row.get("length")) for row in table.to_pylist()]
         present = zip(checks.uids, checks.lengths, strict=True)
-        for episode, (said, is_) in enumerate(zip_longest(told, present)):
-            if said != is_:
-                fault = f"{said} as uid and length of episode {episode}, expected {is_}"
+        for episode, (found, expected) in enumerate(zip_longest(listed, present)):
+            if found != expected:
+                fault = f"{found} as uid and length of episode {episode}, expected {expected}"
                 report.fault(METADATA_PATH, f"{METADATA_PATH} has {fault}")
     try:
         subsets = read_subsets(root)
@@ -192,7 +192,7 @@ def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
 
 
 def _policy_faults(root: Path, behavior: object, report: Report) -> None:
-    """Compare the policy that acted with what is recorded of it, if it was trained while collecting."""
+    """Compare the stored policy with its recorded checksum, if it was trained while collecting."""
     expected = behavior.get("policy_sha256") if isinstance(behavior, dict) else None
     if expected is None:
         return

@@ -1,4 +1,4 @@
-"""The values of every episode, against the rules and against what meta/episodes says of them."""
+"""Check the values of every episode against the format and against meta/episodes."""
 
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
@@ -29,15 +29,15 @@ from astra_data.dataset.plain import (
 EXACT = 1e-6
 """Relative tolerance of our own statistics."""
 ESTIMATED = 1e-3
-"""Relative tolerance of LeRobot's, which adds up in float32 and estimates quantiles and spread."""
+"""Relative tolerance of LeRobot's, which sums in float32 and estimates quantiles and std."""
 
 
 class EpisodeChecks:
-    """Goes through all episodes once, one in memory at a time.
+    """Reads all episodes once, one in memory at a time.
 
     Attributes:
-        hash: of the content, once `run` has been called.
-        uids: of the episodes; their numbers, where there is no such column.
+        hash: the content hash, after `run`.
+        uids: uids of the episodes, or their indices without such a column.
         lengths: their numbers of steps.
     """
 
@@ -49,7 +49,7 @@ class EpisodeChecks:
         is_ours: bool,
         report: Report,
     ) -> None:
-        """Prepare; statistics are exact where the dataset `is_ours`, and estimates elsewhere."""
+        """Prepare; the stored statistics are exact if the dataset `is_ours`, else estimates."""
         self.hash = ContentHash()
         self.uids: list[int] = []
         self.lengths: list[int] = []
@@ -97,7 +97,7 @@ class EpisodeChecks:
             self._report.frames += len(run)
 
     def totals(self) -> None:
-        """Check counts, uids and, where they are estimates, the extremes in stats.json."""
+        """Check counts, uids and, if statistics are estimates, the extremes in stats.json."""
         found = {"total_episodes": self._report.episodes, "total_frames": self._report.frames}
         for key, count in (found | {"total_tasks": len(self._tasks)}).items():
             if self._info.get(key) != count:
@@ -126,18 +126,18 @@ class EpisodeChecks:
         }
         for key, value in expected.items():
             if row.get(key) != value:
-                told = f"meta/episodes: {key} of episode {number} is {row.get(key)}, expected {value}"
-                self._report.fault("meta/episodes", told)
+                fault = f"meta/episodes: {key} of episode {number} is {row.get(key)}, expected {value}"
+                self._report.fault("meta/episodes", fault)
         place = {"chunk_index": row.get("data/chunk_index"), "file_index": row.get("data/file_index")}
         known = all(isinstance(index, int) for index in place.values())
-        said = self._info["data_path"].format(**place) if known else None
-        if said != str(run.path.relative_to(self._root)):
-            told = f"meta/episodes: episode {number} is said to be in {said}, it is in {run.path.name}"
-            self._report.fault("meta/episodes", told)
+        path = self._info["data_path"].format(**place) if known else None
+        if path != str(run.path.relative_to(self._root)):
+            fault = f"meta/episodes: the file of episode {number} is {path}, expected {run.path.name}"
+            self._report.fault("meta/episodes", fault)
         present = {self._tasks.get(int(task)) for task in np.unique(run.columns[names.TASK_INDEX])}
         if set(row.get("tasks") or ()) != present:
-            told = f"meta/episodes: tasks of episode {number} are {row.get('tasks')}, expected {present}"
-            self._report.fault("meta/episodes", told)
+            fault = f"meta/episodes: tasks of episode {number} are {row.get('tasks')}, expected {present}"
+            self._report.fault("meta/episodes", fault)
         self._check_statistics(number, run, row)
 
     def _check_statistics(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
@@ -150,10 +150,9 @@ class EpisodeChecks:
         for column in self._columns:
             last = first + column.size
             for kind in kinds:
-                told = row.get(f"stats/{column.name}/{kind}")
                 self._compare(
                     f"{kind} of {column.name} in episode {number}",
-                    told,
+                    row.get(f"stats/{column.name}/{kind}"),
                     found[STATISTICS.index(kind), first:last],
                 )
             first = last
@@ -168,23 +167,23 @@ class EpisodeChecks:
             last = first + column.size
             for kind, values in (("min", self._lowest), ("max", self._highest)):
                 if values is not None:
-                    told = stored.get(column.name, {}).get(kind)
-                    self._compare(f"{kind} of {column.name}", told, values[first:last])
+                    found = stored.get(column.name, {}).get(kind)
+                    self._compare(f"{kind} of {column.name}", found, values[first:last])
             first = last
 
-    def _compare(self, what: str, told: object, found: NDArray[np.float64]) -> None:
-        if is_close(told, found, EXACT if self._is_ours else ESTIMATED):
+    def _compare(self, what: str, stored: object, expected: NDArray[np.float64]) -> None:
+        if is_close(stored, expected, EXACT if self._is_ours else ESTIMATED):
             return
-        tell = self._report.fault if self._is_ours else self._report.note
-        tell("statistics", f"statistics: {what} is {told}, expected {found.tolist()}")
+        add = self._report.fault if self._is_ours else self._report.note
+        add("statistics", f"statistics: {what} is {stored}, expected {expected.tolist()}")
 
 
-def is_close(told: object, found: object, tolerance: float) -> bool:
-    """Tell whether stored statistics equal the values `found`, relative to the largest of them."""
+def is_close(stored: object, expected: object, tolerance: float) -> bool:
+    """Return whether `stored` statistics equal those `expected`, relative to the largest of these."""
     try:
-        stored, values = np.asarray(told, dtype=np.float64), np.asarray(found, dtype=np.float64)
+        found, values = (np.asarray(each, dtype=np.float64).ravel() for each in (stored, expected))
     except (OverflowError, TypeError, ValueError):
         return False
-    if stored.size != values.size:
+    if found.size != values.size:
         return False
-    return bool(np.allclose(stored.ravel(), values.ravel(), tolerance, tolerance * np.abs(values).max()))
+    return bool(np.allclose(found, values, tolerance, tolerance * np.abs(values).max()))

@@ -1,41 +1,36 @@
-"""A list of findings that stays readable: of one kind, only the first few are told."""
+"""The findings of a check: of each kind, the first few in words and the others counted."""
 
 from collections import Counter
 from dataclasses import dataclass, field
 
 MOST = 5
-"""Findings of one kind that are told; of the others only the number."""
+"""Findings of one kind that are kept; further ones are only counted."""
 
 
-@dataclass
 class _Findings:
-    """Sentences by their kind, and how many more of each were not kept."""
+    """Sentences by kind, the first `MOST` of each, and the number of all."""
 
-    told: dict[str, list[str]] = field(default_factory=dict)
-    untold: Counter[str] = field(default_factory=Counter)
+    def __init__(self) -> None:
+        self.kept: dict[str, list[str]] = {}
+        self.counts: Counter[str] = Counter()
 
     def add(self, kind: str, sentence: str) -> None:
-        told = self.told.setdefault(kind, [])
-        if len(told) < MOST:
-            told.append(sentence)
-        else:
-            self.untold[kind] += 1
+        self.counts[kind] += 1
+        if self.counts[kind] <= MOST:
+            self.kept.setdefault(kind, []).append(sentence)
 
     def sentences(self) -> list[str]:
         found: list[str] = []
-        for kind, sentences in self.told.items():
+        for kind, sentences in self.kept.items():
             found += sentences
-            if self.untold[kind]:
-                found.append(f"{kind}: and {self.untold[kind]} more of this kind")
+            if more := self.counts[kind] - len(sentences):
+                found.append(f"{kind}: and {more} more of this kind")
         return found
-
-    def total(self) -> int:
-        return sum(map(len, self.told.values())) + self.untold.total()
 
 
 @dataclass
 class Report:
-    """What was found in a dataset.
+    """The findings in a dataset.
 
     Attributes:
         episodes: number of episodes in the data.
@@ -48,24 +43,24 @@ class Report:
     _notes: _Findings = field(default_factory=_Findings)
 
     def fault(self, kind: str, sentence: str) -> None:
-        """Add something that is wrong."""
+        """Add a fault."""
         self._faults.add(kind, sentence)
 
     def note(self, kind: str, sentence: str) -> None:
-        """Add something that is worth knowing, but not wrong."""
+        """Add something worth knowing that is not a fault."""
         self._notes.add(kind, sentence)
 
     @property
     def faults(self) -> list[str]:
-        """What is wrong, a sentence each."""
+        """The faults, a sentence each."""
         return self._faults.sentences()
 
     @property
     def fault_count(self) -> int:
-        """How many things are wrong, also those that `faults` only counts."""
-        return self._faults.total()
+        """The number of faults, including those that `faults` only counts."""
+        return self._faults.counts.total()
 
     @property
     def notes(self) -> list[str]:
-        """What is worth knowing, but not wrong, a sentence each."""
+        """The notes, a sentence each."""
         return self._notes.sentences()

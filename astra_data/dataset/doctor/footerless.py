@@ -1,8 +1,8 @@
-"""Parquet files whose writer was killed: the footer, which comes last, is rebuilt from the pages' headers.
+"""Rebuild the footer of parquet files whose writer was killed, from the headers of their pages.
 
-A file is "PAR1", then row group after row group: for each column the pages that hold it, an optional
-dictionary first, each page behind a header with its size and its number of values. Where a column ends is not
-written; it follows from all columns of a row group having equally many rows.
+A file is "PAR1", then the row groups: for each column its pages, an optional dictionary page first; each page
+follows a header with its size and number of values. Where a column ends is not stored in the headers; it is
+inferred, because all columns of a row group have the same number of rows.
 """
 
 import io
@@ -19,13 +19,13 @@ from astra_data.dataset.doctor.thrift import I32, I64, LIST, STRUCT, Reader, Str
 
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
 _DETAILS = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}
-"""Field of a page's header that describes this kind of page."""
+"""Field of a page's header with the details of this kind of page."""
 _ENCODING = {_DATA: 2, _DICTIONARY: 2, _DATA_V2: 4}
-"""Field therein that holds the encoding."""
+"""Field of these details with the encoding."""
 _FIXED_WIDTH = (0, 9)
 """Encodings PLAIN and BYTE_STREAM_SPLIT."""
 _HEADER = 1000
-"""Bytes that a page's header, with the extremes of its values, does not exceed."""
+"""Upper bound of a page header in bytes, including the extremes of its values."""
 _SNAPPY, _ZSTD = 1, 6
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -43,7 +43,7 @@ class _Page:
     is_zstd: bool
 
     def fits(self, column: "_Leaf") -> bool:
-        """Tell whether it may belong to `column`: values of fixed width take that, and a few bits more."""
+        """Return whether it may belong to `column`: does the size match that of values of its width?"""
         if self.kind == _DICTIONARY or self.encoding not in _FIXED_WIDTH:
             return True
         least = self.values * column.bits // 8
@@ -129,7 +129,7 @@ def _page(data: memoryview, start: int) -> _Page | None:
 
 
 def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> list[list[_Page]] | None:
-    """Cut the pages from `first` on into a chunk per column, of equally many rows; None if too few."""
+    """Split the pages from `first` on into one chunk per column, of equally many rows; None if too few."""
     values = 0
     for number in range(first, len(pages)):
         if pages[number].kind == _DICTIONARY:
@@ -166,7 +166,7 @@ def _chunks(
 
 
 def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_Leaf]) -> bytes:
-    """Return parquet's FileMetaData: the schema of `template`, a file of one row group, and our groups."""
+    """Return parquet's FileMetaData: the schema of `template`, a file of one row group, and `groups`."""
     length = int.from_bytes(template[-8:-4], "little")
     metadata = Reader(template[-8 - length : -8]).struct()
     columns = [column[3][1] for column in metadata[4][1][1][0][1][1][1]]
@@ -180,7 +180,7 @@ def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_
 
 
 def _column_chunk(column: Struct, pages: Sequence[_Page]) -> Struct:
-    """Return parquet's ColumnChunk; type and path are those of the template's `column`."""
+    """Return parquet's ColumnChunk of `pages`, with type and path of the template's `column`."""
     data = [page for page in pages if page.kind != _DICTIONARY]
     metadata: Struct = {
         1: column[1],

@@ -1,4 +1,4 @@
-"""Save what is whole of a broken LeRobot dataset, ours or another's, into a new one."""
+"""Save the intact episodes of a damaged LeRobot dataset, ours or another tool's, into a new one."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -39,11 +39,12 @@ _DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
 
 @dataclass
 class Repaired:
-    """What `repair` saved.
+    """The result of `repair`.
 
     Attributes:
-        episodes: number of episodes saved. frames: number of steps.
-        notes: what was lost or changed, a sentence each.
+        episodes: number of episodes saved.
+        frames: number of steps saved.
+        notes: losses and changes, a sentence each.
     """
 
     episodes: int = 0
@@ -52,20 +53,20 @@ class Repaired:
 
 
 def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
-    """Write the whole, verified episodes in `folder` to a new dataset `out`.
+    """Write the intact episodes of `folder` to a new dataset `out`.
 
-    An episode whose values are wrong is left out; so is all that follows once it is unclear where episodes
-    begin, or a file cannot be read. Data files are read by their footers, or where a killed writer left none,
-    by their pages. Statistics and meta/episodes are made anew.
+    Episodes with wrong values are left out, and all that follow once it is unclear where episodes begin, or a
+    file cannot be read. Data files without a footer, which a killed writer leaves, are read page by page.
+    Statistics and meta/episodes are rebuilt.
 
     Args:
-        folder: the broken dataset; it is not touched.
+        folder: the damaged dataset; it is not changed.
         out: folder of the new one.
-        like: the dataset that `folder` was made from by LeRobot's tools, which drop our metadata: origin and
-            the episodes' metadata are taken from it, joined by episode_uid.
+        like: the dataset from which LeRobot's tools made `folder`, dropping our metadata: provenance and the
+            episodes' metadata are taken from it, joined by episode_uid.
 
     Raises:
-        CorruptDatasetError: meta/info.json is gone, or there is not one whole episode.
+        CorruptDatasetError: meta/info.json is missing, or no episode is intact.
         BadInputError: `out` exists, or episodes cannot be joined with `like`.
     """
     info = read_object(folder / INFO_PATH)
@@ -102,8 +103,8 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
         is_all = like is None and counted == result.episodes and len(columns) == len(info["features"])
         if is_all and not isinstance(written, str) and written.get("content_hash") != writer.content_hash:
             result.notes.append(
-                "a value was altered after it was written, for the content hash is another; which one "
-                "cannot be told"
+                "a value was altered after it was written, because the content hash differs; which one is "
+                "unknown"
             )
         writer.made = {"repaired": result.notes}
         writer.policy = policy if (policy := folder / POLICY_PATH).is_file() else None
@@ -113,13 +114,13 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
         result.notes.append(f"{unknown} episodes have no metadata: their uids are not among the known ones")
     if len(tasks) > 1:
         result.notes.append(
-            f"the {len(tasks)} tasks became one, the episodes' own is in their metadata 'task'"
+            f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'"
         )
     return result
 
 
 def _declared(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
-    """Return the readable columns, those of them that the writer takes, and the fps, from info.json."""
+    """Return the readable columns, those to be written, and the fps, from info.json."""
     features, fps = info.get("features"), info.get("fps")
     columns = plain_columns(features)[0] if isinstance(features, dict) else []
     missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
@@ -146,7 +147,7 @@ def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> lis
     notes = []
     others = sorted(info["features"].keys() - {column.name for column in columns})
     if others:
-        notes.append(f"left out, for they are not rows of numbers: {', '.join(others)}")
+        notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     for column in columns:
         kind = _DTYPES[np.dtype(column.dtype).kind]
         if column.dtype != kind:

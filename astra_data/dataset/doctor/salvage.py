@@ -1,4 +1,4 @@
-"""Read the whole episodes of a broken dataset, by its files' footers or, without them, by their pages."""
+"""Read the intact episodes of a damaged dataset, from files with or without a footer."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,13 +25,20 @@ _STRUCTURE = {
     *(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX),
     *(names.TIMESTAMP, names.EPISODE_UID),
 }
-"""Columns that tell where episodes begin: where they are wrong, so may be all that follows."""
+"""Columns that locate episodes: after a fault in one, no later episode can be trusted."""
 
 
 def whole_runs(
     folder: Path, columns: Sequence[PlainColumn], fps: int, notes: list[str]
 ) -> Iterator[tuple[int, Run]]:
-    """Yield the uid and the rows of each whole episode, and note which are left out, and where it stops."""
+    """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
+
+    Args:
+        folder: the damaged dataset.
+        columns: the columns to read, LeRobot's own among them.
+        fps: steps per second.
+        notes: a sentence is added for each loss.
+    """
     lengths = _lengths(folder, notes)
     episode = row = 0
     uids: set[int] = set()
@@ -60,7 +67,7 @@ def whole_runs(
 
 
 def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
-    """Return the lengths that meta/episodes tells, as far as it can be read."""
+    """Return the episodes' lengths from meta/episodes, as far as it can be read."""
     lengths: dict[int, int] = {}
     before = len(notes)
     for path in episodes_files(folder):
@@ -69,9 +76,9 @@ def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
                 columns = block.to_pydict()
                 lengths |= zip(columns["episode_index"], columns["length"], strict=True)
         except (CorruptDatasetError, KeyError) as error:
-            notes.append(f"meta/episodes was made anew from the data: {error}")
+            notes.append(f"meta/episodes was rebuilt from the data: {error}")
     if not lengths and len(notes) == before:
-        notes.append("meta/episodes was missing and was made anew from the data")
+        notes.append("meta/episodes was missing and was rebuilt from the data")
     return lengths
 
 
@@ -91,7 +98,7 @@ def _file_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str]) -> 
     notes.append(
         f"{path.parent.name}/{path.name} has no footer: {len(rows)} whole row groups were found in it"
     )
-    # LeRobot writes one row group per episode. Where groups are cut otherwise, the last one may be.
+    # LeRobot writes one row group per episode. With other groups, the last episode may be incomplete.
     if held is not None and len(held) == rows[-1]:
         yield held
     elif held is not None:
@@ -103,7 +110,7 @@ def _file_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str]) -> 
 def _row_groups(
     path: Path, metadata: pq.FileMetaData, wanted: Sequence[str], rows: list[int]
 ) -> Iterator[pa.Table]:
-    """Yield row groups up to the first that cannot be read, and append their numbers of rows to `rows`."""
+    """Yield row groups up to the first unreadable one, and append their numbers of rows to `rows`."""
     with pq.ParquetFile(path, metadata=metadata) as file:
         for group in range(metadata.num_row_groups):
             try:

@@ -1,4 +1,4 @@
-"""Thrift's compact protocol, in which parquet writes its headers and footers, without knowing their fields.
+"""Thrift's compact protocol, in which parquet writes its headers and footers; independent of their fields.
 
 A struct is a dict of field number to (type, value), a list is (type, values).
 """

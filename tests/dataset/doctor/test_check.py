@@ -88,7 +88,10 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
         (alter(DATA, "action", 10, [0, 0]), ["mean of action in episode 2 is", "the content hash is"]),
         (alter(EPISODES, "length", 1, 2), ["length of episode 1 is 2, expected 1"]),
         (alter(EPISODES, "dataset_to_index", 1, 9), ["dataset_to_index of episode 1 is 9, expected 8"]),
-        (alter(EPISODES, "data/file_index", 1, 4), ["said to be in data/chunk-000/file-004.parquet"]),
+        (
+            alter(EPISODES, "data/file_index", 1, 4),
+            ["the file of episode 1 is data/chunk-000/file-004.parquet, expected file-000.parquet"],
+        ),
         (alter(EPISODES, "tasks", 0, ["walk"]), ["tasks of episode 0 are ['walk'], expected {'run'}"]),
         (alter(EPISODES, "stats/mode/max", 2, [5.0]), ["max of mode in episode 2 is [5.0]"]),
         (change_statistics, ["meta/stats.json: q99 of action is"]),
@@ -227,7 +230,7 @@ def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> No
     edit("meta/info.json", features=features)(root)
     report = check(root)
     assert report.faults == []
-    assert "not checked, for they are not rows of numbers: action, next.reward" in report.notes
+    assert "not checked, because they are not numeric: action, next.reward" in report.notes
 
 
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_missing_episodes_are_told_beside_other_notes(killed: Path, tmp_path: Pa
     shutil.copytree(killed / "whole", tmp_path / "set")
     (tmp_path / "set" / EPISODES).unlink()
     notes = repair(tmp_path / "set", out=tmp_path / "saved").notes
-    assert "meta/episodes was missing and was made anew from the data" in notes
+    assert "meta/episodes was missing and was rebuilt from the data" in notes
     assert len(notes) > 1
 
 
