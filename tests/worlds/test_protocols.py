@@ -11,7 +11,7 @@ from astra_data.worlds import protocols
 from astra_data.worlds.humanoid.walker2d import HumanoidWalker2d
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.protocols import OwnSimulator, RememberingSimulator, TaskSimulator
+from astra_data.worlds.protocols import Simulator, RememberingSimulator, TaskSimulator
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 
@@ -27,14 +27,14 @@ def members(protocol: type) -> set[str]:
 
 
 def test_a_user_writes_what_the_module_shows() -> None:
-    assert members(OwnSimulator) == {
+    assert members(Simulator) == {
         *("abstract_state", "abstraction", "parameters"),
         *("state", "reset_to", "step"),
     }
     shown = protocols.__doc__ or ""
-    assert all(name in shown for name in members(OwnSimulator))
-    glider: OwnSimulator = my_simulator.Glider(1)
-    assert all(hasattr(glider, name) for name in members(OwnSimulator))
+    assert all(name in shown for name in members(Simulator))
+    glider: Simulator = my_simulator.Glider(1)
+    assert all(hasattr(glider, name) for name in members(Simulator))
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)

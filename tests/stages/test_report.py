@@ -1,12 +1,16 @@
+"""The report over small runs: what it writes where; its page is tested in tests/reports/test_page.py."""
+
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from fake_dataset import write_fake
-from fake_report import CONFIG, FIGURES, make
+from fake_report import CONFIG, FIGURES, LASTING_FIGURES, REPLAY, images, make, task
 from fake_runs import (
     MADE,
     ROWS,
@@ -16,21 +20,44 @@ from fake_runs import (
     outcomes,
     write_elsewhere,
     write_evaluation,
+    write_runs,
 )
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import place
+from astra_data.reports.page import render
+from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizesResults
+from astra_data.stages import report as stage
 from astra_data.stages.report import report
+from astra_data.worlds.score import RETURN, SURVIVED_STEPS
+
+
+@pytest.fixture(scope="module")
+def tasks() -> Iterator[None]:
+    """Give the report a task of its own, and no target to replay commands in."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "TASKS", {"antmaze-u": task()})
+        patch.setattr(stage, "replay_commands", lambda _: REPLAY)
+        yield
+
+
+@pytest.fixture
+def root(tasks: None, tmp_path: Path) -> Path:
+    return write_runs(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def folder(tasks: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a finished report, for tests that only read it."""
+    root = write_runs(tmp_path_factory.mktemp("report"))
+    make(root)
+    return root / "report"
 
 
 @pytest.fixture
 def values(folder: Path) -> Any:  # noqa: ANN401 - JSON
     return json.loads((folder / "results.json").read_text())
-
-
-def test_a_list_of_numbers_takes_one_line(folder: Path) -> None:
-    assert '"success": [ 0.5, 0.25, 0.75 ]' in (folder / "results.json").read_text()
 
 
 def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN401 - JSON
@@ -132,13 +159,6 @@ def test_one_seed_of_rows_without_training_is_enough(root: Path) -> None:
     )
 
 
-def test_a_cut_off_trajectory_file_is_refused(root: Path) -> None:
-    path = root / "evaluate/astra/seed_0/trajectories.safetensors"
-    path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(BadInputError, match="no whole safetensors file"):
-        make(root)
-
-
 def test_sizes_are_set_side_by_side(tasks: None, tmp_path: Path) -> None:
     root = tmp_path / "runs" / "sizes"
     for percent in (50, 100):
@@ -166,3 +186,96 @@ def test_sizes_are_set_side_by_side(tasks: None, tmp_path: Path) -> None:
         "sizes.md",
         "sizes_data_efficiency.png",
     ]
+
+
+def test_rows_that_were_tested_in_no_simulator_have_no_predictive_validity(root: Path) -> None:
+    for row in ROWS:
+        edit_json(root / f"evaluate/{row}/seed_1/evaluation.json", raw=None, grounded=None)
+    make(root)
+    assert "Predictive validity" not in (root / "report/results.md").read_text()
+    assert images(root / "report") == FIGURES - {"validity"}
+
+
+def test_the_page_says_that_a_robot_is_a_stand_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(facts={"stand_in": "mujoco"})})
+    make(root)
+    text = "**A simulated stand-in (`mujoco`) takes the physical robot's place"
+    assert text in (root / "report/results.md").read_text()
+
+
+def test_the_page_says_which_rows_are_not_finished(root: Path) -> None:
+    for seed in (0, 1, 2):
+        (root / f"evaluate/astra/seed_{seed}/evaluation.json").unlink()
+    make(root)
+    page = (root / "report/results.md").read_text()
+    assert "Not finished yet: ASTRA." in page and "| ASTRA |" not in page
+    shutil.rmtree(root / "evaluate")
+    shutil.rmtree(root / "report")
+    with pytest.raises(MissingStageError, match="found none for direct_transfer seed 0, 1, 2; astra seed"):
+        make(root)
+    assert not (root / "report").exists()
+
+
+def test_page_holds_the_table_and_only_figures_that_exist(folder: Path) -> None:
+    page = (folder / "results.md").read_text()
+    assert "| Direct transfer (floor) | 3 | 0.17 ± 0.14 |" in page
+    assert "| ASTRA+ | 3 | **0.92 ± 0.14** |" in page
+    assert "| Careful follower (ceiling) | 3 | 1.00 ± 0.00 | 1.00 [1.00, 1.00] |" in page
+    assert "| No grounding | 1 [0.5, 2] | 2 [1, nan] |" in page
+    assert "astra-data run recipes/antmaze_u.toml" in page
+    assert "[plus]" in page
+    assert images(folder) == FIGURES
+    assert {name for name in FIGURES if f"]({name}.png)" in page} == FIGURES
+
+
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [({"plane": None}, {"trajectories", "mismatch"}), ({"ball_index": 4}, {"mismatch"})],
+)
+def test_without_a_maze_or_with_a_ball_some_figures_make_no_sense(
+    root: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], missing: set[str]
+) -> None:
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(**changes)})
+    make(root)
+    assert images(root / "report") == FIGURES - missing
+
+
+def test_of_lasting_tasks_the_page_tells_survived_steps_and_return(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lasting = task(plane=None, objective=SimpleNamespace(scores=(SURVIVED_STEPS, RETURN)))
+    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": lasting})
+    points = [
+        {"steps": steps, "success": None, "episode_steps": lasted}
+        for steps, lasted in ((1000, 30.0), (2000, None), (3000, 90.0))
+    ]
+    for seed, steps in enumerate((60.0, 90.0, 600.0)):
+        means = {"steps": 40.0 + 10 * seed, "return": 200.0 + seed}
+        edit_json(
+            root / f"evaluate/astra/seed_{seed}/evaluation.json",
+            target=outcomes([0, 0, 0, 1], seed) | {"steps": [steps] * 4},
+            encoders={"source": means, "target": means},
+        )
+        edit_json(root / f"evaluate/astra_plus/seed_{seed}/evaluation.json", encoders={})
+        edit_json(root / f"train/astra/seed_{seed}/curve.json", points=points)
+    make(root, note="best: ASTRA  survived steps 250")
+    page = (root / "report/results.md").read_text()
+    scores = "survived steps | IQM [95 %] | return | IQM [95 %]"
+    assert f"| method | seeds | {scores} | failed | survived steps in its simulator |" in page
+    assert "| ASTRA | 3 | **250 ± 303** | " in page
+    assert "| **1.0 ± 1.0** | 1.0 [0.0, 2.0] | 0.75 ± 0.00 | 115 ± 0 |" in page
+    assert "has a higher number of survived steps than" in page
+    # Direct transfer lasts 115 steps with every seed.
+    assert "| ASTRA | Direct transfer | 0.33 [" in page
+    assert "| method | encoder | survived steps | return |" in page
+    assert "| ASTRA | source | 50 ± 10 | 201.0 ± 1.0 |" in page
+    assert "success" not in page
+    drawn = images(root / "report")
+    assert drawn == FIGURES - {"success", "trajectories", "mismatch", "learning"} | LASTING_FIGURES
+    stored = (root / "report/results.json").read_text()
+    curve = {"steps": [1000.0, 2000.0, 3000.0], "score": [30.0, None, 90.0]}
+    assert json.loads(stored)["methods"]["astra"]["learning"] == [curve] * 3
+    # What is stored tells the scores by itself.
+    found = Results.model_validate_json(stored)
+    assert found.scores == (SURVIVED_STEPS, RETURN)
+    assert render(found, {name: f"{name}.png" for name in drawn}) == page

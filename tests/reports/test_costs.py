@@ -1,0 +1,53 @@
+import pytest
+
+from astra_data.reports.artefacts import Artefact, CurveFile, Metrics
+from astra_data.reports.costs import THROUGHPUT, Files, seconds, seed_cost, throughput
+from astra_data.reports.schema import Cost
+
+
+def metrics(**values: float) -> Metrics:
+    return Metrics.model_validate(values)
+
+
+def curve(**values: float) -> CurveFile:
+    return CurveFile.model_validate({"points": [{"steps": 0, "success": None}], **values})
+
+
+def files(**stages: dict[str, list[Artefact]]) -> Files:
+    return {stage: stages.get(stage, {}) for stage in THROUGHPUT}
+
+
+def test_time_is_summed_over_what_recorded_it() -> None:
+    found = files(
+        ground={"astra": [metrics(wall_seconds=3, cpu_seconds=5), metrics(wall_seconds=4)]},
+        train={"astra": [curve(wall_seconds=10)], "astra_plus": [curve(wall_seconds=20), curve()]},
+        align={"astra": [metrics()]},
+    )
+    assert seconds(found, "wall_seconds") == {"ground": 7.0, "train": 30.0, "total": 37.0}
+    assert seconds(found, "cpu_seconds") == {"ground": 5.0, "total": 5.0}
+    assert seconds(files(), "wall_seconds") == {"total": 0}
+
+
+def test_a_seed_costs_what_its_stages_recorded() -> None:
+    made = {
+        "ground": metrics(wall_seconds=3, cpu_seconds=5),
+        "train": curve(),
+        "align": metrics(wall_seconds=1),
+    }
+    assert seed_cost(made) == {
+        "ground": Cost(wall_seconds=3, cpu_seconds=5),
+        "align": Cost(wall_seconds=1, cpu_seconds=None),
+    }
+
+
+@pytest.mark.parametrize("figure", THROUGHPUT["ground"])
+def test_rows_without_a_speed_for_every_seed_are_left_out(figure: str) -> None:
+    found = throughput(
+        files(
+            ground={"astra": [metrics(**{figure: 5}), metrics(**{figure: 7})], "nas": [metrics()], "rma": []}
+        )
+    )
+    assert {name: rows for name, rows in found["ground"].items() if rows} == {figure: {"astra": [5, 7]}}
+    assert found["evaluate"] == {"target_steps_per_second": {}}
+    partly = throughput(files(ground={"astra": [metrics(**{figure: 5}), metrics()]}))
+    assert partly["ground"][figure] == {}

@@ -1,0 +1,49 @@
+from fake_runs import bare_results
+
+from astra_data.reports.comparing import summarised
+from astra_data.reports.schema import Results
+from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
+
+
+def results(success: list[float]) -> Results:
+    bare = bare_results("toy", {"astra": [0, 1]}, {})
+    row = summarised(bare.methods["astra"].model_copy(update={"success": success}), 100)
+    times = {"collect": 100.0, "pair": 60.0, "train": 50.0, "total": 210.0}
+    return bare.model_copy(update={"methods": {"astra": row}, "wall_seconds": times, "seeds": [0, 1]})
+
+
+SMALL, LARGE = results([0.25, 0.5]), results([0.5, 1.0])
+FOUND = SizesResults(
+    recipe="toy",
+    task="maze",
+    command="run it",
+    sizes=[SizeResults(percent=50, results=SMALL), SizeResults(percent=100, results=LARGE)],
+)
+
+
+def test_results_are_found_by_their_size() -> None:
+    assert by_size(FOUND) == {50: SMALL, 100: LARGE}
+    assert by_size(SMALL) == {None: SMALL}
+
+
+def test_the_table_has_a_column_for_each_size() -> None:
+    page = render_sizes(FOUND, {})
+    assert "# toy\n\nTask `maze`, seeds 0, 1, 1 episodes per row, size and seed." in page
+    assert "| method | 50 % | 100 % |" in page
+    assert "| astra | 0.38 ± 0.18 | 0.75 ± 0.35 |" in page
+    assert "| astra | 0.38 [0.25, 0.50] | 0.75 [0.50, 1.00] |" in page
+    assert "## Success by size of the dataset" in page
+    assert "Data efficiency" not in page
+
+
+def test_stages_that_all_sizes_share_are_timed_once() -> None:
+    # Of twice 210 s, the 160 s of collect and pair are counted once.
+    assert "Wall time of the stages, summed: 4 min." in render_sizes(FOUND, {})
+    alone = FOUND.model_copy(update={"sizes": FOUND.sizes[:1] * 3})
+    assert "summed: 5 min" in render_sizes(alone, {})
+
+
+def test_the_figure_is_on_the_page_where_it_was_drawn() -> None:
+    page = render_sizes(FOUND, {"data_efficiency": "some.png"})
+    assert "## Data efficiency\n\n![data_efficiency](some.png)\n\nAbove: where the robot was" in page
+    assert "Below: success in the target over the size;" in page
