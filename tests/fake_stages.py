@@ -44,6 +44,19 @@ class FakeCollectConfig(FakeConfig):
     behavior: str = "random"
 
 
+CONFIGS: dict[str, Any] = dict.fromkeys(
+    ("augment", "pair", "ground", "train", "align", "evaluate", "report"), FakeConfig
+)
+CONFIGS["collect"] = FakeCollectConfig
+"""Models of the stages' tables."""
+
+
+@dataclass(frozen=True)
+class FakeTable:
+    name: str
+    ranges: None = None
+
+
 class FakeMethod:
     def __init__(
         self,
@@ -53,11 +66,11 @@ class FakeMethod:
         grounded_as: str = "",
         initial: str | None = None,
         steps_target: bool = False,
-        table: str = "",
+        table: FakeTable | None = None,
     ) -> None:
         self.grounds, self.aligns, self.trains = grounds, aligns, trains
         self.in_simulator = trains and initial is None and not steps_target
-        self.steps_target, self.table = steps_target, table
+        self.steps_target, self.table, self.configures = steps_target, table, "train"
         self.grounded_as, self.initial = grounded_as, initial
 
     def learns_from(self, reward: str | None) -> bool:
@@ -70,8 +83,12 @@ METHODS = {
     "nas": FakeMethod(grounds=True, aligns=False, trains=True),
     "astra": FakeMethod(grounds=True, aligns=True, trains=True),
     "astra_again": FakeMethod(grounds=True, aligns=True, trains=True, grounded_as="astra"),
-    "target": FakeMethod(grounds=False, aligns=False, trains=True, steps_target=True),
-    "full_obs": FakeMethod(grounds=False, aligns=False, trains=True, steps_target=True, table="target"),
+    "target": FakeMethod(
+        grounds=False, aligns=False, trains=True, steps_target=True, table=FakeTable("target")
+    ),
+    "full_obs": FakeMethod(
+        grounds=False, aligns=False, trains=True, steps_target=True, table=FakeTable("target")
+    ),
     "fine_tuned": FakeMethod(grounds=False, aligns=False, trains=True, initial="direct_transfer"),
 }
 

@@ -231,7 +231,7 @@ def grounding(dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candid
     def ours() -> int:
         with tempfile.TemporaryDirectory() as folder:
             ASTRA(Fitting(TASK, config, None, training, held_out, 0, "cpu", Path(folder), silent))
-        return config.updates * config.batch_windows
+        return int(config.updates * config.batch_windows)
 
     return (
         f"grounding, windows of {config.window} steps",

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from rich.table import Table
 
 from astra_data.experiments.local_executor import Item
-from astra_data.experiments.points import Point
+from astra_data.experiments.points import RunPoint
 from astra_data.reports.figures import method_title
 from astra_data.worlds.score import Score
 
@@ -36,10 +36,10 @@ class Board:
 
     def __init__(
         self,
-        points: Collection[Point],
+        points: Collection[RunPoint],
         items: Collection[Item],
         score: Score,
-        means: Mapping[Point, float],
+        means: Mapping[RunPoint, float],
         to_do: Collection[str],
     ) -> None:
         """Begin with nothing running."""
@@ -72,11 +72,11 @@ class Board:
         self._running.pop(key, None)
         self._failed.add(key)
 
-    def done(self, point: Point, mean: float) -> None:
+    def done(self, point: RunPoint, mean: float) -> None:
         """Note the score of a point whose evaluation is finished."""
         self._means[point] = mean
 
-    def state(self, point: Point) -> str:
+    def state(self, point: RunPoint) -> str:
         """Say what the point is at, such as "training 43 %" or "done 0.72"."""
         if point in self._means:
             return f"done {self._score.text(self._means[point])}"
@@ -99,7 +99,7 @@ class Board:
     def __rich__(self) -> Table:
         """Draw methods by sizes, or by seeds where there are no sizes."""
         sizes = list(dict.fromkeys(point.percent for point in self._points))
-        columns: dict[str, list[Point]] = defaultdict(list)
+        columns: dict[str, list[RunPoint]] = defaultdict(list)
         for point in self._points:
             alone = len(sizes) == 1
             columns[f"seed {point.seed}" if alone else f"{point.percent} %"].append(point)
@@ -112,7 +112,7 @@ class Board:
             table.add_row(method_title(method), *map(self._cell, rows))
         return table
 
-    def _cell(self, points: list[Point]) -> str:
+    def _cell(self, points: list[RunPoint]) -> str:
         """Return the state of a point; of several, how many are done, their mean and what one is at."""
         states = [self.state(point) for point in points]
         if len(points) == 1:

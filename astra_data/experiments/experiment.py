@@ -18,11 +18,12 @@ from typing import Any
 from astra_data.core.config import did_you_mean, load_tables, validated
 from astra_data.core.errors import RecipeError
 from astra_data.core.naming import base_method, is_plus
-from astra_data.experiments.points import Point
-from astra_data.experiments.recipe import DERIVED, METHOD_TABLES, STAGES, WHOLE, Recipe
-from astra_data.methods import METHODS
+from astra_data.experiments.points import RunPoint
+from astra_data.experiments.recipe import WHOLE, Recipe
+from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
+from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import TASKS
 
 ALWAYS_NEW = {"report"}
@@ -31,7 +32,7 @@ ALWAYS_NEW = {"report"}
 
 _SIMULATOR = "simulator"
 """What differs between two tasks that have the same target."""
-_ROWS_TABLES = METHOD_TABLES.keys() | {"plus"}
+_ROWS_TABLES = tables().keys() | {"plus"}
 """Tables of a recipe that only some rows read."""
 
 
@@ -133,7 +134,7 @@ class Experiment:
         """The file of published results that hold its points: the base's, where its evaluations are those."""
         return self.results / f"{self.maker('evaluate').path.stem}.json"
 
-    def published(self) -> set[Point]:
+    def published(self) -> set[RunPoint]:
         """Return the points that its published results have.
 
         Raises:
@@ -152,7 +153,7 @@ class Experiment:
                     f"{self.results} were made: make all rows again and publish them in their place"
                 )
             rows = found.methods.items()
-            points |= {Point(method, seed, percent) for method, row in rows for seed in row.seeds}
+            points |= {RunPoint(method, seed, percent) for method, row in rows for seed in row.seeds}
         return points
 
     def _rows_of(self, table: str, stage: str) -> list[Path]:
@@ -192,20 +193,20 @@ def _reads(row: str, table: str) -> bool:
     method = METHODS.get(base)
     if method is None:
         return False
-    ours = method.table or base
-    return table in (ours, DERIVED.get(ours)) or (
-        method.initial is not None and _reads(method.initial, table)
-    )
+    ours = method.table and method.table.name
+    return table == ours or (method.initial is not None and _reads(method.initial, table))
 
 
 def _stale_stages(changed: set[str]) -> set[str]:
     """Return the stages that a change of the keys `changed` of a recipe reaches."""
     stale: set[str] = set()
-    for stage, reads in STAGES.items():
+    for stage in STAGES:
         sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
         sections |= set() if stage == "collect" else {_SIMULATOR}
-        sections |= {table for table, configures in METHOD_TABLES.items() if configures == stage}
-        if changed & sections or stale.intersection(reads):
+        sections |= {
+            method.table.name for method in METHODS.values() if method.table and method.configures == stage
+        }
+        if changed & sections or stale.intersection(STAGES[stage].reads):
             stale.add(stage)
     return stale
 
@@ -217,7 +218,7 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     """
     with suppress(RecipeError):
         before = validated(before, type(recipe), "recipe.json").settings
-    before, now = _told(dict(before)), _told(recipe.settings)
+    before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
     changed = {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
     if "task" in changed and _share_target(str(before.get("task")), recipe.task):
         return changed - {"task"} | {_SIMULATOR}
@@ -228,8 +229,8 @@ def _share_target(task: str, other: str) -> bool:
     return task in TASKS and TASKS[task].shares_target(TASKS[other])
 
 
-def _told(settings: dict[str, Any]) -> dict[str, Any]:
-    """Say of the sizes only what the artefacts of the others depend on: the largest."""
+def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:
+    """Replace `sweep` by the largest size: artefacts of the others depend on nothing else of it."""
     percents = settings.get("sweep", {}).get("percent", ())
     return settings | {"sweep": max(percents, default=WHOLE)}
 

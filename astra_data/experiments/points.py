@@ -1,4 +1,4 @@
-"""The points of a recipe: which of its rows, seeds and sizes are asked for."""
+"""Which rows, seeds and sizes of a recipe are to be made."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from astra_data.experiments.recipe import Recipe
 
 
 @dataclass(frozen=True)
-class Point:
-    """What is trained and measured as one: a row on the dataset of one seed, or on one size of it."""
+class RunPoint:
+    """A row on the dataset of one seed, or on one size of it: what is trained and evaluated as one."""
 
     method: str
     seed: int
@@ -19,13 +19,13 @@ class Point:
 
     @property
     def key(self) -> str:
-        """Key of the evaluation, with which the point is finished."""
+        """Key of its evaluation, the last artefact to be made for it."""
         return f"evaluate/{self.method}/{place(self.seed, self.percent)}"
 
 
 @dataclass(frozen=True)
-class Part:
-    """The rows, seeds and sizes of a recipe that are asked for; `percents` is empty where it has no sizes."""
+class Selection:
+    """Rows, seeds and sizes of a recipe; `percents` is empty where the recipe has no sizes."""
 
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
@@ -38,8 +38,8 @@ class Part:
         methods: Sequence[str] = (),
         seeds: Sequence[int] = (),
         percents: Sequence[int] = (),
-    ) -> "Part":
-        """Return what is asked for; where nothing is named, all.
+    ) -> "Selection":
+        """Return those that are named; of an axis on which nothing is named, all.
 
         Raises:
             BadInputError: the recipe has no such method, seed or size.
@@ -59,10 +59,10 @@ class Part:
             tuple(dict.fromkeys(percents)) or recipe.sweep.percent,
         )
 
-    def points(self) -> tuple[Point, ...]:
+    def points(self) -> tuple[RunPoint, ...]:
         """Return every row on every size of every seed."""
         return tuple(
-            Point(method, seed, percent)
+            RunPoint(method, seed, percent)
             for method in self.methods
             for percent in self.percents or (None,)
             for seed in self.seeds

@@ -1,12 +1,15 @@
 """What a recipe may say: task, rows, seeds and sizes, and a table of settings per stage and method."""
 
-from typing import Any, Self
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
     Field,
     JsonValue,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
+    WrapValidator,
+    create_model,
     field_validator,
     model_validator,
 )
@@ -15,52 +18,11 @@ from astra_data.core.config import Config, Count, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
-from astra_data.grounding.fit import GroundConfig
-from astra_data.learning.iql import FINE_TUNING, IqlConfig
-from astra_data.learning.rma import RmaConfig
-from astra_data.methods import METHODS
-from astra_data.methods.compass import CompassConfig
-from astra_data.methods.nas_golemo import GolemoConfig
-from astra_data.stages.align import AlignConfig
-from astra_data.stages.augment import AugmentConfig
-from astra_data.stages.collect import CollectConfig
-from astra_data.stages.evaluate import EvaluateConfig
-from astra_data.stages.pair import PairConfig
-from astra_data.stages.report import ReportConfig
-from astra_data.training.train import AnyTrainConfig
-from astra_data.training.train_in_target import TargetConfig
+from astra_data.methods import METHODS, tables
+from astra_data.methods.method import Table
+from astra_data.stages.registry import STAGES, Stage
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.score import Score
-from astra_data.worlds.variation import AnyVariation
-
-STAGES: dict[str, tuple[str, ...]] = {
-    "collect": (),
-    "augment": ("collect",),
-    "pair": ("collect", "augment"),
-    "subset": ("pair",),
-    "ground": ("pair", "subset"),
-    "train": ("pair", "subset", "ground"),
-    "align": ("pair", "subset", "ground"),
-    "evaluate": ("train", "ground", "align"),
-    "report": ("evaluate",),
-}
-"""Each stage, in order, and the stages whose artefacts it reads. Not every recipe augments."""
-
-METHOD_TABLES = {
-    "domain_randomization": "train",
-    "compass": "ground",
-    "compass_uniform": "train",
-    "rma": "train",
-    "nas_golemo": "ground",
-    "iql": "train",
-    "direct_transfer_iql": "train",
-    "target": "train",
-}
-"""Methods with settings of their own in a recipe, and the stage that they are for."""
-
-
-DERIVED = {"compass_uniform": "compass"}
-"""Those of them that are read off another one."""
 
 WHOLE = 100
 """Per cent of a dataset that is not swept over."""
@@ -74,7 +36,11 @@ class SweepConfig(Config):
 
 
 class Recipe(Config):
-    """One experiment: which methods, on which task, with which seeds and settings."""
+    """One experiment: which methods, on which task, with which seeds and settings.
+
+    Below `seeds` come a table for each stage, `based_on`, `sweep`, `plus`, and the methods' tables; see
+    `with_tables`.
+    """
 
     task: str
     """A name in `astra_data.worlds.registry.TASKS`."""
@@ -82,35 +48,10 @@ class Recipe(Config):
     """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
     seeds: tuple[int, ...] = Field(min_length=1)
     """Each seed repeats everything, from the collected dataset on."""
-    collect: CollectConfig
-    augment: AugmentConfig | None = None
-    """How each collected dataset is augmented before it is paired; by default not at all."""
-    pair: PairConfig
-    ground: GroundConfig
-    train: AnyTrainConfig
-    align: AlignConfig
-    evaluate: EvaluateConfig
-    report: ReportConfig
-    based_on: str | None = None
-    """The recipe that all that is not said here, and every artefact it leaves unchanged, is taken from."""
-    sweep: SweepConfig = SweepConfig()
-    plus: AnyTrainConfig
-    """The training of `_plus` rows: the recipe's `[plus]` table laid over `[train]`."""
-    domain_randomization: AnyVariation
-    """What domain randomization varies, laid over the task's ranges for it."""
-    nas_golemo: GolemoConfig = GolemoConfig()
-    """How the residual model of Golemo et al. is fitted."""
-    rma: RmaConfig = RmaConfig()
-    """How the student of rapid motor adaptation learns."""
-    target: TargetConfig = TargetConfig()
-    """The training of `target` and `full_obs`, laid over `[train]`."""
-    compass: CompassConfig
-    """The ranges of `compass` and `compass_uniform`, laid over the task's, and how the former identifies its
-    parameters."""
-    iql: IqlConfig = IqlConfig()
-    """How IQL learns."""
-    direct_transfer_iql: IqlConfig = FINE_TUNING
-    """How direct transfer is fine-tuned; by default gently, for it unlearns more than it learns."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, table: str) -> Any: ...  # noqa: ANN401 - each table has its own model
 
     @property
     def settings(self) -> dict[str, JsonValue]:
@@ -122,23 +63,30 @@ class Recipe(Config):
         """What its rows are compared by above all."""
         return TASKS[self.task].objective.scores[0]
 
-    def settings_of(self, table: str) -> Config:
-        """Return the settings of a method; of ranges to train in, those that the task's simulator has."""
-        varied = TASKS[self.task].varied
-        if table == "compass_uniform":
-            return self.compass.of_kind(type(varied.wide))
-        if table == "domain_randomization":
-            return self.domain_randomization.of_kind(type(varied.randomized))
-        settings: Config = getattr(self, table)
+    def settings_of(self, row: str, stage: str) -> Config | None:
+        """Return the settings of a row's method, if it has any and `stage` takes them.
+
+        Of ranges to train in they are those that the task's simulator has.
+        """
+        method = METHODS[base_method(row)]
+        if method.table is None or method.configures != stage:
+            return None
+        table: Any = getattr(self, method.table.name)
+        if method.table.ranges and stage == "train":
+            table = table.of_kind(type(getattr(TASKS[self.task].varied, method.table.ranges)))
+        settings: Config = table
         return settings
 
-    @model_validator(mode="before")
-    @classmethod
-    def _add_empty_sections(cls, tables: dict[str, Any]) -> dict[str, Any]:
-        needed = {name for name, field in cls.model_fields.items() if field.is_required()}
-        return {table: {} for table in (*STAGES, "plus", *METHOD_TABLES) if table in needed} | tables
+    def config_of(self, stage: str, row: str = "") -> Config | None:
+        """Return the settings of a stage, for a row where it makes a policy; None where it has none."""
+        if stage == "collect" and self.largest != WHOLE:
+            episodes = share(self.largest, self.collect.episodes)
+            collect: Config = self.collect
+            return collect.model_copy(update={"episodes": episodes})
+        config: Config | None = getattr(self, "plus" if stage == "train" and is_plus(row) else stage, None)
+        return config
 
-    @field_validator("plus", mode="before")
+    @field_validator("plus", mode="before", check_fields=False)
     @classmethod
     def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
         train = info.data.get("train")
@@ -147,25 +95,6 @@ class Recipe(Config):
         if (asked := overrides.get("learner", train.learner)) != train.learner:
             raise ValueError(f"learner: expected that of [train], '{train.learner}', got '{asked}'")
         return train.model_dump() | overrides
-
-    @field_validator("domain_randomization", "compass", mode="wrap")
-    @classmethod
-    def _lay_over_ranges(
-        cls,
-        overrides: Any,  # noqa: ANN401 - `check` tells
-        check: ValidatorFunctionWrapHandler,
-        info: ValidationInfo,
-    ) -> Any:  # noqa: ANN401 - what `check` returns
-        if "task" not in info.data or not isinstance(overrides, dict):
-            return check(overrides)
-        varied = TASKS[info.data["task"]].varied
-        usual = varied.wide if info.field_name == "compass" else varied.randomized
-        ranges = check(usual.model_dump() | overrides)
-        try:
-            ranges.of_kind(type(usual))
-        except BadInputError as error:
-            raise ValueError(str(error)) from None
-        return ranges
 
     @field_validator("task")
     @classmethod
@@ -265,3 +194,52 @@ class Recipe(Config):
     def largest(self) -> int:
         """The largest size, in per cent of `collect.episodes`: as much is collected."""
         return max(self.sweep.percent, default=WHOLE)
+
+
+def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[Table]) -> type[Recipe]:
+    """Return the model of recipes that have the tables of `stages` and those that `methods` read.
+
+    And `based_on`, the recipe from which all that is not given here, and every artefact it leaves unchanged,
+    is taken; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
+    """
+    fields: dict[str, Any] = {stage.name: _stage_field(stage) for stage in stages if stage.config}
+    fields["based_on"] = (str | None, None)
+    fields["sweep"] = (SweepConfig, SweepConfig())
+    fields["plus"] = fields["train"]
+    fields |= {table.name: _method_field(table) for table in methods}
+    return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
+
+
+_FILLED: Any = Field(default_factory=dict, validate_default=True)
+"""A table that a recipe leaves out is read as an empty one."""
+
+
+def _stage_field(stage: Stage) -> tuple[Any, Any]:
+    return (stage.config | None, None) if stage.is_optional else (stage.config, _FILLED)
+
+
+def _method_field(table: Table) -> tuple[Any, Any]:
+    if table.ranges is None:
+        return table.model, table.default or table.model()
+    return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
+
+
+def _laid_over(ranges: Literal["randomized", "wide"]) -> Callable[..., Any]:
+    """Return how a table of ranges is read: laid over `ranges` of the recipe's task."""
+
+    def read(overrides: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+        if "task" not in info.data or not isinstance(overrides, dict):
+            return check(overrides)
+        usual = getattr(TASKS[info.data["task"]].varied, ranges)
+        found = check(usual.model_dump() | overrides)
+        try:
+            found.of_kind(type(usual))
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return found
+
+    return read
+
+
+if not TYPE_CHECKING:
+    Recipe = with_tables(Recipe, STAGES.values(), tables().values())

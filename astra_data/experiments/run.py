@@ -20,9 +20,10 @@ from astra_data.experiments.display import display
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.experiments.local_executor import Item, Watcher, execute
 from astra_data.experiments.plan import grounded_as, plan, stage_of
-from astra_data.experiments.points import Part
+from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
-from astra_data.experiments.recipe import STAGES, Recipe
+from astra_data.experiments.recipe import Recipe
+from astra_data.stages.registry import STAGES
 
 RUNS = Path("runs")
 CUDA_JOBS = 2
@@ -57,7 +58,7 @@ def run(
     _check_stage(until or "report")
     experiment = load_experiment(recipe_path, root)
     wanted = set(list(STAGES)[: list(STAGES).index(until or "report") + 1]) - experiment.borrowed
-    part = Part.of(experiment.recipe, seeds=seeds)
+    part = Selection.of(experiment.recipe, seeds=seeds)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if stage_of(item) in wanted]
     make(experiment, items, jobs=jobs, device=device)
@@ -95,7 +96,7 @@ def run_stage(
             f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` for that"
         )
     recipe, folder = experiment.recipe, experiment.folder
-    part = Part.of(recipe, seeds=seeds)
+    part = Selection.of(recipe, seeds=seeds)
     if add:
         experiment.published()
     planned = plan(
@@ -184,7 +185,7 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
         stage, root = missing.partition("/")[0], experiment.folder.parent
         maker = experiment.maker(stage)
         # Of the base, `run` makes what comes before the stage as well; the command `augment` takes no recipe.
-        alone = stage != "augment" and (maker is experiment or not STAGES[stage])
+        alone = stage != "augment" and (maker is experiment or not STAGES[stage].reads)
         command = f"astra-data {stage if alone else 'run'} {maker.path}"
         option = "" if root == RUNS else f" --root {root}"
         raise MissingStageError(f"{experiment.place(missing)} is missing: run `{command}{option}` first")

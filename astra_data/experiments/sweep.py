@@ -22,7 +22,7 @@ from astra_data.experiments.display import display
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.local_executor import Item, Watcher
 from astra_data.experiments.plan import plan, stage_of
-from astra_data.experiments.points import Part, Point
+from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
 from astra_data.experiments.run import RUNS, finished, make
 from astra_data.reports.artefacts import EVALUATION, Artefact, Evaluation, read_json
@@ -78,7 +78,7 @@ def sweep(
         AstraDataError: an item failed.
     """
     experiment = load_experiment(recipe_path, root)
-    part = Part.of(experiment.recipe, methods, seeds, percents)
+    part = Selection.of(experiment.recipe, methods, seeds, percents)
     log = _tracked(trackio, experiment.folder.name) if trackio else None
     table = Table(experiment)
     items = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
@@ -92,8 +92,8 @@ def sweep(
 
 
 def _left(
-    points: Sequence[Point], items: Sequence[Item], published: Collection[Point]
-) -> tuple[tuple[Point, ...], tuple[Item, ...]]:
+    points: Sequence[RunPoint], items: Sequence[Item], published: Collection[RunPoint]
+) -> tuple[tuple[RunPoint, ...], tuple[Item, ...]]:
     """Return the points that are not published, and what they need, with the report."""
     left = tuple(point for point in points if point not in published)
     if not left:
@@ -115,11 +115,11 @@ class Table:
         """Look at all points of the recipe, whichever are made now."""
         recipe, self.experiment, self.folder = experiment.recipe, experiment, experiment.folder
         self.headline = recipe.headline
-        self._points = Part.of(recipe).points()
+        self._points = Selection.of(recipe).points()
         self._items = {item.key: item for item in plan(recipe, experiment.path, self.folder)}
-        self._lines: dict[Point, dict[str, Any]] = {}
+        self._lines: dict[RunPoint, dict[str, Any]] = {}
 
-    def write(self) -> dict[Point, dict[str, Any]]:
+    def write(self) -> dict[RunPoint, dict[str, Any]]:
         """Write the lines of all points that are finished now, and return them."""
         for point in self._points:
             # What is finished does not change any more.
@@ -135,7 +135,7 @@ class Table:
         replace(partial_file, self.folder / "sweep.csv")
         return lines
 
-    def _line(self, point: Point) -> dict[str, Any]:
+    def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
         means = evaluation.target.means()
         stages = {key: key.partition("/")[0] for key in sorted(set(needed(point.key, self._items)))}
@@ -163,7 +163,7 @@ class Table:
 @contextmanager
 def _shown(
     table: Table,
-    points: Collection[Point],
+    points: Collection[RunPoint],
     items: Collection[Item],
     log: Log | None,
     total: int,
@@ -185,7 +185,7 @@ class _PointWatcher:
         self,
         watch: Watcher,
         board: Board,
-        points: dict[str, Point],
+        points: dict[str, RunPoint],
         table: Table,
         log: Log | None,
         console: Console,

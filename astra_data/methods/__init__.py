@@ -1,4 +1,4 @@
-"""Every method by name; each file holds only what is different about its method."""
+"""All methods by name; each file holds one method, or a family, and only what is particular to it."""
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method
@@ -8,7 +8,7 @@ from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
-from astra_data.methods.method import Method
+from astra_data.methods.method import Method, Table
 from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
@@ -19,23 +19,29 @@ METHODS: dict[str, Method] = {
     for method in (
         DIRECT_TRANSFER,
         DOMAIN_RANDOMIZATION,
-        RMA,
-        COMPASS_UNIFORM,
-        COMPASS,
         NAS,
         NAS_GOLEMO,
+        RMA,
+        TARGET,
+        FULL_OBS,
+        COMPASS,
+        COMPASS_UNIFORM,
+        IQL,
+        BEHAVIOR_CLONING,
+        DIRECT_TRANSFER_IQL,
         ASTRA,
         ASTRA_WITHOUT_LATENT,
         ASTRA_WITHOUT_REWARD,
         ASTRA_TASK_REWARD,
-        TARGET,
-        FULL_OBS,
-        BEHAVIOR_CLONING,
-        IQL,
-        DIRECT_TRANSFER_IQL,
         FOLLOWER,
     )
 }
+"""By name. Recipes list the methods' tables, and results the settings in them, in this order."""
+
+
+def tables() -> dict[str, Table]:
+    """Return every table of a recipe that methods read, by its name."""
+    return {method.table.name: method.table for method in METHODS.values() if method.table}
 
 
 def method_named(row: str) -> Method:

@@ -23,7 +23,7 @@ from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.fit import Fitting
 from astra_data.grounding.replays import Recorded, beginnings, trajectory_gaps
 from astra_data.learning.networks.causal import CausalConfig, descend, fit_causes
-from astra_data.methods.method import Method
+from astra_data.methods.method import Method, Table
 from astra_data.training.train import InSimulator
 from astra_data.worlds.variation import AnyVariation, Variation
 
@@ -207,11 +207,23 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     return dict(zip(varied, rows, strict=False))
 
 
-COMPASS = Method(name="compass", title="COMPASS", fit=identify)
+TABLE = Table("compass", CompassConfig, ranges="wide")
+
+COMPASS = Method(
+    name="compass",
+    title="COMPASS",
+    colour="#F0E442",
+    fit=identify,
+    table=TABLE,
+    configures="ground",
+    fit_rates=("replays_per_second",),
+)
 
 COMPASS_UNIFORM = Method(
     name="compass_uniform",
     title="COMPASS, uniform",
+    colour="#B8A000",
     learn=InSimulator(ranges="wide"),
+    table=TABLE,
 )
 """COMPASS as the paper describes it: every episode draws its parameters from the ranges."""

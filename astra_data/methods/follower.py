@@ -12,7 +12,9 @@ from astra_data.worlds.plane.kicking import Kicking
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 
-FOLLOWER = Method(name="follower", title="Careful follower", learn=None, planar=True)
+FOLLOWER = Method(
+    name="follower", title="Careful follower", colour="#9A9A9A", role="ceiling", learn=None, planar=True
+)
 
 Act = Callable[[Tensor, Tensor], Tensor]
 

@@ -21,7 +21,7 @@ from astra_data.learning.iql import FINE_TUNING, Experience, Iql, IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.history import PositionFeatures
 from astra_data.learning.networks.policy import Policy
-from astra_data.methods.method import Method
+from astra_data.methods.method import Method, Table
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.simulator_env import policy_observation
 from astra_data.training.train import Training
@@ -109,16 +109,29 @@ def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
     return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}
 
 
-IQL = Method(name="iql", title="IQL", learn=learn_from_episodes)
+_RATES = ("updates_per_second",)
 
-BEHAVIOR_CLONING = Method(
-    name="behavior_cloning", title="Behavior cloning", learn=clone_behavior, table="iql"
+IQL = Method(
+    name="iql",
+    title="IQL",
+    colour="#D55E00",
+    learn=learn_from_episodes,
+    table=Table("iql", IqlConfig),
+    learn_rates=_RATES,
+)
+
+BEHAVIOR_CLONING = replace(
+    IQL, name="behavior_cloning", title="Behavior cloning", colour="#AA4499", learn=clone_behavior
 )
 
 DIRECT_TRANSFER_IQL = Method(
     name="direct_transfer_iql",
     title="Direct transfer + IQL",
+    colour="#7B3294",
     learn=learn_from_episodes,
     initial="direct_transfer",
+    table=Table("direct_transfer_iql", IqlConfig, default=FINE_TUNING),
+    learn_rates=_RATES,
 )
-"""The critics are fitted while the policy rests; then the policy goes on from direct transfer's."""
+"""Fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently by
+default, since it otherwise unlearns more than it learns."""

@@ -1,7 +1,9 @@
-"""What a method is: which parts of the pipeline it uses, and how."""
+"""What a method is: which parts of the pipeline it uses, its settings, and how it is shown."""
 
 from dataclasses import dataclass
+from typing import Literal
 
+from astra_data.core.config import Config
 from astra_data.grounding.fit import Fit, HistoryFit
 from astra_data.training.simulator_env import RewardSource
 from astra_data.training.train import InSimulator, Learn
@@ -9,35 +11,63 @@ from astra_data.training.train_in_target import InTarget
 
 IN_RAW_SIMULATOR = InSimulator()
 
+Role = Literal["floor", "ceiling", "trained there"]
+"""What the other rows are compared with: no grounding at all; a hand-written controller; a policy trained in
+the target itself, to which the same number of steps need not teach as much."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of settings in a recipe, which one method or several read.
+
+    Attributes:
+        name: its key in recipes. model: of its content.
+        default: the settings where a recipe has no such table; None for those of the model.
+        ranges: the task's ranges of simulator parameters that it is laid over, if it holds ranges.
+    """
+
+    name: str
+    model: type[Config]
+    default: Config | None = None
+    ranges: Literal["randomized", "wide"] | None = None
+
 
 @dataclass(frozen=True)
 class Method:
-    """One row of the paper's tables.
+    """One row of the results, and all that is particular to it.
 
     Attributes:
         name: in recipes and folders. title: in tables and figures.
+        colour: in figures, as "#rrggbb"; one of the spare colours where empty.
+        role: what the row is to the others, if it is not one among them.
         fit: what it learns about the simulator from pairs; None where the simulator stays raw.
         learn: how it learns its policy; None where there is none to learn.
         aligns: whether a target encoder is fitted for deployment.
-        initial: the method whose policy its own goes on from, if any.
+        initial: the method from whose policy its own training starts, if any.
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
-        table: the recipe's table with its settings, if it has any; that of its own name where empty.
-        planar: whether it is for tasks in a maze alone.
+        table: its settings in a recipe, if it has any. configures: the stage that takes them.
+        fit_rates: the speeds that its fit records. learn_rates: those that its training records.
+        planar: whether it is for tasks in a maze only.
     """
 
     name: str
     title: str
+    colour: str = ""
+    role: Role | None = None
     fit: Fit | None = None
     learn: Learn | None = IN_RAW_SIMULATOR
     aligns: bool = False
     initial: str | None = None
     grounded_as: str = ""
-    table: str = ""
+    table: Table | None = None
+    configures: Literal["ground", "train"] = "train"
+    fit_rates: tuple[str, ...] = ("windows_per_second",)
+    learn_rates: tuple[str, ...] = ("simulator_steps_per_second", "steps_per_second")
     planar: bool = False
 
     @property
     def grounds(self) -> bool:
-        """Whether something is fitted to pairs."""
+        """Whether it fits something to pairs."""
         return self.fit is not None
 
     @property
@@ -47,7 +77,7 @@ class Method:
 
     @property
     def in_simulator(self) -> bool:
-        """Whether its policy is trained in the abstract simulator, so that the cures of `[plus]` apply."""
+        """Whether its policy is trained in the abstract simulator, so that `[plus]` applies."""
         return isinstance(self.learn, InSimulator)
 
     @property

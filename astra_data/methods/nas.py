@@ -9,5 +9,6 @@ from astra_data.methods.method import Method
 NAS = Method(
     name="nas",
     title="NAS",
+    colour="#56B4E9",
     fit=HistoryFit(latent=False, reward=False),
 )

@@ -14,7 +14,7 @@ from astra_data.grounding.diagnostics import correction_r2
 from astra_data.grounding.fit import Fitting, scatter_factor
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
-from astra_data.methods.method import Method
+from astra_data.methods.method import Method, Table
 
 
 class GolemoConfig(Config):
@@ -110,4 +110,12 @@ def _r2(model: ResidualModel, episodes: PairedEpisodes) -> float | None:
     return correction_r2(_corrected(model, episodes), episodes.windows, model.correction_std)
 
 
-NAS_GOLEMO = Method(name="nas_golemo", title="NAS (Golemo et al.)", fit=fit_residual)
+NAS_GOLEMO = Method(
+    name="nas_golemo",
+    title="NAS (Golemo et al.)",
+    colour="#0072B2",
+    fit=fit_residual,
+    table=Table("nas_golemo", GolemoConfig),
+    configures="ground",
+    fit_rates=("episodes_per_second",),
+)

@@ -17,7 +17,7 @@ from astra_data.core.seeding import derive
 from astra_data.learning.networks.adaptation import AdaptiveShape, Teacher
 from astra_data.learning.ppo import Ppo
 from astra_data.learning.rma import Adaptation, RmaConfig
-from astra_data.methods.method import Method
+from astra_data.methods.method import Method, Table
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimise
 
@@ -62,5 +62,7 @@ class TeacherThenStudent(InSimulator):
 RMA = Method(
     name="rma",
     title="RMA",
+    colour="#A6761D",
     learn=TeacherThenStudent(ranges="wide"),
+    table=Table("rma", RmaConfig),
 )

@@ -1,8 +1,17 @@
 """Target and Full Obs: policies trained in the target on φ(s), or on the complete state (Section V-A)."""
 
-from astra_data.methods.method import Method
-from astra_data.training.train_in_target import InTarget
+from dataclasses import replace
 
-TARGET = Method(name="target", title="Target", learn=InTarget("abstract"))
+from astra_data.methods.method import Method, Table
+from astra_data.training.train_in_target import InTarget, TargetConfig
 
-FULL_OBS = Method(name="full_obs", title="Full Obs", learn=InTarget("full"), table="target")
+TARGET = Method(
+    name="target",
+    title="Target",
+    colour="#4D4D4D",
+    role="trained there",
+    learn=InTarget("abstract"),
+    table=Table("target", TargetConfig),
+)
+
+FULL_OBS = replace(TARGET, name="full_obs", title="Full Obs", colour="#1A1A1A", learn=InTarget("full"))

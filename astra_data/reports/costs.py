@@ -5,14 +5,15 @@ from typing import Literal
 
 import numpy as np
 
+from astra_data.methods import METHODS
 from astra_data.reports.artefacts import Artefact
 from astra_data.reports.schema import Cost
 
 THROUGHPUT = {
     "collect": ("target_steps_per_second",),
     "pair": ("pairs_per_second",),
-    "ground": ("windows_per_second", "episodes_per_second", "replays_per_second"),
-    "train": ("simulator_steps_per_second", "steps_per_second", "updates_per_second"),
+    "ground": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.fit_rates)),
+    "train": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.learn_rates)),
     "align": ("windows_per_second",),
     "evaluate": ("target_steps_per_second",),
 }

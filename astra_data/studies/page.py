@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from astra_data.reports.figures import method_title, walk_prediction
+from astra_data.reports.figures import walk_prediction
 from astra_data.reports.formatting import duration, table
 from astra_data.studies.errors import AXES, BODY_AXES
+from astra_data.studies.models import MODELS
 
 SHOWN_S = 1.0
 """The horizon of the first table."""
@@ -27,16 +28,6 @@ for all models are rows where self-localisation jumps or the robot moves faster 
 carried), and every prediction up to a horizon with such a row before it. Where histories hold such rows, the
 simulator's motion stands in. Each prediction is averaged with that of the mirror image, for all alike."""
 
-MODELS = {
-    "raw": "a planar body that moves at once as the published code and speed limits say",
-    "gains": "the same with one constant gain per axis, by least squares",
-    "ridge": "linear on the last H steps, in closed form; its strength chosen on training data",
-    "mlp": "a feed-forward network on the same H steps, as in the lab's earlier grounding",
-    "nas": "the GRU of the grounding model, with the correction's loss alone, λ = (0, 0, 1)",
-    "astra": "the same with all three losses, λ = (0.1, 1, 1); the logs have no reward, so L_rew predicts "
-    "how much nearer the ball comes",
-}
-
 
 def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str:
     """Return the page on what `study.run_study` found by `command`, with the figure in file `image`."""
@@ -47,7 +38,7 @@ def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str
         f"```sh\n{command}\n```",
         WHAT,
         _recordings(found),
-        "\n".join(f"- **{method_title(model)}**: {MODELS[model]}" for model in models),
+        "\n".join(f"- **{MODELS[model].title}**: {MODELS[model].text}" for model in models),
         f"A control step is {found['step_s']:.3f} s, H = {config['steps']['history']}. The three networks "
         f"are fitted to open-loop predictions of {config['fit']['steps']} steps (L_state of ASTRA and NAS), "
         "all with noise on the history, mirror images and the same updates.",
@@ -79,7 +70,8 @@ def figure(found: Mapping[str, Any]) -> Figure:
         for axis in BODY_AXES
     }
     minutes = [size["minutes"] for size in case["sizes"]]
-    return walk_prediction(case["horizons_s"], by_horizon, minutes, by_minutes, float(shown))
+    looks = {name: (model.title, model.colour) for name, model in MODELS.items()}
+    return walk_prediction(case["horizons_s"], by_horizon, minutes, by_minutes, float(shown), looks)
 
 
 def _shown(case: Mapping[str, Any]) -> str:
@@ -114,7 +106,7 @@ def _case(case: Mapping[str, Any]) -> str:
     ]
     rows = [
         [
-            method_title(model),
+            MODELS[model].title,
             *(_error(horizons[shown][axis]) for axis in AXES),
             _share(horizons[shown]["mean"], "less_than_raw"),
             _share(horizons[shown]["mean"], "less_than_ridge"),
@@ -129,7 +121,7 @@ def _case(case: Mapping[str, Any]) -> str:
     )
     by_axis = [
         [
-            method_title(model),
+            MODELS[model].title,
             *(_share(horizons[shown][axis], "less_than_raw") for axis in BODY_AXES),
             *(_share(horizons[shown][axis], "less_than_ridge") for axis in BODY_AXES),
         ]
@@ -143,7 +135,7 @@ def _case(case: Mapping[str, Any]) -> str:
     ]
     by_horizon = [
         [
-            method_title(model),
+            MODELS[model].title,
             *(" / ".join(f"{horizons[key][axis]['rmse']:.3f}" for axis in BODY_AXES) for key in horizons),
         ]
         for model, horizons in size["models"].items()
@@ -176,7 +168,7 @@ def _efficiency(case: Mapping[str, Any]) -> str:
     models = [model for model in case["sizes"][-1]["models"] if model != "raw"]
     rows = [
         [
-            method_title(model),
+            MODELS[model].title,
             *(_share(size["models"][model][shown]["mean"], "less_than_raw") for size in case["sizes"]),
         ]
         for model in models

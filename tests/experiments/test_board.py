@@ -5,11 +5,11 @@ from rich.console import Console
 
 from astra_data.experiments.board import Board
 from astra_data.experiments.local_executor import Item
-from astra_data.experiments.points import Point
+from astra_data.experiments.points import RunPoint
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS
 
 
-def items(*points: Point) -> list[Item]:
+def items(*points: RunPoint) -> list[Item]:
     made = [Item("pair/seed_0", (), print)]
     for point in points:
         train = point.key.replace("evaluate", "train")
@@ -24,7 +24,7 @@ def drawn(board: Board) -> str:
 
 
 def test_a_point_is_at_the_last_stage_that_works_for_it() -> None:
-    nas, astra = Point("nas", 0), Point("astra", 0)
+    nas, astra = RunPoint("nas", 0), RunPoint("astra", 0)
     planned = items(nas, astra)
     board = Board([nas, astra], planned, SUCCESS, {}, [item.key for item in planned])
     assert board.state(nas) == "waiting"
@@ -44,7 +44,7 @@ def test_a_point_is_at_the_last_stage_that_works_for_it() -> None:
 
 
 def test_with_sizes_a_cell_tells_of_all_seeds() -> None:
-    points = [Point("nas", seed, percent) for percent in (25, 50) for seed in (0, 1, 2)]
+    points = [RunPoint("nas", seed, percent) for percent in (25, 50) for seed in (0, 1, 2)]
     planned = items(*points)
     success = {points[0]: 0.5, points[1]: 0.7}
     board = Board(points, planned, SUCCESS, success, [point.key for point in points[2:]])
@@ -61,7 +61,7 @@ def test_with_sizes_a_cell_tells_of_all_seeds() -> None:
 def test_the_time_left_follows_from_the_work_done_and_its_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("astra_data.experiments.board.time.monotonic", lambda: now)
-    points = [Point("nas", seed) for seed in range(4)]
+    points = [RunPoint("nas", seed) for seed in range(4)]
     planned = items(*points)[1:]
     board = Board(
         points, [Item("pair/seed_0", (), print), *planned], SUCCESS, {}, [item.key for item in planned]
@@ -89,7 +89,7 @@ def test_the_time_left_follows_from_the_work_done_and_its_speed(monkeypatch: pyt
 
 
 def test_an_item_may_fail_before_it_has_begun() -> None:
-    nas = Point("nas", 0)
+    nas = RunPoint("nas", 0)
     planned = items(nas)
     board = Board([nas], planned, SUCCESS, {}, [item.key for item in planned])
     board.failed("pair/seed_0")

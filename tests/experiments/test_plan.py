@@ -7,7 +7,7 @@ from fake_stages import FakeConfig
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
 from astra_data.experiments.plan import plan
-from astra_data.experiments.points import Part
+from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 
 HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
@@ -81,7 +81,7 @@ def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) 
     recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     assert len(items) == 2 * (1 + 1 + 2 * (1 + 1 + 3 + 1 + 4)) + 1
-    assert items["collect/seed_7"].call.args[1].episodes == 300  # type: ignore[attr-defined]
+    assert items["collect/seed_7"].call.keywords["config"].episodes == 300  # type: ignore[attr-defined]
     assert items["subset/percent_050/seed_7"].inputs == ("pair/seed_7",)
     assert items["ground/astra/percent_150/seed_0"].inputs == ("subset/percent_150/seed_0",)
     assert items["evaluate/astra_plus/percent_050/seed_0"].inputs == (
@@ -96,7 +96,7 @@ def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) 
 
 def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
     recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
-    part = Part.of(recipe, methods=["astra"], seeds=[7], percents=[50])
+    part = Selection.of(recipe, methods=["astra"], seeds=[7], percents=[50])
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
     assert list(items) == [
         "collect/seed_7",
@@ -108,7 +108,7 @@ def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_re
         "evaluate/astra/percent_050/seed_7",
         "report",
     ]
-    assert items["collect/seed_7"].call.args[1].episodes == 300  # type: ignore[attr-defined]
+    assert items["collect/seed_7"].call.keywords["config"].episodes == 300  # type: ignore[attr-defined]
     options = "--method astra --seed 7 --percent 50"
     assert items["report"].call.keywords["command"].endswith(f"r.toml {options}")  # type: ignore[attr-defined]
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.points import Point
+from astra_data.experiments.points import RunPoint
 from astra_data.experiments.sweep import sweep
 from astra_data.reports.sizes import SizesResults
 
@@ -138,7 +138,7 @@ def test_plus_settings_may_change_until_such_rows_are_published(recipe: Path, tm
     recipe.write_text(recipe.read_text().replace('"astra"', '"astra", "astra_plus"') + "[plus]\nsteps = 7\n")
     publish(recipe, {50: {"astra": [0]}})
     recipe.write_text(recipe.read_text().replace("steps = 7", "steps = 8"))
-    assert load_experiment(recipe, tmp_path).published() == {Point("astra", 0, 50)}
+    assert load_experiment(recipe, tmp_path).published() == {RunPoint("astra", 0, 50)}
     publish(recipe, {50: {"astra": [0], "astra_plus": [0]}})
     recipe.write_text(recipe.read_text().replace("steps = 8", "steps = 9"))
     with pytest.raises(RecipeError, match=r"^plus changed in .*r.toml since its results in"):

@@ -189,15 +189,17 @@ def ranges(task: str, tables: str) -> Recipe:
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_ranges_are_laid_over_those_of_the_task(task: Task) -> None:
     usual = ranges(task.name, "")
-    assert usual.settings_of("compass_uniform") == task.varied.wide
-    assert usual.settings_of("domain_randomization") == task.varied.randomized
+    assert usual.settings_of("compass_uniform", "train") == task.varied.wide
+    assert usual.settings_of("domain_randomization", "train") == task.varied.randomized
     assert Recipe.model_validate(usual.model_dump()) == usual
     own = ranges(
         task.name, "[compass]\nfriction = [0.5, 0.9]\n[domain_randomization]\naction_noise = [0.0, 0.2]\n"
     )
-    assert own.settings_of("compass_uniform") == task.varied.wide.model_copy(update={"friction": (0.5, 0.9)})
+    assert own.settings_of("compass_uniform", "train") == task.varied.wide.model_copy(
+        update={"friction": (0.5, 0.9)}
+    )
     randomized = task.varied.randomized.model_copy(update={"action_noise": (0.0, 0.2)})
-    assert own.settings_of("domain_randomization") == randomized
+    assert own.settings_of("domain_randomization", "train") == randomized
 
 
 def test_ranges_that_the_simulator_does_not_have_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""One look for all figures: each method has one colour and one title wherever it appears."""
+"""One style for all figures; each method has its colour and title wherever it appears."""
 
 import zlib
 from collections.abc import Iterator
@@ -12,68 +12,15 @@ from matplotlib.style import context
 from PIL import Image
 
 from astra_data.core.naming import base_method, is_plus
+from astra_data.methods import METHODS
 from astra_data.worlds.score import Score
 
-TITLES = {
-    "direct_transfer": "Direct transfer",
-    "domain_randomization": "Domain randomization",
-    "compass": "COMPASS",
-    "compass_uniform": "COMPASS, uniform",
-    "rma": "RMA",
-    "nas": "NAS",
-    "nas_golemo": "NAS (Golemo et al.)",
-    "astra": "ASTRA",
-    "astra_without_latent": "ASTRA w/o L_trans",
-    "astra_without_reward": "ASTRA w/o L_rew",
-    "astra_task_reward": "ASTRA, task reward",
-    "behavior_cloning": "Behavior cloning",
-    "iql": "IQL",
-    "direct_transfer_iql": "Direct transfer + IQL",
-    "target": "Target",
-    "full_obs": "Full Obs",
-    "follower": "Careful follower",
-    "raw": "Raw simulator",
-    "gains": "One gain per axis",
-    "ridge": "Ridge regression",
-    "mlp": "Feed-forward network",
-}
-
-COLOURS = {
-    "direct_transfer": "#E69F00",
-    "domain_randomization": "#CC79A7",
-    "compass": "#F0E442",
-    "compass_uniform": "#B8A000",
-    "rma": "#A6761D",
-    "nas": "#56B4E9",
-    "nas_golemo": "#0072B2",
-    "astra": "#009E73",
-    "astra_without_latent": "#44AA99",
-    "astra_without_reward": "#999933",
-    "astra_task_reward": "#117733",
-    "behavior_cloning": "#AA4499",
-    "iql": "#D55E00",
-    "direct_transfer_iql": "#7B3294",
-    "target": "#4D4D4D",
-    "full_obs": "#1A1A1A",
-    "follower": "#9A9A9A",
-    "raw": "#2B2B2B",
-    "gains": "#B58900",
-    "ridge": "#D33682",
-    "mlp": "#6C71C4",
-}
-"""Okabe and Ito's palette, which colour-blind readers can tell apart."""
-
 SPARE_COLOURS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
-"""For methods without a colour of their own."""
+"""For methods without a colour of their own. The others are Okabe and Ito's palette and shades that
+colour-blind readers can tell from it."""
 
-ROLES = {
-    "direct_transfer": "floor",
-    "target": "trained there",
-    "full_obs": "trained there",
-    "follower": "ceiling",
-}
-"""Rows that the others are seen against: no grounding at all; trained in the target itself, which the same
-steps need not teach as much; written by hand."""
+ROLES: dict[str, str] = {name: method.role for name, method in METHODS.items() if method.role}
+"""What some rows are to the others."""
 
 SIMULATED = "#E07B00"
 """A simulator, in every figure (as in the paper's Fig. 3)."""
@@ -127,15 +74,15 @@ def style() -> Iterator[None]:
 def method_title(method: str) -> str:
     """Return the title of a row: "astra_plus" is "ASTRA+"."""
     base = base_method(method)
-    title = TITLES.get(base, base.replace("_", " ").capitalize())
+    title = METHODS[base].title if base in METHODS else base.replace("_", " ").capitalize()
     return f"{title}+" if is_plus(method) else title
 
 
 def method_colour(method: str) -> str:
     """Return the colour of a row as "#rrggbb": a variant's is its base row's, darker."""
     base = base_method(method)
-    spare = SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
-    colour = COLOURS.get(base, spare)
+    own = METHODS[base].colour if base in METHODS else ""
+    colour = own or SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
     if is_plus(method):
         red, green, blue = to_rgb(colour)
         return to_hex((0.68 * red, 0.68 * green, 0.68 * blue))

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from astra_data.reports.figures.style import method_colour, method_title, style
+from astra_data.reports.figures.style import style
 
 Floats = NDArray[np.float64]
 Bands = Mapping[str, Mapping[str, Floats]]
@@ -23,6 +23,7 @@ def walk_prediction(
     minutes: Sequence[float],
     by_minutes: Bands,
     horizon_s: float,
+    looks: Mapping[str, tuple[str, str]],
 ) -> Figure:
     """Draw a column per axis: RMS error by horizon; below, where there are several, by size of the data.
 
@@ -32,6 +33,7 @@ def walk_prediction(
         minutes: the M sizes of the data.
         by_minutes: errors at `horizon_s`.
         horizon_s: the horizon of the lower row.
+        looks: title and colour of each model.
     """
     with style():
         rows = 2 if len(minutes) > 1 else 1
@@ -39,11 +41,11 @@ def walk_prediction(
         grid = figure.subplots(rows, len(by_horizon), squeeze=False)
         for column, (axis, bands) in enumerate(by_horizon.items()):
             upper = grid[0, column]
-            _lines(upper, np.array(horizons_s), bands)
+            _lines(upper, np.array(horizons_s), bands, looks)
             upper.set_title(LABELS.get(axis, axis))
             upper.set_xlabel("horizon (s)")
             if rows > 1:
-                _lines(grid[1, column], np.array(minutes), by_minutes[axis])
+                _lines(grid[1, column], np.array(minutes), by_minutes[axis], looks)
                 grid[1, column].set(xscale="log", xlabel="minutes of training data")
                 grid[1, column].set_xticks(minutes, [f"{size:.3g}" for size in minutes])
                 grid[1, column].minorticks_off()
@@ -55,12 +57,11 @@ def walk_prediction(
         return figure
 
 
-def _lines(axes: Axes, places: Floats, bands: Mapping[str, Floats]) -> None:
+def _lines(
+    axes: Axes, places: Floats, bands: Mapping[str, Floats], looks: Mapping[str, tuple[str, str]]
+) -> None:
     for name, (middle, low, high) in bands.items():
-        is_raw = name == RAW
-        colour = method_colour(name)
+        title, colour = looks[name]
         axes.fill_between(places, low, high, color=colour, alpha=0.08, lw=0)
-        axes.plot(
-            places, middle, ":" if is_raw else "-", color=colour, marker="o", ms=3, label=method_title(name)
-        )
+        axes.plot(places, middle, ":" if name == RAW else "-", color=colour, marker="o", ms=3, label=title)
     axes.set_ylim(bottom=0)

@@ -8,6 +8,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from astra_data.methods import METHODS
 from astra_data.reports.figures import (
     Curve,
     Foretold,
@@ -28,7 +29,7 @@ from astra_data.reports.figures import (
     strips,
     trajectories,
 )
-from astra_data.reports.figures.style import COLOURS, DEPLOYED, SIMULATED, style
+from astra_data.reports.figures.style import DEPLOYED, SIMULATED, style
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS
 
@@ -71,7 +72,7 @@ def test_titles_follow_from_the_names() -> None:
 
 def test_every_row_has_its_own_colour_and_a_plus_row_its_base_rows_darker() -> None:
     assert len({method_colour(row) for row in ROWS}) == len(ROWS)
-    for base in (*COLOURS, "my_own"):
+    for base in (*METHODS, "my_own"):
         light, dark = to_rgb(method_colour(base)), to_rgb(method_colour(f"{base}_plus"))
         assert sum(dark) < sum(light)
         assert dark == pytest.approx([0.68 * channel for channel in light], abs=0.01)

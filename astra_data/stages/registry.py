@@ -1,0 +1,63 @@
+"""All stages of the pipeline by name: what each reads, its settings, and what makes its artefacts."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from astra_data.grounding.fit import GroundConfig
+from astra_data.stages.align import AlignConfig, align
+from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.collect import CollectConfig, collect
+from astra_data.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.stages.ground import ground
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.stages.report import ReportConfig, report
+from astra_data.stages.subset import subset
+from astra_data.stages.train import train
+from astra_data.training.train import AnyTrainConfig
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the pipeline.
+
+    Attributes:
+        name: in recipes, folders and on the command line.
+        run: makes one artefact. `experiments.plan` gives it what its parameters name.
+        each: what there is one artefact of: a seed; a size of a seed's dataset; a grounding, a policy, an
+            aligned grounding or a row, each per dataset; or the recipe.
+        reads: the stages whose artefacts it may read.
+        config: the type of its table in a recipe; None where it has no settings.
+        is_optional: whether recipes without its table leave the stage out.
+    """
+
+    name: str
+    run: Callable[..., object]
+    each: Literal["seed", "size", "grounding", "policy", "alignment", "row", "recipe"]
+    reads: tuple[str, ...] = ()
+    config: Any = None
+    is_optional: bool = False
+
+    @property
+    def makes_dataset(self) -> bool:
+        """Whether its artefacts are datasets."""
+        return self.each in ("seed", "size")
+
+
+_OF_DATASET = ("pair", "subset")
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage("collect", collect, "seed", config=CollectConfig),
+        Stage("augment", augment, "seed", ("collect",), AugmentConfig, is_optional=True),
+        Stage("pair", pair, "seed", ("collect", "augment"), PairConfig),
+        Stage("subset", subset, "size", ("pair",)),
+        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig),
+        Stage("train", train, "policy", (*_OF_DATASET, "ground"), AnyTrainConfig),
+        Stage("align", align, "alignment", (*_OF_DATASET, "ground"), AlignConfig),
+        Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig),
+        Stage("report", report, "recipe", ("evaluate",), ReportConfig),
+    )
+}
+"""In the order of the pipeline."""

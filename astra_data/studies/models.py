@@ -1,0 +1,53 @@
+"""The models that a study compares, as its page and its figure show them."""
+
+from dataclasses import dataclass
+
+from astra_data.methods import METHODS
+
+
+@dataclass(frozen=True)
+class Model:
+    """How a model is shown.
+
+    Attributes:
+        title: in tables and figures. colour: in figures, as "#rrggbb". text: what it is, in a clause.
+    """
+
+    title: str
+    colour: str
+    text: str
+
+
+def _of_method(name: str, text: str) -> Model:
+    return Model(METHODS[name].title, METHODS[name].colour, text)
+
+
+MODELS = {
+    "raw": Model(
+        "Raw simulator",
+        "#2B2B2B",
+        "a planar body that moves at once as the published code and speed limits say",
+    ),
+    "gains": Model(
+        "One gain per axis", "#B58900", "the same with one constant gain per axis, by least squares"
+    ),
+    "ridge": Model(
+        "Ridge regression",
+        "#D33682",
+        "linear on the last H steps, in closed form; its strength chosen on training data",
+    ),
+    "mlp": Model(
+        "Feed-forward network",
+        "#6C71C4",
+        "a feed-forward network on the same H steps, as in the lab's earlier grounding",
+    ),
+    "nas": _of_method(
+        "nas", "the GRU of the grounding model, with the correction's loss alone, λ = (0, 0, 1)"
+    ),
+    "astra": _of_method(
+        "astra",
+        "the same with all three losses, λ = (0.1, 1, 1); the logs have no reward, so L_rew predicts "
+        "how much nearer the ball comes",
+    ),
+}
+"""By the names in `[fit]` of a study's recipe."""
