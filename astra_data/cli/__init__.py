@@ -1,1 +1,1 @@
-"""The command line: one thin door per command."""
+"""The command line: one thin function per command."""

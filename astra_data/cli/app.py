@@ -1,7 +1,4 @@
-"""The command line: its commands are in `astra_data.cli`.
-
-There imports stand inside functions, so that `astra-data --help` answers at once.
-"""
+"""The command line. Commands import what they need when they run, so that `astra-data --help` is fast."""
 
 import os
 import sys
@@ -95,7 +92,7 @@ for panel, commands in PANELS.items():
 
 
 def main() -> None:
-    """Run the command line; a reported error becomes one line, unless ASTRA_DATA_DEBUG is set."""
+    """Run the command line; print an `AstraDataError` as one line unless ASTRA_DATA_DEBUG is set."""
     try:
         app()
     except (AstraDataError, ModuleNotFoundError) as error:

@@ -1,4 +1,4 @@
-"""Arguments that several commands take."""
+"""Arguments of several commands."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +17,8 @@ Source = Annotated[
     str,
     typer.Argument(
         metavar="RECIPE|DATASET",
-        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for its highest version; "
-        "what follows is for a dataset.",
+        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for its highest version. "
+        "Settings below are for a dataset; a recipe has its own.",
         show_default=False,
     ),
 ]

@@ -1,4 +1,4 @@
-"""The command that makes more episodes of few."""
+"""`astra-data augment`."""
 
 from typing import Annotated
 
@@ -11,7 +11,10 @@ def augment(
     dataset: DatasetName,
     task: Annotated[
         str | None,
-        typer.Option(help="Task that judges the copies.", show_default="what the dataset was collected for"),
+        typer.Option(
+            help="Task that computes rewards and ends of the copies.",
+            show_default="the one the dataset was collected for",
+        ),
     ] = None,
     name: NewName = None,
     out: Out = None,
@@ -28,18 +31,19 @@ def augment(
         bool | None,
         typer.Option(
             "--translations/--no-translations",
-            help="Put copies anywhere, or where they started.",
+            help="Place copies anywhere in the maze, or where the original started.",
             show_default="translations",
         ),
     ] = None,
     held_out_share: Annotated[
-        float | None, typer.Option(help="Share of episodes never to be copied.", show_default="0.1")
+        float | None,
+        typer.Option(help="Share of episodes that are held out and never copied.", show_default="0.1"),
     ] = None,
     keep_originals: Annotated[
         bool | None,
         typer.Option(
             "--keep-originals/--drop-originals",
-            help="Keep the training episodes themselves, or only their copies.",
+            help="Keep the training episodes, or only their copies.",
             show_default="keep-originals",
         ),
     ] = None,
@@ -47,15 +51,13 @@ def augment(
         float | None,
         typer.Option(help="Clearance from the walls, in m.", show_default="the robot's reach"),
     ] = None,
-    min_steps: Annotated[
-        int | None, typer.Option(help="Shortest stretch that is copied.", show_default="20")
-    ] = None,
+    min_steps: Annotated[int | None, typer.Option(help="Fewest steps of a copy.", show_default="20")] = None,
     tries: Annotated[
-        int | None, typer.Option(help="Turns that are tried for a copy.", show_default="100")
+        int | None, typer.Option(help="Rotations tried per copy before it is given up.", show_default="100")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
 ) -> None:
-    """Turn and move episodes into more of them; the dataset must not be paired yet."""
+    """Make more episodes by rotating and translating them; the dataset must not be paired yet."""
     from astra_data.core.config import validated
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown

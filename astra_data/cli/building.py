@@ -1,4 +1,4 @@
-"""Commands that make datasets: of a recipe, or by themselves."""
+"""`astra-data collect` and `astra-data pair`, for a recipe or on their own."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,8 @@ Task = Annotated[
     str,
     typer.Argument(
         metavar="RECIPE|TASK",
-        help="A recipe (.toml), or a task such as antmaze-umaze; what follows is for a task.",
+        help="A recipe (.toml), or a task such as antmaze-umaze. "
+        "Settings below are for a task; a recipe has its own.",
         show_default=False,
     ),
 ]
@@ -21,7 +22,7 @@ SeedOrSeeds = Annotated[
     list[int] | None,
     typer.Option(
         "--seed",
-        help="Of everything random; of a recipe, only these of its seeds.",
+        help="Seed of all randomness; of a recipe, only these of its seeds.",
         show_default="0; all of a recipe",
     ),
 ]
@@ -29,7 +30,7 @@ Behavior = Annotated[
     str | None, typer.Option(help="random, policy, suboptimal_ppo or suboptimal_sac.", show_default="random")
 ]
 Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
-MaxSteps = Annotated[int | None, typer.Option(help="Longest episode.", show_default="500")]
+MaxSteps = Annotated[int | None, typer.Option(help="Longest episode, in steps.", show_default="500")]
 Start = Annotated[
     str | None, typer.Option(help="Where episodes start: anywhere or task.", show_default="anywhere")
 ]
@@ -38,24 +39,24 @@ PpoSteps = Annotated[
 ]
 SacEpisodeSteps = Annotated[
     int | None,
-    typer.Option(help="How long episodes last when suboptimal_sac stops learning.", show_default="500"),
+    typer.Option(help="Mean episode length at which suboptimal_sac stops learning.", show_default="500"),
 ]
 Policy = Annotated[
     str | None,
-    typer.Option(help="Folder of the policy: of a training, or meta/astra of a dataset.", show_default=False),
+    typer.Option(
+        help="Folder of the policy: made by a training, or meta/astra of a dataset.", show_default=False
+    ),
 ]
 Grounding = Annotated[
-    str | None, typer.Option(help="Folder of its grounding, if it has one.", show_default=False)
+    str | None, typer.Option(help="Folder of the policy's grounding, if it has one.", show_default=False)
 ]
 Encoder = Annotated[
-    str | None, typer.Option(help="Folder of its target encoder, if it has one.", show_default=False)
+    str | None, typer.Option(help="Folder of the policy's target encoder, if it has one.", show_default=False)
 ]
 Name = Annotated[
     str | None, typer.Option(help="Name of the dataset.", show_default="task, behaviour and seed")
 ]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with what an interrupted call of the same command left.")
-]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted call of the same command.")]
 
 
 def collect(
@@ -94,7 +95,7 @@ def collect(
         run_stage(Path(task), "collect", seeds=seeds or (), jobs=jobs, root=root)
         return
     if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError("collect: a task takes one --seed and no --jobs; a recipe takes them")
+        raise BadInputError("collect: a task takes one --seed and no --jobs, which are for recipes")
     import torch
 
     from astra_data.core.config import validated
@@ -104,9 +105,9 @@ def collect(
 
     config = validated(given, CollectConfig, "collect")
     seed = seeds[0] if seeds else 0
-    # Idle threads of the networks would slow down the physics.
+    # The networks' idle threads would slow down the physics.
     torch.set_num_threads(1)
-    how = "the same command with --resume goes on from here"
+    how = "run the same command with --resume to continue"
     with resumable(how), shown("collect") as progress:
         folder = collect_dataset(
             task, config, seed=seed, out=out, name=name, resume=resume, progress=progress
@@ -122,25 +123,27 @@ def pair(
     simulator: Annotated[
         str | None,
         typer.Option(
-            help="A task, for its abstract simulator, or a class of yours: path.py:MySimulator.",
+            help="A task, for its abstract simulator, or your own class: path.py:MySimulator.",
             show_default=False,
         ),
     ] = None,
     reset_tolerance: Annotated[
         float | None,
-        typer.Option(help="Largest difference of a reset simulator from φ(s).", show_default="1e-6"),
+        typer.Option(
+            help="Largest difference between a reset simulator's state and φ(s).", show_default="1e-6"
+        ),
     ] = None,
     name: NewName = None,
     out: Out = None,
 ) -> None:
-    """Add to every transition where the abstract simulator lands from the same state."""
+    """Add to every transition the abstract simulator's next state from the same state and action."""
     given = _given(reset_tolerance=reset_tolerance)
     if dataset.endswith(".toml"):
         refuse(given | _given(simulator=simulator, name=name, out=out), "pair")
         run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
-        raise BadInputError("pair: a dataset takes neither --seed nor --jobs; a recipe takes them")
+        raise BadInputError("pair: a dataset takes neither --seed nor --jobs, which are for recipes")
     from astra_data.core.config import validated
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown

@@ -1,4 +1,4 @@
-"""Commands that tell whether a dataset is whole, and save what is whole of a broken one."""
+"""`astra-data validate` and `astra-data repair`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ def validate(
         bool, typer.Option("--with-lerobot", help="Also compare windows with lerobot's own loader; slow.")
     ] = False,
 ) -> None:
-    """Check every file and value of a LeRobot dataset, and list everything that is wrong."""
+    """Check every file and value of a LeRobot dataset, and list all faults."""
     from astra_data.core.errors import CorruptDatasetError
     from astra_data.dataset.doctor.check import check
     from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
@@ -28,27 +28,29 @@ def validate(
         typer.echo(f"note: {note}")
     if report.faults:
         count = "1 fault" if report.fault_count == 1 else f"{report.fault_count} faults"
-        told = "\n  ".join([f"{root} has {count}:", *report.faults])
-        raise CorruptDatasetError(f"{told}\nTo save its whole episodes: astra-data repair {root} --out DIR")
+        message = "\n  ".join([f"{root} has {count}:", *report.faults])
+        raise CorruptDatasetError(
+            f"{message}\nTo save its whole episodes: astra-data repair {root} --out DIR"
+        )
     typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
 
 
 def repair(
     folder: Annotated[
-        Path, typer.Argument(help="The folder of a LeRobot dataset; it is not touched.", show_default=False)
+        Path, typer.Argument(help="The folder of a LeRobot dataset; it is not changed.", show_default=False)
     ],
     out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
     like: Annotated[
         str | None,
         typer.Option(
             metavar="DATASET",
-            help="The dataset that FOLDER was made from by LeRobot's tools: its origin and its episodes' "
-            "metadata are joined by uid.",
+            help="The dataset from which FOLDER was made by LeRobot's tools: its origin and its episodes' "
+            "metadata are copied, matched by uid.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Save the whole episodes of a broken dataset, of ours or of LeRobot's, to a new one."""
+    """Save the intact episodes of a broken dataset, of astra-data or LeRobot, to a new one."""
     from astra_data.dataset.doctor.repair import repair as save
     from astra_data.dataset.versions import open_dataset
 

@@ -1,4 +1,4 @@
-"""Commands that tell where a dataset comes from, and how two differ."""
+"""`astra-data log` and `astra-data diff`."""
 
 from typing import Annotated
 
@@ -8,7 +8,7 @@ from astra_data.cli.arguments import DatasetName
 
 
 def log(dataset: DatasetName) -> None:
-    """Show what a dataset was made of, as a tree: name, version, start of the hash, stage and settings."""
+    """Show the datasets that one was made from, as a tree with versions, hashes, stages and settings."""
     from astra_data.dataset.lineage import lineage, tree_lines
     from astra_data.dataset.versions import open_dataset
 

@@ -1,4 +1,4 @@
-"""Commands that write a new version of a dataset with other episodes."""
+"""`astra-data subset`, `merge`, `delete` and `filter`: new versions with other episodes."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,17 +17,19 @@ def subset(
     ] = None,
     percent: Annotated[
         int | None,
-        typer.Option(min=1, help="Or how many per cent of --of; may exceed 100.", show_default=False),
+        typer.Option(min=1, help="Or how many, in per cent of --of; may exceed 100.", show_default=False),
     ] = None,
     of: Annotated[
         int | None,
-        typer.Option(min=1, help="What 100 per cent are.", show_default="all episodes of DATASET"),
+        typer.Option(
+            min=1, help="Number of episodes that is 100 per cent.", show_default="all episodes of DATASET"
+        ),
     ] = None,
     seeds: Annotated[
         list[int] | None,
         typer.Option(
             "--seed",
-            help="Of the permutation; of a recipe, only these of its seeds.",
+            help="Seed of the permutation; of a recipe, only these of its seeds.",
             show_default="the one stored in DATASET; all of a recipe",
         ),
     ] = None,
@@ -43,19 +45,19 @@ def subset(
     jobs: Jobs = None,
     root: Root = RUNS,
 ) -> None:
-    """Write a random subset; with one seed, smaller subsets lie inside larger ones."""
+    """Write a random subset; with the same seed, larger subsets contain smaller ones."""
     if dataset.endswith(".toml"):
         options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
         refuse(options | {"name": name, "out": out}, "subset", "sweep")
         run_stage(Path(dataset), "subset", seeds=seeds or (), jobs=jobs, root=root)
         return
     if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError("subset: a dataset takes one --seed and no --jobs; a recipe takes them")
+        raise BadInputError("subset: a dataset takes one --seed and no --jobs, which are for recipes")
     from astra_data.dataset.edit import subset as write
     from astra_data.dataset.versions import open_dataset
 
     source = open_dataset(dataset)
-    _told(
+    _report(
         write(
             source,
             episodes=episodes,
@@ -78,23 +80,25 @@ def merge(
         ),
     ],
     new_uids: Annotated[
-        bool, typer.Option("--new-uids", help="Give episodes whose uid is taken a new one.")
+        bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is taken.")
     ] = False,
     name: NewName = None,
     out: Out = None,
 ) -> None:
-    """Write the episodes of several datasets into one."""
+    """Merge the episodes of several datasets into one."""
     from astra_data.dataset.edit import merge as write
     from astra_data.dataset.versions import open_dataset
 
-    _told(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, name=name, out=out))
+    _report(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, name=name, out=out))
 
 
 def delete(
     dataset: DatasetName,
     uids: Annotated[
         list[int],
-        typer.Option("--episode", metavar="UID", help="An episode; may be repeated.", show_default=False),
+        typer.Option(
+            "--episode", metavar="UID", help="Uid of an episode; may be repeated.", show_default=False
+        ),
     ],
     name: NewName = None,
     out: Out = None,
@@ -103,7 +107,7 @@ def delete(
     from astra_data.dataset.edit import delete as write
     from astra_data.dataset.versions import open_dataset
 
-    _told(write(open_dataset(dataset), uids, name=name, out=out))
+    _report(write(open_dataset(dataset), uids, name=name, out=out))
 
 
 def filter_(
@@ -123,7 +127,7 @@ def filter_(
     from astra_data.dataset.edit import filter_episodes
     from astra_data.dataset.versions import open_dataset
 
-    _told(
+    _report(
         filter_episodes(
             open_dataset(dataset),
             success=success,
@@ -137,7 +141,7 @@ def filter_(
     )
 
 
-def _told(folder: Path) -> None:
+def _report(folder: Path) -> None:
     from astra_data.dataset.reader import Dataset
 
     written = Dataset.open(folder)

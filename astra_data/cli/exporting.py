@@ -1,4 +1,4 @@
-"""The command that writes a dataset in another library's format."""
+"""`astra-data export`."""
 
 from pathlib import Path
 from typing import Annotated

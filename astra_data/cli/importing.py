@@ -22,7 +22,9 @@ MappingFile = Annotated[
 FileFormat = Annotated[
     str | None,
     typer.Option(
-        "--format", help="csv, hdf5, json, mcap, minari or npz.", show_default="told by the files' names"
+        "--format",
+        help="csv, hdf5, json, mcap, minari or npz.",
+        show_default="inferred from the files' names",
     ),
 ]
 Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
@@ -39,7 +41,7 @@ def import_(
     fps: Fps = None,
     task: Task = None,
 ) -> None:
-    """Turn logs (CSV, NPZ, HDF5, Minari, MCAP, JSON) into a dataset."""
+    """Convert logs (CSV, NPZ, HDF5, Minari, MCAP, JSON) to a dataset."""
     from astra_data.exchange.importing import import_dataset
 
     report = import_dataset(

@@ -1,4 +1,4 @@
-"""The command that shows what a dataset holds."""
+"""`astra-data inspect` and `astra-data list`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ def inspect(
         typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures"),
     ] = None,
 ) -> None:
-    """Show what a dataset holds: its values, its episodes, where the robot was."""
+    """Show the contents of a dataset: its values, its episodes, where the robot was."""
     from rich.console import Console
 
     from astra_data.cli.inspection_page import inspection_page
@@ -32,7 +32,9 @@ def inspect(
     maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
     found = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
     if not found:
-        raise BadInputError(f"{inspection.reference}: the roles of its state tell no position or velocity")
+        raise BadInputError(
+            f"{inspection.reference}: its state has no column with the role position or velocity"
+        )
     try:
         plot.mkdir(parents=True, exist_ok=True)
         for planar, label, unit in found:

@@ -1,4 +1,4 @@
-"""An inspection for the terminal: a table of all values, and a map of where the robot was."""
+"""The contents of a dataset for the terminal: a table of all values, and a map of the robot's positions."""
 
 from collections.abc import Iterator
 
@@ -18,23 +18,23 @@ def inspection_page(inspection: Inspection) -> RenderableType:
     parts: list[RenderableType] = [Text(_summary(inspection)), *_tables(inspection.spreads)]
     if inspection.positions is not None:
         left, right, bottom, top = inspection.positions.extent
-        told = f"positions, x {left:.1f} to {right:.1f} m, y {bottom:.1f} to {top:.1f} m"
-        parts += [Text(told), Text(shaded(inspection.positions))]
+        label = f"positions, x {left:.1f} to {right:.1f} m, y {bottom:.1f} to {top:.1f} m"
+        parts += [Text(label), Text(shaded(inspection.positions))]
     return Group(*parts)
 
 
 def sparkline(counts: Ints) -> str:
-    """Draw counts (n,) as n bars; only a bin that nothing is in is empty."""
+    """Draw counts (n,) as n bars; only empty bins are blank."""
     return _drawn(counts, _BARS)
 
 
 def shaded(planar: Map) -> str:
-    """Draw a map as lines of shades, the top first; a character is two cells high, for it is so tall."""
+    """Draw a map as lines of shades, the top first; a character is about as tall as two cells are wide."""
     counts = planar.counts
     if len(counts) % 2:
         counts = np.concatenate([counts, np.zeros_like(counts[:1])])
     pairs = counts[::2] + counts[1::2]
-    # Square roots, for a robot that rests somewhere would outshine all else.
+    # Square roots, so that places where the robot rested do not outshine all others.
     drawn = _drawn(np.sqrt(pairs).ravel(), _SHADES)
     width = counts.shape[1]
     rows = [drawn[start : start + width] for start in range(0, len(drawn), width)]

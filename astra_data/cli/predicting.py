@@ -18,8 +18,8 @@ Data = Annotated[
 Train = Annotated[
     Path | None,
     typer.Option(
-        help="Recordings to learn from, likewise.",
-        show_default="a part of the data itself, the rest is predicted",
+        help="Recordings to learn from, in the same form.",
+        show_default="a part of --data, of which the rest is predicted",
     ),
 ]
 
@@ -32,7 +32,7 @@ def gap(
     publish: Publish = False,
     root: Root = RUNS,
 ) -> None:
-    """Measure how well models predict a real robot's recordings; run again, it goes on."""
+    """Measure how well models predict a real robot's recordings; run it again to continue."""
     from astra_data.studies.run import measure_gap
 
     with resumable():

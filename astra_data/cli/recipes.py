@@ -33,7 +33,7 @@ Publish = Annotated[
     bool, typer.Option("--publish", help="Also copy the results to results/ beside the recipe.")
 ]
 Add = Annotated[
-    bool, typer.Option("--add", help="Add to the published results: what they have and --root lacks stays.")
+    bool, typer.Option("--add", help="Add to the published results: those that are not in --root are kept.")
 ]
 
 RUNS = Path("runs")
@@ -47,7 +47,7 @@ def run(
     until: Until = None,
     root: Root = RUNS,
 ) -> None:
-    """Run all stages of a recipe; run it again to go on from where it stopped."""
+    """Run all stages of a recipe; run it again to continue."""
     from astra_data.experiments.run import run as run_recipe
 
     with resumable():
@@ -56,7 +56,7 @@ def run(
 
 
 def check(recipes: RecipePaths, root: Root = RUNS) -> None:
-    """Check recipes without running them, and list what is finished and what is to do."""
+    """Check recipes without running them, and list which artefacts are finished."""
     from astra_data.experiments.run import check as check_recipe
     from astra_data.studies.run import is_gap_recipe, load_gap_recipe
 
@@ -86,7 +86,7 @@ def ground(
     device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
-    """Learn to correct the abstract simulator from the pairs."""
+    """Learn from the pairs to correct the abstract simulator."""
     run_stage(recipe, "ground", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
 
 
@@ -98,7 +98,7 @@ def train(
     device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
-    """Train policies in the abstract simulator, grounded where the method grounds it."""
+    """Train policies in the abstract simulator, grounded if the method grounds it."""
     run_stage(recipe, "train", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
 
 
@@ -110,7 +110,7 @@ def align(
     device: Device = "cpu",
     root: Root = RUNS,
 ) -> None:
-    """Learn the encoder of target histories that agrees with the simulator's."""
+    """Fit the encoder of target histories to that of simulated ones."""
     run_stage(recipe, "align", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
 
 
@@ -144,7 +144,7 @@ def run_stage(
     publish: bool = False,
     add: bool = False,
 ) -> None:
-    """Run one stage of a recipe, and say where its artefacts are."""
+    """Run one stage of a recipe, and print the folder of its artefacts."""
     from astra_data.experiments.run import run_stage as run
 
     with resumable():
@@ -163,7 +163,7 @@ def run_stage(
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
-    """Refuse `options` that are given, since a recipe says them itself.
+    """Refuse `options` that are given, since a recipe sets them itself.
 
     Raises:
         BadInputError: one is given.
@@ -171,13 +171,13 @@ def refuse(options: Mapping[str, object], stage: str, table: str | None = None) 
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
         raise BadInputError(
-            f"{stage}: a recipe says this itself, in [{table or stage}]: leave out {', '.join(given)}"
+            f"{stage}: a recipe sets this itself, in [{table or stage}]: leave out {', '.join(given)}"
         )
 
 
 @contextmanager
-def resumable(how: str = "run the same command again to go on from here") -> Iterator[None]:
-    """At Ctrl-C, say how to go on, and leave with exit code 130."""
+def resumable(how: str = "run the same command again to continue") -> Iterator[None]:
+    """At Ctrl-C, print how to continue, and exit with code 130."""
     try:
         yield
     except KeyboardInterrupt:

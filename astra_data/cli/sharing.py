@@ -23,7 +23,7 @@ def card(
     ] = None,
     notes: NotesPath = None,
 ) -> None:
-    """Write a dataset's card: what it holds, where it comes from, how to load it."""
+    """Write a dataset's card: its contents, its origin, how to load it."""
     from astra_data.core.config import load_recipe
     from astra_data.dataset.versions import open_dataset
     from astra_data.exchange.sharing.card import write_card
@@ -47,10 +47,10 @@ def push(
     ],
     notes: NotesPath = None,
     private: Annotated[
-        bool, typer.Option("--private", help="Let nobody else see a repository that is made on the Hub.")
+        bool, typer.Option("--private", help="Create the repository on the Hub as private.")
     ] = False,
 ) -> None:
-    """Share a version of a dataset, with its card; a version that is there never changes."""
+    """Share a version of a dataset with its card; a shared version never changes."""
     from astra_data.exchange.sharing.push import push as send
     from astra_data.experiments.display import shown
 
@@ -71,7 +71,7 @@ def pull(
     out: Out = None,
     version: Annotated[str | None, typer.Option(help="Such as 1.2.0.", show_default="the newest")] = None,
 ) -> None:
-    """Fetch a shared dataset and verify it; run it again to go on from where it stopped."""
+    """Download a shared dataset and verify it; run it again to continue."""
     from astra_data.exchange.sharing.pull import pull as fetch
     from astra_data.experiments.display import shown
 

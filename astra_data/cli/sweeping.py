@@ -1,4 +1,4 @@
-"""The command that repeats a recipe's rows over seeds and sizes."""
+"""`astra-data sweep`."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -28,7 +28,8 @@ def sweep(
         typer.Option("--percent", help="Only this size; may be repeated.", show_default=False),
     ] = None,
     unpublished: Annotated[
-        bool, typer.Option("--unpublished", help="Only the points that results/ beside the recipe lacks.")
+        bool,
+        typer.Option("--unpublished", help="Only the points that are not in results/ beside the recipe."),
     ] = False,
     jobs: Jobs = None,
     device: Device = "cpu",
@@ -39,8 +40,8 @@ def sweep(
     address: Annotated[
         str | None,
         typer.Option(
-            help="Of a Ray cluster whose machines share this folder and installation.",
-            show_default="one is started here",
+            help="Address of a Ray cluster whose machines share this folder and installation.",
+            show_default="a cluster on this machine",
         ),
     ] = None,
     trackio: Annotated[
@@ -50,7 +51,7 @@ def sweep(
         ),
     ] = None,
 ) -> None:
-    """Run a recipe on every seed and size, with a table of its points; run it again to go on."""
+    """Run a recipe on every seed and size, with a table of its points; run it again to continue."""
     if address is not None and engine is not Engine.ray:
         raise BadInputError("sweep: --address is for --engine ray")
     from astra_data.experiments.sweep import sweep as sweep_recipe

@@ -1,1 +1,1 @@
-"""Other people's formats in and out, and datasets shared."""
+"""Import from and export to other formats; sharing of datasets."""

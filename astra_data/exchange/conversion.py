@@ -1,4 +1,4 @@
-"""Fields of a recording into columns."""
+"""Convert the fields of a recording to columns of a dataset."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,14 @@ from astra_data.exchange.recording import Block
 
 Mask = NDArray[np.bool_]
 EXACT = 2**53
-"""Below it, floats hold whole numbers exactly."""
+"""Floats represent whole numbers below this exactly."""
 
 
 class Converter:
     """Converts the blocks of one recording.
 
     Attributes:
-        columns: what the dataset holds, with the columns that are derived; known from the first block on.
+        columns: of the dataset, including derived ones; known after the first block.
     """
 
     def __init__(self, mapping: ImportMapping) -> None:
@@ -32,7 +32,7 @@ class Converter:
         """Return the columns of `block` with n rows, (n,) or (n, size), and which rows are finite, (n,).
 
         Raises:
-            BadInputError: values are not what their columns hold, or change in size; lists every fault.
+            BadInputError: values do not fit their columns, or change in size; lists every fault.
         """
         faults: list[str] = []
         fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
@@ -72,8 +72,8 @@ class Converter:
                 faults.append(f"{name}: {sizes[name]} values, expected 1")
         jump = self._mapping.split.jump
         if jump and max(jump.values) >= sizes[jump.column]:
-            told = f"{jump.column} has {sizes[jump.column]} values, counted from 0"
-            faults.append(f"split.jump.values {list(jump.values)}: {told}")
+            size = f"{jump.column} has {sizes[jump.column]} values, counted from 0"
+            faults.append(f"split.jump.values {list(jump.values)}: {size}")
         return faults
 
 
@@ -118,8 +118,8 @@ def _transformed(values: Array, spec: ColumnMapping) -> Array:
     """Apply `take`, `scale`, `offset` and `clip` to `values` (n, width)."""
     if spec.take:
         if max(spec.take) >= values.shape[1]:
-            told = f"{', '.join(spec.fields)} hold {values.shape[1]} values, counted from 0"
-            raise BadInputError(f"take {list(spec.take)}: {told}")
+            size = f"{', '.join(spec.fields)} hold {values.shape[1]} values, counted from 0"
+            raise BadInputError(f"take {list(spec.take)}: {size}")
         values = values[:, list(spec.take)]
     for key, numbers in (("scale", spec.scale), ("offset", spec.offset)):
         if len(numbers) not in (0, 1, values.shape[1]):
@@ -154,7 +154,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             raise BadInputError(f"{column.name}: expected whole numbers")
         if (abs(sound.astype(float)) >= EXACT).any():
             raise BadInputError(
-                f"{column.name}: numbers of 2^53 or more came as floats, which do not hold them exactly; "
+                f"{column.name}: numbers of 2^53 or more came as floats, which cannot represent them; "
                 "expected integers: no fractions or empty cells among them, no field of floats beside them, "
                 "no scale, offset or clip"
             )

@@ -1,4 +1,4 @@
-"""Rows of a recording into columns, and columns into episodes."""
+"""Cut a recording into episodes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -24,26 +24,26 @@ from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block
 
 REASONS = ("file", "source", "field", "end", "gap", "jump", "rejected")
-"""What begins an episode, the first that applies: a new file, the format's own episodes, a field that
+"""Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
 changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, a jump, rows that
 were rejected."""
 
 RATE_TOLERANCE = 0.1
-"""By which share the rate that the times tell may differ from fps."""
+"""Largest relative difference between fps and the rate measured from the times."""
 
 Cut = tuple[dict[str, Array], dict[str, Scalar]]
 
 
 @dataclass
 class Tally:
-    """What became of the rows.
+    """How many rows were read and dropped, and why.
 
     Attributes:
         rows: how many were read.
         rejected_rows: those with a value that is not finite.
         rejected_first: where the first of them is.
-        split_points: where an episode ends and the next begins, by reason.
-        last_rows: last rows of episodes, dropped because nobody recorded their next state.
+        split_points: number of boundaries between episodes, by reason.
+        last_rows: last rows of episodes, dropped because their next state was not recorded.
         last_reward: the sum of their rewards.
         short_rows: rows of episodes that were too short.
     """
@@ -58,10 +58,10 @@ class Tally:
 
 
 class Cutter:
-    """Cuts the blocks that it is fed, in order, into episodes; holds one episode at a time.
+    """Cuts consecutive blocks into episodes; holds one episode in memory at a time.
 
     Attributes:
-        tally: what became of the rows so far.
+        tally: of the rows so far.
     """
 
     def __init__(self, mapping: ImportMapping) -> None:
@@ -78,19 +78,19 @@ class Cutter:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """What the episodes hold; known from the first block on."""
+        """Columns of the episodes; known after the first block."""
         return self._converter.columns
 
     def feed(self, block: Block, row: int, *, is_apart: bool) -> Iterator[Cut]:
-        """Take in `block`; yield the columns and the metadata of the episodes that ended.
+        """Add `block`; yield the columns and the metadata of the episodes that ended.
 
         Args:
             block: at least one row.
             row: number of its first row in its file.
-            is_apart: whether it does not continue the block before.
+            is_apart: whether it begins a new file instead of continuing the block before.
 
         Raises:
-            BadInputError: values are not what their columns hold, or change in size; lists every fault.
+            BadInputError: values do not fit their columns, or change in size; lists every fault.
         """
         columns, finite = self._converter.convert(block)
         self.tally.rows += len(block)
@@ -114,7 +114,7 @@ class Cutter:
                 self._pieces.append({name: values[first:last] for name, values in kept.items()})
 
     def finish(self) -> Iterator[Cut]:
-        """Yield the episode at hand, if there is one, and begin the next."""
+        """Yield the current episode, if there is one, and begin the next."""
         if not self._pieces:
             return
         episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
@@ -123,7 +123,7 @@ class Cutter:
         if STATE in episode and NEXT_STATE not in episode:
             state = episode[STATE]
             if TERMINATED in episode and episode[TERMINATED][-1]:
-                # Nobody bootstraps on what follows a terminal step, but its reward counts.
+                # Learners do not bootstrap from the state after a terminal step, but its reward counts.
                 episode[NEXT_STATE] = np.concatenate([state[1:], state[-1:]])
             else:
                 self.tally.last_rows += 1
@@ -139,7 +139,7 @@ class Cutter:
         yield episode | {TRUNCATED: truncated, DONE: terminated | truncated}, self._metadata
 
     def check_rate(self) -> None:
-        """Compare fps to the rate that the times tell.
+        """Compare fps to the rate measured from the times.
 
         Raises:
             BadInputError: they differ by more than `RATE_TOLERANCE`.
@@ -148,14 +148,14 @@ class Cutter:
             rate, fps = self._steps / self._seconds, self._mapping.fps
             if abs(rate / fps - 1) > RATE_TOLERANCE:
                 raise BadInputError(
-                    f"'{self._mapping.time}' tells {rate:.4g} rows per second, fps says {fps}: "
+                    f"'{self._mapping.time}' gives {rate:.4g} rows per second, but fps is {fps}: "
                     "correct fps or time_scale, or resample the recording"
                 )
 
     def _count(
         self, block: Block, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
     ) -> NDArray[np.int64]:
-        """Return how often each reason but jumps has applied up to each row, (reasons, n)."""
+        """Return how often each reason, except jumps, has applied up to each row, (reasons, n)."""
         split, n = self._mapping.split, len(block)
         masks: dict[str, Mask] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
@@ -217,7 +217,7 @@ class Cutter:
 
 
 def _held(times: Array) -> Array:
-    """Replace what is not finite in `times` (n, 1) by what was before, so that no gap hides behind it."""
+    """Replace values of `times` (n, 1) that are not finite by the last finite one, so that gaps are seen."""
     rows = np.where(np.isfinite(times[:, 0]), np.arange(len(times)), 0)
     held: Array = times[np.maximum.accumulate(rows)]
     return held

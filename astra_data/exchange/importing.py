@@ -1,4 +1,4 @@
-"""Other people's recordings into datasets."""
+"""Import recordings in other formats as datasets."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,19 +30,19 @@ FORMATS: Mapping[str, ModuleType] = {
     "npz": npz,
 }
 IN_ARCHIVES = ("csv", "json")
-"""Formats that are read from front to back, and so from archives."""
+"""Formats that are read sequentially, so that they can be read inside archives."""
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import gave.
+    """Result of an import.
 
     Attributes:
         root: the dataset's folder.
-        episodes: how many it has.
-        frames: how many steps.
-        tally: what became of the rows.
-        wall_seconds: how long it took.
+        episodes: number of episodes.
+        frames: number of steps.
+        tally: of the rows that were read and dropped.
+        wall_seconds: duration of the import.
     """
 
     root: Path
@@ -52,7 +52,7 @@ class ImportReport:
     wall_seconds: float
 
     def __str__(self) -> str:
-        """Tell it in a few lines."""
+        """Summarise it in a few lines."""
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
@@ -82,14 +82,14 @@ def import_dataset(
         recordings: files, folders or archives of one format.
         mapping: the file that says which fields become which columns; D4RL, robomimic and Minari need none.
         out: the dataset's folder, by default its place at home.
-        file_format: one of `FORMATS`, by default told from the recordings' names.
+        file_format: one of `FORMATS`, by default inferred from the recordings' names.
         name: of the dataset; like `fps` and `task`, it overrides the mapping.
         fps: steps per second.
         task: what the episodes do.
 
     Raises:
-        BadInputError: a recording is not what was expected; nothing is written.
-        RecipeError: the mapping is not what was expected.
+        BadInputError: a recording is malformed or does not fit the mapping; nothing is written.
+        RecipeError: the mapping has faults.
     """
     began = time.perf_counter()
     given = {"name": name, "fps": fps, "task": task, "format": file_format}
@@ -98,7 +98,7 @@ def import_dataset(
     if mapping is not None:
         read = load_recipe(mapping, ImportMapping)
         settings = validated(read.model_dump() | options, ImportMapping, str(mapping))
-    chosen = (settings.format if settings else file_format) or _told_format(recordings)
+    chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
     sources = [source for recording in recordings for source in _sources(recording, chosen)]
@@ -130,19 +130,19 @@ def import_dataset(
     return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began)
 
 
-def _told_format(recordings: Sequence[Path]) -> str:
-    faults, told = [], {}
+def _common_format(recordings: Sequence[Path]) -> str:
+    faults, formats = [], {}
     for recording in recordings:
         try:
-            told[recording] = _format_of(recording)
+            formats[recording] = _format_of(recording)
         except BadInputError as error:
             faults.append(str(error))
-    if len(set(told.values())) > 1:
-        formats = ", ".join(f"{path} {name}" for path, name in told.items())
-        faults.append(f"expected recordings of one format, got {formats}")
+    if len(set(formats.values())) > 1:
+        listed = ", ".join(f"{path} {name}" for path, name in formats.items())
+        faults.append(f"expected recordings of one format, got {listed}")
     if faults:
         raise BadInputError("\n".join(faults))
-    return next(iter(told.values()))
+    return next(iter(formats.values()))
 
 
 def _format_of(recording: Path) -> str:
@@ -152,7 +152,9 @@ def _format_of(recording: Path) -> str:
     for name, module in FORMATS.items():
         if any(file.endswith(_suffixes(module)) for file in names):
             return name
-    raise BadInputError(f"{recording}: its name does not tell its format; pass --format {'|'.join(FORMATS)}")
+    raise BadInputError(
+        f"{recording}: its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
+    )
 
 
 def _suffixes(module: ModuleType) -> tuple[str, ...]:
@@ -203,7 +205,7 @@ def _blocks(source: Source, file_format: str, mapping: ImportMapping) -> Iterato
 
 @contextmanager
 def _explained(source: Source, file_format: str) -> Iterator[None]:
-    """Turn what a broken file makes a library raise, which may be anything, into one clear message."""
+    """Turn any exception of the library that reads a file into one clear message."""
     try:
         yield
     except AstraDataError:
@@ -234,7 +236,7 @@ def _last_rows(tally: Tally) -> str:
 
 
 def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:
-    """Return name and sha256 of every file that is read."""
+    """Return name and sha256 of every file of the recordings."""
     files = []
     for path in dict.fromkeys(source.path for source in sources):
         files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]

@@ -1,4 +1,4 @@
-"""What other libraries call our columns in their files, for who reads them and who writes them."""
+"""Names of our columns in the files of other libraries, for importers and exporters."""
 
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 

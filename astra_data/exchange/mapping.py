@@ -1,4 +1,4 @@
-"""Which fields of a recording become which columns, in one TOML file."""
+"""The mapping of a recording's fields to columns, a TOML file."""
 
 from difflib import get_close_matches
 from typing import Annotated, Literal, Self
@@ -28,8 +28,9 @@ FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
 class ColumnMapping(Config):
     """Where one column comes from.
 
-    The fields stand side by side; of a field with more than two dimensions, each row is flattened. Then come
-    `take`, `scale`, `offset` and `clip`, in this order. Lists with one entry hold for every value.
+    The fields are concatenated; each row of a field with more than two dimensions is flattened. Then
+    `take`, `scale`, `offset` and `clip` are applied, in this order. A list with one entry applies to every
+    value.
     """
 
     fields: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -39,9 +40,9 @@ class ColumnMapping(Config):
     scale: tuple[float, ...] = ()
     """Factors, such as 0.001 for mm."""
     offset: tuple[float, ...] = ()
-    """What is added after scaling."""
+    """Added after scaling."""
     clip: tuple[float, float] | None = None
-    """The range into which values are clipped; what is not finite is not clipped but rejected."""
+    """Range to which values are clipped; values that are not finite are rejected, not clipped."""
     names: tuple[str, ...] = ()
     """A name for each value."""
     unit: tuple[str, ...] = ()
@@ -89,7 +90,8 @@ class Split(Config):
     """Fields of the source that are true in the last row of an episode, besides those of next.terminated and
     next.truncated."""
     gap_s: Positive | None = None
-    """A step in `time` that is longer, or backwards; of MCAP, how long a topic's last value may be held."""
+    """A step in `time` that is longer, or backwards; of MCAP, the longest time for which a topic's last value
+    is held."""
     jump: Jump | None = None
     """A jump between rows."""
 
@@ -106,23 +108,23 @@ class ImportMapping(Config):
     row is a step."""
     columns: Annotated[dict[str, ColumnMapping], Field(min_length=1)]
     """By name. next.observation.state is derived where it is left out: an episode then loses its last row,
-    whose next state nobody recorded, unless it is terminated: then the state stands for the next state, on
-    which nobody bootstraps. A row with next.terminated or next.truncated ends its episode, also where such a
-    flag stays set row by row: `min_steps` = 2 leaves out what follows the first. next.done is always
+    whose next state was not recorded, unless it is terminated: then the state stands for the next state, from
+    which no learner bootstraps. A row with next.terminated or next.truncated ends its episode, even if the
+    flag stays set row after row: `min_steps` = 2 leaves out the rows after the first. next.done is always
     derived."""
     version: str = "1.0.0"
     """The dataset's version."""
     format: str | None = None
-    """One of `imports.FORMATS`, by default told from the file's name."""
+    """One of `importing.FORMATS`, by default inferred from the file's name."""
     split: Split = Split()
     """What begins a new episode."""
     time: str | None = None
-    """A field with the time of each row; the rate that it tells must be `fps`."""
+    """A field with the time of each row; the rate measured from it must be `fps`."""
     time_scale: Positive = 1.0
     """Seconds per unit of `time`."""
     not_finite: Literal["refuse", "drop", "split"] = "refuse"
-    """What becomes of rows with values that are not finite: nothing is imported; the rows are left out and
-    their neighbours become consecutive; or the rows are left out and begin new episodes."""
+    """Handling of rows with values that are not finite. "refuse": nothing is imported. "drop": they are left
+    out and their neighbours become consecutive. "split": they are left out and begin new episodes."""
     min_steps: Count = 1
     """Episodes with fewer steps are left out."""
     episodes: str | None = None
@@ -159,5 +161,5 @@ class ImportMapping(Config):
 
     @property
     def all_fields(self) -> list[str]:
-        """The fields that the mapping needs, with the one that tells episodes apart."""
+        """The fields that the mapping needs, with the one that separates episodes."""
         return list(dict.fromkeys([*self.fields, *([self.split.field] if self.split.field else [])]))

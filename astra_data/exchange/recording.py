@@ -1,4 +1,4 @@
-"""Other people's recordings: where they lie, and the blocks of rows that importers read from them."""
+"""Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
 import re
 import tarfile
@@ -13,7 +13,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 
 BLOCK_ROWS = 2**13
-"""Rows that an importer reads at once, where the format allows it."""
+"""Rows that an importer reads at once, if the format allows it."""
 
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 
@@ -25,7 +25,7 @@ class Source:
     Attributes:
         path: the file, or the archive that holds it.
         member: its entry in the archive, None for a file of its own.
-        recording: the file, folder or archive that was asked for; its files come one after the other.
+        recording: the file, folder or archive given by the user; its files follow one another.
     """
 
     path: Path
@@ -56,8 +56,8 @@ class Block:
 
     Attributes:
         values: field to n rows, (n,) or (n, ...).
-        origin: the file, and the part of it, that they come from.
-        starts: whether the format itself begins an episode with the first row.
+        origin: the file and part of the file that they come from.
+        starts: whether an episode of the format itself begins with the first row.
     """
 
     values: Mapping[str, Array]
@@ -70,11 +70,11 @@ class Block:
 
 
 def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
-    """List the files of a recording in their natural order: 2 before 10; what is hidden is left out.
+    """List the files of a recording in natural order (2 before 10), without hidden ones.
 
     Args:
         recording: a file, a folder, or an archive, whose members must be plain files inside of it.
-        suffixes: what the names of a folder's or archive's files end with; others are left out.
+        suffixes: endings of the names of files in a folder or archive that are listed.
 
     Raises:
         BadInputError: it does not exist, cannot be read, is unsafe or holds no such file.
@@ -96,17 +96,17 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
 
 
 def is_archive(path: Path) -> bool:
-    """Tell by its name whether `path` is an archive."""
+    """Return whether `path` has the name of an archive."""
     return path.name.endswith(ARCHIVES)
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """Return what sorts names with numbers in them as people do."""
+    """Return a sort key that orders numbers in names by value."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
 
 
 def _is_seen(path: PurePath) -> bool:
-    """Tell whether no part of `path` is hidden; archives made on a Mac hide a file beside each."""
+    """Return whether no part of `path` is hidden; archives made on a Mac have a hidden file beside each."""
     return not any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
 
 
@@ -133,8 +133,8 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
 
     Args:
         origin: the file, for the message.
-        fields: what is wanted.
-        shapes: the shape of every field that there is.
+        fields: those to be read.
+        shapes: the shape of every field in the file.
 
     Raises:
         BadInputError: lists the fields that are missing or have no rows, and differing numbers of rows.
@@ -144,8 +144,8 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     faults += [f"field '{field}' is a single value, expected rows" for field in found if not found[field]]
     lengths = {field: shape[0] for field, shape in found.items() if shape}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{field} {length}" for field, length in lengths.items())
-        faults.append(f"fields differ in their number of rows ({told})")
+        listed = ", ".join(f"{field} {length}" for field, length in lengths.items())
+        faults.append(f"fields differ in their number of rows ({listed})")
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
     return next(iter(lengths.values()))

@@ -1,4 +1,4 @@
-"""What a run shows: a live line per running item in a terminal, plain lines elsewhere."""
+"""Progress of a run: a live line per running item in a terminal, plain lines elsewhere."""
 
 import time
 from collections.abc import Iterator
@@ -13,12 +13,12 @@ from astra_data.core.progress import Progress as Notes
 from astra_data.experiments.execution import Watcher
 
 SECONDS_OF_SPEED = 600
-"""How far back the estimate of the remaining time looks."""
+"""Period over which speed is measured to estimate the remaining time."""
 
 
 @contextmanager
 def display(total: int, console: Console, above: RenderableType = "") -> Iterator[Watcher]:
-    """Show `total` items getting on, as it suits `console`; in a terminal with `above` over them."""
+    """Show the progress of `total` items on `console`; in a terminal, below `above`."""
     if not console.is_terminal:
         yield PlainDisplay(total, console)
         return
@@ -36,7 +36,7 @@ def display(total: int, console: Console, above: RenderableType = "") -> Iterato
 
 @contextmanager
 def shown(key: str) -> Iterator[Notes]:
-    """Show on standard error how one job of this process gets on; yield what it is to tell."""
+    """Show the progress of one job of this process on standard error; yield its progress callback."""
     began = time.perf_counter()
     with display(1, Console(stderr=True)) as watch:
         watch.started(key)
@@ -53,7 +53,7 @@ class PlainDisplay:
         self._tenths: dict[str, int] = {}
 
     def started(self, key: str) -> None:
-        """Print that an item has begun."""
+        """Print that an item has started."""
         self._tenths[key] = 0
         self._print(f"{key}  started")
 
@@ -103,6 +103,6 @@ class LiveDisplay:
         self._progress.console.print(f"{key}  finished in {seconds:.1f} s", markup=False, highlight=False)
 
     def failed(self, key: str) -> None:
-        """Leave the item's line where it stopped, if it had begun."""
+        """Leave the item's line where it stopped, if it had started."""
         if key in self._tasks:
             self._progress.update(self._tasks[key], note="failed")

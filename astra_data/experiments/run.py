@@ -1,4 +1,4 @@
-"""Run recipes: every stage for every row and seed, each artefact once, from where the last run stopped."""
+"""Run recipes: make every artefact that is not finished yet, for every row and seed."""
 
 import os
 from collections import Counter
@@ -28,7 +28,7 @@ from astra_data.stages.registry import STAGES
 
 RUNS = Path("runs")
 CUDA_JOBS = 2
-"""Items at a time on a CUDA device: each process holds a context of its own there."""
+"""Items at a time on a CUDA device, where each process has its own context."""
 
 
 def run(
@@ -44,14 +44,14 @@ def run(
 
     Args:
         recipe_path: the recipe.
-        seeds: those of the recipe's seeds to make and to report; by default all.
-        root: where the recipe's folder is.
+        seeds: the recipe's seeds to make and to report; by default all.
+        root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
         device: torch device of the networks.
         until: the last stage to run; by default all.
 
     Raises:
-        RecipeError: the recipe has faults, or differs from the one that made what is there.
+        RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
         MissingStageError: an artefact of the recipe that it is based on is not finished.
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
@@ -88,12 +88,12 @@ def run_stage(
 ) -> Path:
     """Make the artefacts of one stage of a recipe, of one `method` and of some `seeds` only where given.
 
-    The report is also published where asked to `publish`, and has what is published already where asked to
-    `add`.
+    With `publish`, the report is also copied to the published results; with `add`, it includes the results
+    that are published already.
 
     Raises:
         MissingStageError: an artefact that the stage reads is not finished.
-        RecipeError: the recipe has faults, or differs from the one that made what is there.
+        RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
@@ -130,7 +130,7 @@ def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
 
 
 Show = Callable[[int, Console], AbstractContextManager[Watcher]]
-"""Begins to show so many items, as `display.display` does."""
+"""Shows the progress of a number of items, as `display.display` does."""
 
 
 def make(
@@ -149,14 +149,14 @@ def make(
         items: each after those it reads.
         jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
         device: torch device of the networks.
-        cluster: address of the Ray cluster that works, or "local" for one that is started; by default
-            processes of this machine do.
-        show: shows how the items get on.
+        cluster: address of the Ray cluster to run on, or "local" to start one; by default processes of
+            this machine are used.
+        show: shows the progress of the items.
 
     Raises:
         MissingStageError: an artefact that an item reads is neither finished nor among them.
-        RecipeError: the recipe differs from the one that made what is there.
-        BadInputError: another process runs in the recipe's folder, or device or cluster are not there.
+        RecipeError: the recipe differs from the one that made the existing artefacts.
+        BadInputError: another process runs in the recipe's folder, or the device or cluster is not available.
         AstraDataError: an item failed.
     """
     _check_device(device, cluster)
@@ -172,7 +172,7 @@ def make(
         partial_file = folder / ".recipe.json.partial"
         partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
         os.replace(partial_file, folder / "recipe.json")
-        # The networks get one thread: faster as small as they are, and idle threads slow down other items.
+        # One thread for the networks: they are small, and idle threads would slow down other items.
         prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
         with show(len(items), Console()) as watch:
             if cluster is None:
@@ -184,9 +184,9 @@ def make(
 
 
 def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
-    """Check that what `items` read and none of them makes is finished."""
+    """Check that every input of `items` is finished or made by one of them."""
     made = {item.key for item in items}
-    # The report takes the seeds that are there, and says itself which rows have none.
+    # The report uses the seeds that are finished, and itself lists rows without any.
     readers = [item for item in items if stage_of(item) not in ALWAYS_NEW]
     reads = [key for item in readers for key in item.inputs if key not in made]
     missing = next((key for key in reads if not experiment.has(key)), None)
@@ -205,7 +205,7 @@ def _default_jobs(device: str) -> int:
 
 
 def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
-    """Tell the items that step the target's physics their share of the cores."""
+    """Give the items that step the target's physics their share of the cores."""
     counts = Counter(map(stage_of, items))
     return [_with_threads(item, max(1, cores() // min(jobs, counts[stage_of(item)]))) for item in items]
 
@@ -217,7 +217,7 @@ def _with_threads(item: Item, num_threads: int) -> Item:
 
 
 def finished(item: Item, experiment: Experiment) -> bool:
-    """Tell whether the artefact of `item` is there, and is not to be made anew."""
+    """Return whether the artefact of `item` is finished and need not be made again."""
     return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
 
 
@@ -254,4 +254,4 @@ def _check_device(device: str, cluster: str | None) -> None:
         return
     count = torch.cuda.device_count()
     if wanted.type == "cuda" and (wanted.index or 0) >= count:
-        raise BadInputError(f"device '{device}' is not here: torch sees {count} CUDA devices")
+        raise BadInputError(f"device '{device}' is not available: torch finds {count} CUDA devices")

@@ -1,7 +1,7 @@
-"""Sweeps: a recipe's rows on every seed and size, point by point, with a table of what is finished.
+"""Sweeps: a recipe's rows on every seed and size, with a table of the finished points.
 
 A point is finished when its evaluation is. `sweep.csv` in the recipe's folder has one line per finished
-point, written anew from the artefacts themselves whenever one is finished.
+point, rewritten from the artefacts whenever one is finished.
 """
 
 import csv
@@ -62,20 +62,20 @@ def sweep(
 
     Args:
         recipe_path: the recipe.
-        methods: those of its rows to make and to report; by default all.
-        seeds: those of its seeds; by default all.
-        percents: those of its sizes; by default all.
-        unpublished: leave out the points that its published results have.
-        root: where the recipe's folder is.
+        methods: rows of the recipe to make and to report; by default all.
+        seeds: seeds of the recipe; by default all.
+        percents: sizes of the recipe; by default all.
+        unpublished: leave out the points that are in its published results.
+        root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
         cluster: address of a Ray cluster to work on, or "local" to start one; by default none.
         trackio: project of trackio to which each finished point is logged, if any.
 
     Raises:
-        RecipeError: the recipe has faults, or differs from the one that made what is there.
-        BadInputError: the recipe has no such row, seed or size, none that is not published or no published
-            results, Ray or trackio is asked for and missing, or another process runs in the recipe's folder.
+        RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
+        BadInputError: the recipe has no such row, seed or size, nothing unpublished or no published results,
+            Ray or trackio is not installed, or another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     experiment = load_experiment(recipe_path, root)
@@ -94,7 +94,7 @@ def sweep(
 def _left(
     points: Sequence[RunPoint], items: Sequence[Item], published: Collection[RunPoint]
 ) -> tuple[tuple[RunPoint, ...], tuple[Item, ...]]:
-    """Return the points that are not published, and what they need, with the report."""
+    """Return the unpublished points, and the items that they and the report need."""
     left = tuple(point for point in points if point not in published)
     if not left:
         raise BadInputError("all of these points are published: leave out --unpublished to make them again")
@@ -213,7 +213,7 @@ class _PointWatcher:
 
 
 def _tracked(project: str, recipe: str) -> Log:
-    """Return what logs a point as a run of its own to a project of trackio."""
+    """Return a function that logs each point as a run of a trackio project."""
     trackio = optional("trackio", "trackio")
 
     def log(line: dict[str, Any]) -> None:

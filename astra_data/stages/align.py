@@ -38,8 +38,8 @@ class AlignConfig(DescentConfig):
     paired_weight: NotNegative = 0.0
     """Weight of the direct distance between paired latents; 0 is the paper's loss."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Share of the episodes that only measure the agreement, unless the dataset sets some aside itself; the
-    same ones as in `ground`."""
+    """Share of the episodes that are held out to measure the agreement, unless the dataset sets some aside
+    itself; the same ones as in `ground`."""
 
 
 def align(
@@ -52,10 +52,10 @@ def align(
     device: str = "cpu",
     progress: Progress = silent,
 ) -> None:
-    """Fit ψ^t on index-matched target and abstract histories; write it and how well it agrees to `out`.
+    """Fit ψ^t on index-matched target and abstract histories; write it and its agreement with ψ^s to `out`.
 
     Raises:
-        BadInputError: an input is not there or not what was expected, or `out` was begun otherwise.
+        BadInputError: an input is missing or malformed, or `out` was begun with other settings.
 
     Example:
         >>> from pathlib import Path
@@ -79,13 +79,15 @@ def align(
         latent_size=model.shape.latent_size,
         position_octaves=model.shape.position_octaves,
     ).to(device)
-    # Where φ drops the place, latents must not change with the way that a robot has come.
+    # Where φ drops the robot's place, latents must not depend on where it came from.
     encoder.set_scales(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    told = as_json(**episodes.named, grounding_sha256=file_digest(grounding_file), seed=seed, align=config)
-    with finished_folder(out, config=told) as folder:
+    settings_text = as_json(
+        **episodes.named, grounding_sha256=file_digest(grounding_file), seed=seed, align=config
+    )
+    with finished_folder(out, config=settings_text) as folder:
         checkpoint = folder / "checkpoint.safetensors"
         descent = Descent(encoder, config, checkpoint=checkpoint)
         while not descent.is_over:

@@ -1,14 +1,14 @@
-"""Augment: more episodes from few, by turning and moving them on the floor.
+"""Augment: more episodes from few, by rotating and translating them on the floor.
 
-What is copied is true of the copy as well, for nothing in the robot's dynamics knows where it is and which
-way it faces, but for three things, which decide how it is done:
+The robot's dynamics do not depend on where it is and which way it faces, so a moved episode is one that the
+robot could have recorded, with three exceptions:
 
-* Walls. A robot that was stopped by a wall would be stopped by nothing in another place. So only stretches
-  of an episode are copied that keep out of the walls' reach, and copies keep out of it too.
-* The goal. It belongs to the maze and does not move along: every copy gets a goal of its own, drawn as the
-  task draws it. Rewards and ends are the task's judgement of the copy; it ends where that goal is reached.
-* Commands. Where the worlds cut off what is beyond ±1 m/s along each axis, a command that is turned out of
-  that square is no longer what the robot did; such turns are drawn again.
+* Walls. A robot that was stopped by a wall would not be stopped elsewhere. So only stretches of an episode
+  that keep clear of the walls are copied, and the copies keep clear of them too.
+* The goal belongs to the maze and is not moved: every copy gets a goal of its own, drawn as the task draws
+  it. The task computes the copy's rewards and ends anew; a copy ends where it reaches its goal.
+* Commands. Where commands are clipped to ±1 m/s along each axis, a command that is rotated out of that square
+  is no longer what the robot did; such rotations are drawn again.
 
 Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
 """
@@ -78,7 +78,7 @@ class AugmentConfig(Config):
 
     @field_validator("episodes")
     @classmethod
-    def _is_not_told_twice(cls, episodes: int | None, info: ValidationInfo) -> int | None:
+    def _excludes_copies(cls, episodes: int | None, info: ValidationInfo) -> int | None:
         if episodes is not None and info.data.get("copies") is not None:
             raise ValueError("expected either copies or episodes, got both")
         return episodes
@@ -115,17 +115,17 @@ def augment(
     (`augmentation_x_m`, `augmentation_y_m`).
 
     Args:
-        task: that judges copies; by default the one that the dataset was collected for.
+        task: computes rewards and ends of copies; by default the one that the dataset was collected for.
         config: settings.
         dataset: folder of the dataset, not paired.
-        seed: of everything random; the same seed gives the same bytes.
+        seed: of all randomness; the same seed gives the same bytes.
         name: of the new dataset, by default that of `dataset`, whose next version it is.
         out: its folder, by default its place at home.
-        progress: is told how far it is.
+        progress: called with the fraction done.
 
     Raises:
-        BadInputError: the task has no maze; the dataset does not fit it, was paired or augmented, does not
-            say how its columns move, or has no stretch to copy or no place for any copy.
+        BadInputError: the task has no maze; the dataset does not fit it, was paired or augmented, has
+            columns without roles, or has no stretch to copy or no place for any copy.
         CorruptDatasetError: `dataset` is incomplete.
 
     Example:
@@ -208,14 +208,18 @@ def _check(source: Dataset, world: Task) -> None:
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")
     if world.ball_index is not None:
-        faults.append("it has a ball: what becomes of a moved episode is judged by the robot's place alone")
-    faults += [f"{column.name}: its roles are not told" for column in _moving(source) if not column.roles]
+        faults.append("it has a ball: rewards of copies are computed from the robot's place alone")
+    faults += [
+        f"{column.name}: it has no roles, which say how it is rotated"
+        for column in _moving(source)
+        if not column.roles
+    ]
     if faults:
         raise BadInputError(f"{source.root} cannot be augmented for {world.name}: {'; '.join(faults)}")
 
 
 def _moving(source: Dataset) -> list[Column]:
-    """Return the columns that move along: not the goal, the outcomes, or what is counted or told apart."""
+    """Return the columns that are transformed: all of floats but the goal and the outcomes."""
     still = (*_OUTCOMES, GOAL)
     return [column for column in source.schema if column.dtype == "float32" and column.name not in still]
 

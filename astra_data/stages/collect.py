@@ -1,4 +1,4 @@
-"""Collect: a behaviour in the target environment, stored as a LeRobot dataset."""
+"""Collect: record a behaviour in the target environment as a LeRobot dataset."""
 
 import time
 from functools import partial
@@ -42,29 +42,29 @@ from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
 _TRAINING_SHARE = 0.8
-"""Part of the progress that training the suboptimal policy takes."""
+"""Share of the progress bar for training the suboptimal policy."""
 
 
 class CollectConfig(Config):
-    """What to collect; 200 episodes of random behaviour of up to 500 steps are the paper's."""
+    """What to collect; the paper uses 200 episodes of random behaviour of up to 500 steps."""
 
     behavior: Literal["random", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
     """"random": commands drawn from U[-1, 1] per axis, each held for a while. "policy": a saved policy;
     "suboptimal_ppo" and "suboptimal_sac": one trained in the target and stopped early. Policies draw actions
     as in training."""
     episodes: Count = 200
-    """In all."""
+    """Episodes in all."""
     max_steps: Count = 500
     """Longest episode, in control steps; longer ones are truncated."""
     num_envs: Count = 200
-    """Episodes recorded side by side; decides which random numbers an episode gets."""
+    """Episodes recorded in one batch; also decides which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
     """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does."""
     hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
     clearance_m: NotNegative = 0.0
-    """A random command is given up once it would lead closer to a wall than this within a second, as
-    somebody who steers a robot by hand would; 0: never."""
+    """A random command is replaced once it would lead closer to a wall than this within a second, as
+    somebody steering the robot by hand would do; 0: never."""
     ppo_steps: Count = 300_000
     """Environment steps after which the suboptimal policy's training by PPO is stopped."""
     sac_steps: Count = 300_000
@@ -112,13 +112,13 @@ def collect(
         config: what to collect.
         seed: of everything random.
         out: the dataset's folder, by default its place at home.
-        progress: is told how far it is.
+        progress: called with the fraction done.
         num_threads: of the physics.
-        name: the dataset's, by default made of task, behaviour and seed.
-        resume: go on with the finished episodes that an interrupted call left.
+        name: of the dataset, by default made of task, behaviour and seed.
+        resume: keep the finished episodes of an interrupted call and record the rest.
 
     Raises:
-        BadInputError: the task is unknown, `out` exists, or the behaviour lacks something.
+        BadInputError: the task is unknown, `out` exists, or an artefact of the behaviour is missing.
     """
     world = task_named(task)
     saved = {
@@ -144,8 +144,8 @@ def collect(
         fsync=False,
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
-        behavior, told = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))
-        stopwatch = Stopwatch(told.get("spent"))
+        behavior, metadata = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))
+        stopwatch = Stopwatch(metadata.get("spent"))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
         steps = 0
@@ -155,14 +155,14 @@ def collect(
                 steps += _record(world, config, behavior, rows, seed, writer, num_threads, recording)
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
-        told |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
+        metadata |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
         writer.made = {
-            "behavior": told,
+            "behavior": metadata,
             **stopwatch.spent(),
             "target_steps_per_second": rate,
             "machine": machine(),
         }
-    note = f"return {told['return_mean']:.2f}, success {told['success_rate']:.2f}"
+    note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
     progress(1.0, f"{config.episodes} episodes, {note}, {rate:,.0f} target steps/s")
     return folder
 
@@ -175,7 +175,7 @@ def _behavior(
     num_threads: int | None,
     progress: Progress,
 ) -> tuple[Behavior, dict[str, Any]]:
-    """Return what acts, and what is to be told about it; a policy trained for it goes into the dataset."""
+    """Return the behaviour and its metadata; a policy trained for it is stored in the dataset."""
     if config.behavior == "random":
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
@@ -190,11 +190,13 @@ def _behavior(
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
         else:
             by = partial(suboptimal_by_sac, steps=config.sac_steps, episode_steps=config.sac_episode_steps)
-        policy, told = by(task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress)
+        policy, metadata = by(
+            task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress
+        )
         writer.policy = writer.folder / "policy.safetensors"
         policy.save(writer.policy)
-        told["policy_sha256"] = file_digest(writer.policy)
-        return PolicyBehavior(deploy(task, policy)), told
+        metadata["policy_sha256"] = file_digest(writer.policy)
+        return PolicyBehavior(deploy(task, policy)), metadata
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
     grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
@@ -202,7 +204,7 @@ def _behavior(
     deployed = deploy(task, trained, grounding, encoder)
     if deployed.observation_size != trained.policy.shape.observation_size:
         raise BadInputError(
-            f"{files['policy']} sees {trained.policy.shape.observation_size} values, the task shows "
+            f"{files['policy']} takes {trained.policy.shape.observation_size} values, the task gives "
             f"{deployed.observation_size}: expected a policy of {task.name} and, if it was trained in a "
             "grounded simulator, its grounding"
         )
@@ -228,10 +230,10 @@ def _record(
     num_threads: int | None,
     progress: Progress,
 ) -> int:
-    """Record the episodes `rows` side by side, staging each when it ends; return the number of steps.
+    """Record the episodes `rows` as one batch, staging each when it ends; return the number of steps.
 
-    The outcome depends on the whole batch, so episodes of it that are staged already are recorded again,
-    with the same outcome, and left alone.
+    Random numbers are drawn for the whole batch, so episodes that are staged already are simulated again,
+    with the same outcome, but not written again.
     """
     count = len(rows)
     batch_seed = derive(seed, f"episodes from {rows.start}") if rows.start else seed

@@ -1,8 +1,8 @@
-"""Evaluate: run a policy in the target environment, and in simulators.
+"""Evaluate: run a policy in the target environment and in simulators.
 
-Those are the world that it was trained in, and two that are the same for all policies, so that it can be told
-how well they foretell the target: the raw simulator, and a grounded one for reference. These two pay the
-task's own reward.
+The simulators are the one that it was trained in, and two that are the same for all policies, to measure how
+well each predicts the target: the raw simulator, and a grounded one as reference. These two give the task's
+own reward.
 """
 
 import json
@@ -39,16 +39,16 @@ from astra_data.worlds.task import Task
 
 Act = Callable[[Tensor, Tensor], Tensor]
 Begin = Callable[[Tensor], Act]
-"""Given the goals of N new episodes, returns how to act in them."""
+"""Given the goals (N, G) of new episodes, returns the function that acts in them."""
 
 
 class EvaluateConfig(Config):
-    """How policies are tested; 100 episodes are the paper's."""
+    """How policies are tested; the paper uses 100 episodes."""
 
     episodes: Count = 100
-    """Run side by side, in the target and in simulation each."""
+    """Run in one batch, in the target and in each simulator."""
     encoder: EncoderKind = "target"
-    """Whose latents an aligned policy is deployed with for the headline figures; both are reported."""
+    """Encoder with which an aligned policy is deployed for the headline figures; both are reported."""
     leg_scale: Positive = 1.0
     """Of the ant in the target environment; 1.25 is the paper's morphology test."""
 
@@ -78,14 +78,14 @@ def evaluate(
         policy: what `train` made, for a row that trains.
         grounding: what `ground` made for it, for a row that grounds.
         target_encoder: what `align` made for it, for a row that aligns.
-        reference: the grounding of the simulator that foretells the target; None where there is none.
+        reference: the grounding of the reference simulator, if there is one.
         seed: of all randomness.
         out: the folder to write.
-        progress: told the share done.
+        progress: called with the fraction done.
         num_threads: of the physics, by default one per core; the outcome is the same with any number.
 
     Raises:
-        BadInputError: an input is not there or not what was expected.
+        BadInputError: an input is missing or malformed.
 
     Example:
         >>> import json
@@ -99,13 +99,13 @@ def evaluate(
     world, base = task_named(task), method_named(method)
     scores = world.objective.scores
     if base.trains and policy is None:
-        raise BadInputError(f"method '{method}' has a policy to test: run the stage `train` first")
+        raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
     if base.grounds and grounding is None:
         raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     stopwatch = Stopwatch()
-    told: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
-    told["leg_scale"] = config.leg_scale
-    told |= origin()
+    results: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
+    results["leg_scale"] = config.leg_scale
+    results |= origin()
     simulators: dict[str, SimulatorWorld] = {}
     headline: EncoderKind = "source"
     if policy is None:
@@ -125,41 +125,41 @@ def evaluate(
             aligned = replace(source, target_encoder=encoder)
             robots["target"] = partial(_start, aligned, aligned.act)
         headline = config.encoder if config.encoder in robots else "source"
-        told |= {
+        results |= {
             "encoder": headline,
             "dataset_version": trained.dataset,
             "dataset_hash": trained.content_hash,
         }
         shown_abstract = trained.observed == "abstract"
         if trained.simulation is not None:
-            simulators["simulated"] = _own_world(world, trained.simulation, model, config)
+            simulators["simulated"] = _training_simulator(world, trained.simulation, model, config)
     if shown_abstract:
-        simulators |= _shared_worlds(world, reference, config)
+        simulators |= _shared_simulators(world, reference, config)
     outcomes, filmed = {}, {}
     for kind, robot in robots.items():
         outcomes[kind], filmed[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
     if policy is not None:
-        told["encoders"] = {
+        results["encoders"] = {
             kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
             for kind, outcome in outcomes.items()
         }
-    told |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
+    results |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
     tensors = {"target.position": outcomes[headline].position}
     if world.photograph is not None:
         tensors["target.state"] = filmed[headline]
     for name, simulated in simulators.items():
         outcome = _in_simulator(simulated, begin, world.objective.horizon, seed)
-        told[name] = outcome.to_json()
+        results[name] = outcome.to_json()
         if name == "simulated":
             tensors["simulated.position"] = outcome.position
     start_goal = _starts_and_goals(world, config, seed)
     with finished_folder(out) as folder:
         save_tensors(folder / "trajectories.safetensors", tensors | start_goal, {})
-        told |= stopwatch.spent()
-        (folder / "evaluation.json").write_text(json.dumps(told, indent=1))
+        results |= stopwatch.spent()
+        (folder / "evaluation.json").write_text(json.dumps(results, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
     first = scores[0]
-    progress(1.0, f"{first.title} in the target {first.text(fmean(told['target'][first.measure]))}")
+    progress(1.0, f"{first.title} in the target {first.text(fmean(results['target'][first.measure]))}")
 
 
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
@@ -180,7 +180,7 @@ def _in_target(
     num_threads: int | None,
     progress: Progress,
 ) -> tuple[Outcome, Tensor, float]:
-    """Return what happened in the target, the states (T + 1, S) of the first episode, and target steps/s."""
+    """Return the outcome in the target, the states (T + 1, S) of the first episode, and target steps/s."""
     env = task.target(
         config.episodes,
         seed=derive(seed, "evaluation"),
@@ -212,14 +212,16 @@ def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str
     return {"start": env.position, "goal": env.goal}
 
 
-def _own_world(
+def _training_simulator(
     task: Task, simulation: Simulation, grounding: Grounding, config: EvaluateConfig
 ) -> SimulatorWorld:
     parts = WorldParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
     return training_world(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
 
 
-def _shared_worlds(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorWorld]:
+def _shared_simulators(
+    task: Task, reference: Path | None, config: EvaluateConfig
+) -> dict[str, SimulatorWorld]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
         groundings["grounded"] = load_grounding(reference / "grounding.safetensors")
@@ -231,7 +233,7 @@ def _shared_worlds(task: Task, reference: Path | None, config: EvaluateConfig) -
 
 @torch.no_grad()
 def _in_simulator(world: SimulatorWorld, begin: Begin, horizon: int, seed: int) -> Outcome:
-    """Return what happened in `world`, from the task's starts, which are the same in all worlds."""
+    """Return the outcome in the simulator `world`, from starts that are the same in every simulator."""
     torch.manual_seed(derive(seed, "simulated evaluation"))
     world.reset()
     act = begin(world.goal)

@@ -1,4 +1,4 @@
-"""Ground: fit what corrects the abstract simulator, and report how good it is."""
+"""Ground: fit a correction of the abstract simulator, and report its open-loop error."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ def ground(
     device: str = "cpu",
     progress: Progress = silent,
 ) -> None:
-    """Fit a method's grounding to a paired dataset; write it, its telemetry and its gap report to `out`.
+    """Fit a method's grounding to a paired dataset; write it with its diagnostics and gap report to `out`.
 
     Args:
         task: a name in `TASKS`.
@@ -40,10 +40,11 @@ def ground(
         seed: of all randomness.
         out: the folder to write.
         device: torch device.
-        progress: told the share done.
+        progress: called with the fraction done.
 
     Raises:
-        BadInputError: the method does not ground, the dataset is not paired, or `out` was begun otherwise.
+        BadInputError: the method does not ground, the dataset is not paired, or `out` was begun
+            with other settings.
 
     Example:
         >>> from pathlib import Path
@@ -58,8 +59,8 @@ def ground(
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
     named = {"task": task, "method": method, **episodes.named}
-    told = as_json(**named, seed=seed, ground=config, settings=settings)
-    with finished_folder(out, config=told) as folder:
+    settings_text = as_json(**named, seed=seed, ground=config, settings=settings)
+    with finished_folder(out, config=settings_text) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()
         grounding, metrics = fit(fitting)

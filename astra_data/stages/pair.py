@@ -1,4 +1,4 @@
-"""Pair: put the abstract simulator where the target was, give it the same action, keep where it lands."""
+"""Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
 
 import time
 from collections.abc import Iterator
@@ -31,16 +31,16 @@ from astra_data.worlds.registry import TASKS
 from astra_data.worlds.simulator_loader import Pairing, built, checked_abstraction, explained, pairing_named
 
 BATCH = 4096
-"""Simulators that are reset and stepped side by side."""
+"""Simulators that are reset and stepped in one batch."""
 _BLOCK = 8 * BATCH
-"""Steps that are held in memory before they are paired, rounded up to whole episodes."""
+"""Steps held in memory at once, rounded up to whole episodes."""
 
 
 class PairConfig(Config):
-    """How strictly a reset of the simulator is checked."""
+    """Tolerance of the check that the simulator was reset to φ(s)."""
 
     reset_tolerance: NotNegative = 1e-6
-    """Largest difference between φ(s) and what the simulator shows after being reset to it."""
+    """Largest difference between φ(s) and the simulator's state after being reset to it."""
 
 
 def pair(
@@ -60,10 +60,10 @@ def pair(
         dataset: folder of the dataset.
         name: of the new dataset, by default that of `dataset`, whose next version it is.
         out: its folder, by default its place at home.
-        progress: is told how far it is.
+        progress: called with the fraction done.
 
     Raises:
-        BadInputError: the simulator does not show the state it was reset to, or does not fit the dataset.
+        BadInputError: the simulator is not in the state that it was reset to, or does not fit the dataset.
         CorruptDatasetError: `dataset` is incomplete.
 
     Example:
@@ -136,7 +136,7 @@ def pair_steps(
     tolerance: float,
     first_step: int = 0,
 ) -> tuple[dict[str, Array], float]:
-    """Reset `batch` to φ of each of N target steps and give it the step's action.
+    """Reset `batch` to φ(s) of each of N target steps and step it with the recorded action.
 
     Args:
         pairing: the simulator and φ.
@@ -151,7 +151,7 @@ def pair_steps(
         the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
 
     Raises:
-        BadInputError: the difference is larger than `tolerance`, or the simulator gives no numbers.
+        BadInputError: the difference is larger than `tolerance`, or the simulator's states are not finite.
     """
     abstract = checked_abstraction(pairing, state)
     landed = np.empty_like(abstract)

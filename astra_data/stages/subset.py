@@ -1,4 +1,4 @@
-"""Subset: one size of a paired dataset; smaller ones lie inside larger ones."""
+"""Subset: one size of a paired dataset; smaller sizes are subsets of larger ones."""
 
 from pathlib import Path
 
@@ -11,11 +11,11 @@ def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progres
     """Write `percent` per cent of `of` episodes of `dataset` to `out`, as a dataset of its own.
 
     Args:
-        dataset: whose own permutation says which episodes.
+        dataset: its stored permutation decides which episodes are taken.
         percent: the size; may exceed 100.
-        of: how many episodes 100 per cent are.
+        of: number of episodes that count as 100 per cent.
         out: the folder to write.
-        progress: told the episodes.
+        progress: called with the number of episodes.
 
     Raises:
         BadInputError: `dataset` has fewer episodes, or `out` exists.

@@ -1,4 +1,4 @@
-"""Train: learn the policy of a row, as its method does it."""
+"""Train: learn the policy of a row with its method."""
 
 import json
 from pathlib import Path
@@ -47,12 +47,12 @@ def train(
         seed: of all randomness.
         out: the folder to write.
         device: torch device.
-        progress: told the share done.
+        progress: called with the fraction done.
         num_threads: of the target's physics, for methods that train in the target.
 
     Raises:
         BadInputError: the method has no policy to train, needs an artefact and got none, or `out` was begun
-            otherwise.
+            with other settings.
 
     Example:
         >>> from pathlib import Path
@@ -76,7 +76,7 @@ def train(
     initial_file = initial and initial / "policy.safetensors"
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
-    told = as_json(
+    settings_text = as_json(
         task=task,
         method=method,
         **episodes.named,
@@ -86,7 +86,7 @@ def train(
         train=config,
         settings=settings,
     )
-    with finished_folder(out, config=told) as folder:
+    with finished_folder(out, config=settings_text) as folder:
         training = Training(
             task=world,
             config=config,

@@ -82,4 +82,4 @@ def test_stopping_a_recording_says_how_to_go_on(home: Path, monkeypatch: pytest.
     monkeypatch.setattr(StagedWriter, "add", stop)
     stopped = call("collect", "antmaze-umaze", *SMALL)
     assert stopped.exit_code == 130
-    assert stopped.output.splitlines()[-1] == "stopped: the same command with --resume goes on from here"
+    assert stopped.output.splitlines()[-1] == "stopped: run the same command with --resume to continue"

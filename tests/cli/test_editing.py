@@ -42,6 +42,6 @@ def test_a_refused_edit_writes_nothing(fake: str) -> None:
 
 def test_a_recipe_says_its_sizes_itself() -> None:
     result = CliRunner().invoke(app, ["subset", "r.toml", "--percent", "50"])
-    assert str(result.exception) == "subset: a recipe says this itself, in [sweep]: leave out --percent"
+    assert str(result.exception) == "subset: a recipe sets this itself, in [sweep]: leave out --percent"
     result = CliRunner().invoke(app, ["subset", "fake", "--percent", "50", "--seed", "0", "--seed", "1"])
     assert isinstance(result.exception, BadInputError)

@@ -30,7 +30,7 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     write_fake(tmp_path / "mute", columns=[replace(column, astra=None) for column in COLUMNS])
     for arguments, told in (
         ([str(tmp_path / "none")], "no such folder"),
-        ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "roles of its state tell no position"),
+        ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "no column with the role position"),
         ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "expected a folder to write to"),
     ):
         error = call("inspect", *arguments).exception

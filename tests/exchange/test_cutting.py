@@ -105,7 +105,7 @@ def test_no_gap_hides_behind_a_time_that_is_not_finite(block_rows: int) -> None:
 def test_a_rate_that_is_not_fps_is_told() -> None:
     cutting = cutter(time="t", time_scale=0.001)
     cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)
-    with pytest.raises(BadInputError, match="'t' tells 50 rows per second, fps says 10"):
+    with pytest.raises(BadInputError, match="'t' gives 50 rows per second, but fps is 10"):
         cutting.check_rate()
 
 

@@ -65,7 +65,7 @@ def test_rejected_rows_refuse_the_import(tmp_path: Path) -> None:
 
 def test_a_rate_that_is_not_fps_refuses_the_import(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.npz", rows() | {"unused": np.arange(20) / 30})
-    with pytest.raises(BadInputError, match="tells 30 rows per second, fps says 10"):
+    with pytest.raises(BadInputError, match="gives 30 rows per second, but fps is 10"):
         imported(tmp_path, path, 'time = "unused"\n' + MAPPING)
     assert list(tmp_path.glob("*out*")) == []
 
@@ -74,7 +74,7 @@ def test_recordings_that_do_not_fit_are_all_told(tmp_path: Path) -> None:
     csv, npz = (write_table(tmp_path / name, rows()) for name in ("a.csv", "b.npz"))
     with pytest.raises(BadInputError) as caught:
         imported(tmp_path, [tmp_path / "none.csv", csv, npz, tmp_path / "mapping.toml"])
-    for told in ("none.csv does not exist", "of one format, got", "mapping.toml: its name does not tell"):
+    for told in ("none.csv does not exist", "of one format, got", "mapping.toml: its format cannot be inf"):
         assert told in str(caught.value)
 
 

@@ -245,7 +245,7 @@ def test_datasets_that_do_not_fit_are_refused(
         (augmented, None, "it has been augmented; augment its parent"),
         (collected, "antmaze-long", "was collected for antmaze-short, not for antmaze-long"),
         (mute, None, "give --task"),
-        (mute, TASK, "observation.state: its roles are not told"),
+        (mute, TASK, "observation.state: it has no roles"),
         (mute, "antmaze-umase", "did you mean 'antmaze-umaze'"),
     ):
         with pytest.raises(BadInputError, match=told):

@@ -1,6 +1,6 @@
-"""Datasets in the formats of other libraries: one file each, each a function of a dataset and where it goes.
+"""Export of datasets to the formats of other libraries, one file per format.
 
-All of them stream episode by episode, write whole or not at all, and overwrite nothing.
+All exporters stream episode by episode, write atomically and never overwrite.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ EXPORTERS: dict[str, Callable[[Dataset, Path], None]] = {
 }
 
 NEEDED = (STATE, ACTION, REWARD, TERMINATED, TRUNCATED, NEXT_STATE)
-"""Columns that every format is made of."""
+"""Columns that every format needs."""
 
 
 def export(dataset: Dataset, out: Path, *, format: str) -> None:

@@ -14,8 +14,8 @@ from astra_data.exchange.layouts import D4RL
 def export(dataset: Dataset, out: Path) -> None:
     """Write observations (N, S), actions (N, A), rewards, terminals, timeouts (N,), next_observations (N, S).
 
-    Goals (N, G) become infos/goal. The last step of every episode is a terminal or a timeout, since there is
-    nothing else to tell the episodes apart.
+    Goals (N, G) become infos/goal. The last step of every episode is a terminal or a timeout, since
+    nothing else separates the episodes.
     """
     h5py = optional("h5py", "hdf5")
     rows = int(dataset.lengths.sum())

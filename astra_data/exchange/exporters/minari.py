@@ -33,8 +33,8 @@ def export(dataset: Dataset, out: Path) -> None:
     `out` in Minari's folder, or its name if it lies elsewhere.
 
     Raises:
-        BadInputError: next states are not the states of the following steps, as Minari takes for granted, or
-            the name of `out` is no id.
+        BadInputError: next states are not the states of the following steps, as Minari assumes, or the name
+            of `out` is not a valid id.
     """
     minari = optional("minari", "minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
@@ -44,12 +44,12 @@ def export(dataset: Dataset, out: Path) -> None:
 
     shelf, place = get_dataset_path().resolve(), out.resolve()
     name = str(place.relative_to(shelf)) if place.is_relative_to(shelf) else place.name
-    # Without a version its own parser ends in a TypeError.
+    # Its parser raises a TypeError for a name without a version.
     try:
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:
         raise BadInputError(
-            f"{out}: '{name}' is no id of Minari; end --out with a name and a version, such as maze/random-v0"
+            f"{out}: '{name}' is not a Minari id; end --out with a name and a version, such as maze/random-v0"
         ) from error
 
     def box(column: str) -> Box:
@@ -58,7 +58,7 @@ def export(dataset: Dataset, out: Path) -> None:
 
     goal = {"desired_goal": box(GOAL)} if GOAL in dataset.features else {}
     observed = Dict({"observation": box(STATE), **goal}) if goal else box(STATE)
-    # Minari mixes up relative paths.
+    # Minari does not handle relative paths.
     with atomic_folder(place) as folder:
         storage = MinariStorage.new(folder / "data", observed, box(ACTION), data_format="hdf5")
         description = f"{dataset.reference}, content hash {dataset.content_hash}"

@@ -12,15 +12,15 @@ from astra_data.exchange.layouts import ROBOMIMIC
 VALID_SHARE = 0.1
 """Share of the episodes in mask/valid, as in robomimic's own split; the others are in mask/train."""
 _GYM = 2
-"""robomimic's number for gym environments."""
+"""robomimic's code for gym environments."""
 
 
 def export(dataset: Dataset, out: Path) -> None:
     """Write data/demo_i: actions (T, A), rewards, dones, truncated (T,), obs/state, next_obs/state (T, S).
 
-    `dones` is terminated alone: robomimic's learners do not bootstrap on it. `truncated` is for the way back.
-    Goals (T, G) become obs/goal and next_obs/goal. mask/train and mask/valid follow the permutation of the
-    nested subsets; a dataset of a single episode has only mask/train.
+    `dones` is terminated alone: robomimic's learners do not bootstrap on it. `truncated` is read by our own
+    importer only. Goals (T, G) become obs/goal and next_obs/goal. mask/train and mask/valid follow the
+    permutation of the nested subsets; a dataset of a single episode has only mask/train.
     """
     h5py = optional("h5py", "hdf5")
     goal = [GOAL] if GOAL in dataset.features else []

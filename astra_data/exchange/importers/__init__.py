@@ -1,6 +1,6 @@
-"""Other people's logs, one file per format; no file knows another.
+"""Readers of logs, one file per format, independent of each other.
 
-Each has `read(source, mapping)`, which yields `recording.Block`s with the fields that `mapping` names, and
-those whose fields have standard names have `layout(source)`, which returns a mapping's keys. What goes wrong
-in reading may be any exception of the libraries that read: `imports` explains it.
+Each has `read(source, mapping)`, which yields `recording.Block`s with the fields that `mapping` names.
+Formats whose fields have standard names also have `layout(source)`, which returns the keys of a mapping. Both
+may raise any exception of the libraries that they read with; `importing` turns it into a message.
 """

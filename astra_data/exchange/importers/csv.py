@@ -19,10 +19,10 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows; fields are whole numbers, numbers, or true and false, and an empty cell is NaN.
 
     Raises:
-        BadInputError: fields are missing, doubled or no numbers.
+        BadInputError: fields are missing, duplicated or not numeric.
     """
     with source.open() as stream:
-        # As text first: what a column holds in its first block says nothing about its last.
+        # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
             stream,
             parse_options=csv.ParseOptions(delimiter="\t" if str(source).endswith(".tsv") else ","),
@@ -58,7 +58,7 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
 
 
 def _numbers(texts: pa.StringArray, where: str) -> Array:
-    whole = [] if texts.null_count else [pa.int64()]  # No integer stands for an empty cell.
+    whole = [] if texts.null_count else [pa.int64()]  # An empty cell has no integer value.
     for kind in (*whole, pa.float64(), pa.bool_()):
         try:
             numbers = pc.cast(texts, kind)

@@ -15,14 +15,14 @@ from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, natural, ro
 SUFFIXES = (".h5", ".hdf5", ".mat")
 
 MOST_COMPRESSED = 10_000
-"""No filter makes this many bytes of one; beyond, values were never written."""
+"""Larger than the compression ratio of any filter; beyond it, the values were never written."""
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows of each episode's group, or of the file where `mapping.episodes` is left out.
 
     Raises:
-        BadInputError: groups or fields are missing, or lie in another file.
+        BadInputError: groups or fields are missing, or are stored in another file.
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
@@ -47,8 +47,8 @@ def layout(source: Source) -> dict[str, Any]:
     """Return the keys of a mapping for a file in the layout of D4RL or of robomimic.
 
     Of robomimic, the state is all of `obs` with one or two dimensions (images are left out), in the order of
-    their names; `dones` is taken for terminated, as robomimic's own learners do. It may stay set while
-    success lasts: rows after its first are episodes of one step, left out unless truncation is told too.
+    their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set while
+    success lasts: rows after its first are episodes of one step, left out unless truncation is recorded too.
 
     Raises:
         BadInputError: it is neither.
@@ -96,10 +96,10 @@ def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]
 
 
 def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN401 - of h5py
-    """Return the group `name` of `group`, unless the name stands for what may lie in another file."""
+    """Return the group `name` of `group`; links are refused, since they may lead to another file."""
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise BadInputError(
-            f"{origin}{group.name.rstrip('/')}/{name} is a link; copy what it names into its place"
+            f"{origin}{group.name.rstrip('/')}/{name} is a link; replace it by a copy of its target"
         )
     return group[name]
 

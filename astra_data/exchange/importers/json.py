@@ -1,6 +1,6 @@
 """JSON: one object that maps each field to its rows, as the NAO's logs are.
 
-A file is read whole, since a JSON value ends where its file ends; larger ones than `LIMIT_BYTES` are refused.
+A file is read whole, since JSON cannot be parsed in blocks; files larger than `LIMIT_BYTES` are refused.
 """
 
 import json
@@ -20,7 +20,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield all rows as one block.
 
     Raises:
-        BadInputError: the file is too large or no object; fields are missing or differ in length.
+        BadInputError: the file is too large or not an object; fields are missing or differ in length.
     """
     with source.open() as stream:
         text = stream.read(LIMIT_BYTES + 1)

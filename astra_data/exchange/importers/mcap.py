@@ -1,9 +1,9 @@
 """MCAP: messages of asynchronous topics, as JSON, protobuf or ROS 2 (CDR), resampled to fps.
 
-From the moment when every topic has spoken, a row is taken every 1 / fps seconds; each value is the topic's
-last one at that time, held until the next. A topic that is silent for longer than `split.gap_s` ends the
-episode, and the next begins when all have spoken again. Times are the messages' log times. Read message by
-message.
+From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
+topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s` ends the
+episode, and the next begins when all have sent a message again. Times are the messages' log times. Files
+are read message by message.
 """
 
 import json
@@ -23,7 +23,7 @@ SUFFIXES = (".mcap",)
 
 
 class Resampler:
-    """Holds the last values of all topics and takes rows from them.
+    """Holds the last values of all topics and samples rows from them.
 
     Attributes:
         topics: topic to its fields.
@@ -31,28 +31,28 @@ class Resampler:
     """
 
     def __init__(self, mapping: ImportMapping) -> None:
-        """Hold the fields of `mapping`."""
+        """Sample the fields of `mapping`."""
         self.topics: dict[str, list[str]] = {}
         self.times: dict[str, int] = {}
         for field in mapping.all_fields:
             self.topics.setdefault(field.partition(":")[0], []).append(field)
-        hurried = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
-        self._hurried = {field.partition(":")[0] for field in hurried}
+        expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
+        self._expiring = {field.partition(":")[0] for field in expiring}
         self._gap_ns = round((mapping.split.gap_s or 0) * 1e9)
         self._fps = mapping.fps
         self._values: dict[str, Array] = {}
         self._start: int | None = None
         self._row = 0
 
-    def hear(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
-        """Take in a message."""
+    def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
+        """Update the values of `topic` with a message at `time` ns."""
         self._values |= values
         self.times[topic] = time
         if self._start is None and self._is_complete(time):
             self._start, self._row = time, 0
 
     def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows before `time` that have not been taken yet, and whether each begins an episode."""
+        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode."""
         while self._start is not None:
             moment = self._start + self._row * 10**9 // self._fps
             if moment >= time:
@@ -65,7 +65,7 @@ class Resampler:
 
     def _is_complete(self, time: int) -> bool:
         return self.times.keys() == self.topics.keys() and all(
-            time - self.times[topic] <= self._gap_ns for topic in self._hurried
+            time - self.times[topic] <= self._gap_ns for topic in self._expiring
         )
 
 
@@ -73,7 +73,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield rows at the rate `mapping.fps`.
 
     Raises:
-        BadInputError: topics or parts of messages are missing; lists every one.
+        BadInputError: topics or parts of messages are missing; lists all of them.
     """
     _check_mapping(mapping, str(source))
     starts = False
@@ -109,7 +109,7 @@ def _rows(source: Source, mapping: ImportMapping) -> Iterator[tuple[bool, dict[s
             if changed:
                 raise BadInputError(f"{source} at {time} ns: {', '.join(changed)} changes in size")
             yield from resampler.rows_before(time)
-            resampler.hear(channel.topic, time, values)
+            resampler.receive(channel.topic, time, values)
     yield from resampler.rows_before(time + 1)
     silent = sorted(resampler.topics.keys() - resampler.times.keys())
     if silent:
@@ -127,7 +127,7 @@ def _check_mapping(mapping: ImportMapping, origin: str) -> None:
         if not all(field.partition(":"))
     ]
     if mapping.split.gap_s is None:
-        faults.append("split.gap_s is missing: for how long may a topic's last value be held?")
+        faults.append("split.gap_s is missing: the longest time for which a topic's last value is held")
     if mapping.time is not None:
         faults.append("time: leave it out, the messages' log times are used")
     if all(column.latched for column in mapping.columns.values()):
@@ -154,7 +154,7 @@ def _values(content: Any, topic: str, fields: list[str], origin: str) -> dict[st
         is_list = hasattr(part, "__len__") and not isinstance(part, str | Mapping)
         value = np.array(list(part) if is_list else part)
         if value.dtype.kind not in "biufU":
-            faults.append(f"'{field}' is no number, nor a list of them")
+            faults.append(f"'{field}' is neither a number nor a list of numbers")
         values[field] = value
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")

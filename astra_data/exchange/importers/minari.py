@@ -48,7 +48,7 @@ def layout(source: Source) -> dict[str, Any]:
 
 
 def is_dataset(path: Path) -> bool:
-    """Tell whether `path` is a folder as Minari writes them."""
+    """Return whether `path` is the folder of a Minari dataset."""
     return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
 
 

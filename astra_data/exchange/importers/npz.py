@@ -1,4 +1,4 @@
-"""NPZ: one array per field, rows along the first dimension; read block by block, without pickle."""
+"""NPZ: one array per field, rows along the first dimension. Read block by block; nothing is unpickled."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -17,7 +17,7 @@ SUFFIXES = (".npz",)
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows, read from all arrays side by side.
+    """Yield the rows, read from all arrays in parallel.
 
     Raises:
         BadInputError: fields are missing, differ in length, or hold Python objects.

@@ -1,4 +1,4 @@
-"""Where datasets are shared: a repository on the Hugging Face Hub, or a folder at any URL."""
+"""Addresses of shared datasets: a repository on the Hugging Face Hub, or a folder at any URL."""
 
 import re
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Hub:
     repo: str
 
     def __str__(self) -> str:
-        """Write it as a URL."""
+        """Return it as a URL."""
         return f"hf://datasets/{self.repo}"
 
 
@@ -31,7 +31,7 @@ class Url:
     url: str
 
     def __str__(self) -> str:
-        """Write the URL."""
+        """Return the URL."""
         return self.url
 
 
@@ -42,7 +42,7 @@ def parse_place(text: str) -> Place:
     """Read "user/name", "hf://datasets/user/name", another URL, or a folder that begins with a dot, / or ~.
 
     Raises:
-        BadInputError: it is none of them.
+        BadInputError: it is none of these.
     """
     if hub := _HUB.fullmatch(text):
         return Hub(hub["repo"])
@@ -60,7 +60,7 @@ def parse_source(text: str) -> tuple[Place, Version | None]:
     """Read a place, and the version where one is named: "user/name@data-1.2.0", "s3://…/name/data-1.2.0".
 
     Raises:
-        BadInputError: it is not a place.
+        BadInputError: it is not an address.
     """
     named = _VERSION.search(text)
     if named is None:

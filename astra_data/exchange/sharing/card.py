@@ -1,4 +1,4 @@
-"""A dataset's card: what it is and where it comes from, in the form that the Hugging Face Hub shows."""
+"""A dataset's card, in the format of the Hugging Face Hub."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ from astra_data.reports.figures.style import png
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 
 SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B")
-"""Upper ends of the Hub's size categories, in steps, from a thousand by factors of ten."""
+"""Upper bounds of the Hub's size categories in steps, from 1000 in factors of ten."""
 
 WIDE = 4
 """Columns with more values than this have their names listed below the table."""
@@ -44,8 +44,8 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     Args:
         dataset: any.
         out: the Markdown file; it is replaced, and so is the figure, `<stem>-coverage.png`.
-        notes: what only a person can say.
-        source: where it is shared, as `pull` takes it; None tells how to open a folder.
+        notes: the part of the card that a person writes.
+        source: where it is shared, as `pull` takes it; if None, the card shows how to open a folder.
 
     Returns:
         the files written.
@@ -98,11 +98,11 @@ def render_card(
 
 def _opening(dataset: Dataset) -> str:
     stand_in = dataset.description["environment"].get("stand_in")
-    told = f" The robot is a simulated stand-in (`{stand_in}`) for a physical one." if stand_in else ""
+    note = f" The robot is a simulated stand-in (`{stand_in}`) for a physical one." if stand_in else ""
     return (
         f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
         f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. Task: “{dataset.task}”. "
-        f"The format is LeRobot {layout.CODEBASE_VERSION}.{told}"
+        f"The format is LeRobot {layout.CODEBASE_VERSION}.{note}"
     )
 
 
@@ -115,8 +115,8 @@ def _counts(dataset: Dataset) -> str:
         ("duration", f"{lengths.sum() / dataset.info['fps'] / 60:,.1f} min"),
         ("episode length", f"{lengths.min()} to {lengths.max()} steps; quartiles {_listed(quartiles)}"),
     ]
-    told = dataset.metadata | {"success": dataset.successes() or []}
-    facts = {key: [value for value in values if value is not None] for key, values in told.items()}
+    metadata = dataset.metadata | {"success": dataset.successes() or []}
+    facts = {key: [value for value in values if value is not None] for key, values in metadata.items()}
     for key, values in sorted(facts.items()):
         if values and all(isinstance(value, bool) for value in values):
             share = sum(map(bool, values)) / len(values)

@@ -1,4 +1,4 @@
-"""Fetch files that may have been fetched in part before."""
+"""Resumable download of one file, verified by its checksum."""
 
 from pathlib import Path
 
@@ -7,20 +7,20 @@ from astra_data.core.errors import SharingError
 from astra_data.exchange.sharing.store import RemoteFolder
 
 BLOCK_BYTES = 2**24
-"""Asked for at once."""
+"""Bytes per request."""
 
 
 def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str) -> None:
-    """Fetch the file `path` into `folder`, on from where an earlier call stopped.
+    """Download the file `path` into `folder`, continuing where an earlier call stopped.
 
     Args:
         remote: where it is.
-        path: relative to it and to `folder`, and known to stay inside.
-        folder: what is fetched in part is kept in it as <path>.part.
+        path: relative to it and to `folder`; already checked to stay inside them.
+        folder: an unfinished download is kept in it as <path>.part.
         digest: the file's sha256.
 
     Raises:
-        SharingError: it cannot be read or written, or holds something else.
+        SharingError: it cannot be read or written, or its checksum is another.
     """
     target = folder / path
     if target.is_file() and file_digest(target) == digest:
@@ -35,13 +35,13 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str) -> None:
             _append(remote, path, part)
     except Exception as error:
         raise SharingError(
-            f"{remote.name}: {path} cannot be fetched ({type(error).__name__}: {error}); "
-            "run the same command again to go on from here."
+            f"{remote.name}: {path} cannot be downloaded ({type(error).__name__}: {error}); "
+            "run the same command again to continue."
         ) from error
     if file_digest(part) != digest:
         part.unlink()
         raise SharingError(
-            f"{remote.name}: {path} does not have the sha256 that it should; it was altered there."
+            f"{remote.name}: {path} does not have the sha256 in SHA256SUMS; it was altered there."
         )
     part.replace(target)
 

@@ -24,23 +24,23 @@ class HubStore:
     """The versions of one dataset in the Hub's repository `repo`, "user/name"."""
 
     def __init__(self, repo: str) -> None:
-        """Take the repository; nothing is asked yet."""
+        """Take the name of the repository; no request is made."""
         self._repo = repo
 
     def create(self, card: Path, *, private: bool) -> None:
-        """Make the repository unless it exists.
+        """Create the repository unless it exists.
 
         Args:
-            card: a folder with the README.md that it is to get, which the Hub checks first.
-            private: whether nobody else may see it.
+            card: a folder with its future README.md, which the Hub validates first.
+            private: whether the repository is to be private.
 
         Raises:
-            BadInputError: the Hub does not take the card, or the repository is public and not to be.
+            BadInputError: the Hub rejects the card, or the repository is public and should be private.
             SharingError: the Hub refuses or cannot be reached.
         """
-        with _told(self._repo) as api:
+        with _explained(self._repo) as api:
             _validate(api, (card / "README.md").read_text(encoding="utf-8"))
-            # None leaves it to what the user or the organisation prefers.
+            # None stands for the default of the user or the organisation.
             api.create_repo(self._repo, repo_type=KIND, private=private or None, exist_ok=True)
             if private and not api.repo_info(self._repo, repo_type=KIND).private:
                 raise BadInputError(
@@ -54,7 +54,7 @@ class HubStore:
         return sorted(self._commits())
 
     def folder(self, version: Version) -> RemoteFolder:
-        """Return where the files of `version` are read: the commit that its tag names right now."""
+        """Return the folder with the files of `version`: the commit that its tag names right now."""
         from huggingface_hub import HfFileSystem  # noqa: PLC0415 - slow to import
 
         filesystem = HfFileSystem(skip_instance_cache=True)
@@ -70,7 +70,7 @@ class HubStore:
         """
         version = Version.parse(dataset.description["version"])
         self._refuse_mixing(dataset, version)
-        with _told(self._repo) as api:
+        with _explained(self._repo) as api:
             progress(0.0, "files")
             commit = self._commit(api, dataset, card)
             progress(0.9, "tags")
@@ -124,14 +124,14 @@ class HubStore:
         return str(commit.oid)
 
     def _commits(self) -> dict[Version, str]:
-        with _told(self._repo) as api:
+        with _explained(self._repo) as api:
             tags = api.list_repo_refs(self._repo, repo_type=KIND).tags
         versions = ((Version.from_tag(tag.name), tag.target_commit) for tag in tags)
         return {version: commit for version, commit in versions if version}
 
 
 def _validate(api: "HfApi", card: str) -> None:
-    """Ask the Hub whether it takes `card`; a commit asks only once there is a repository to commit to."""
+    """Validate `card` on the Hub, before a repository is created for it."""
     from huggingface_hub import get_session, get_token, hf_raise_for_status  # noqa: PLC0415 - slow to import
 
     token = get_token()
@@ -147,8 +147,8 @@ def _validate(api: "HfApi", card: str) -> None:
 
 
 @contextmanager
-def _told(repo: str) -> Iterator["HfApi"]:
-    """Yield the Hub's interface, and turn what it raises into one line."""
+def _explained(repo: str) -> Iterator["HfApi"]:
+    """Yield the Hub's API; turn its exceptions into one-line messages."""
     from huggingface_hub import HfApi  # noqa: PLC0415 - slow to import
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError  # noqa: PLC0415 - slow to import
 
@@ -159,11 +159,11 @@ def _told(repo: str) -> Iterator["HfApi"]:
     except HfHubHTTPError as error:
         raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(error)}") from error
     except HFValidationError as error:
-        raise BadInputError(f"{repo} is no name of a repository on the Hub: {error}") from error
+        raise BadInputError(f"{repo} is not a valid repository name on the Hub: {error}") from error
     except ValueError as error:
-        raise BadInputError(f"{repo}: the Hugging Face Hub does not take this: {error}") from error
+        raise BadInputError(f"{repo}: the Hugging Face Hub rejects this: {error}") from error
     except Exception as error:
-        # Uploads fail with whatever their transfer raises, wrapped or not.
+        # A failed upload raises the exception of its transfer, wrapped or not.
         cause = error.__cause__ or error
         if isinstance(cause, HfHubHTTPError):
             raise SharingError(f"{repo} on the Hugging Face Hub: {_refusal(cause)}") from error

@@ -1,4 +1,4 @@
-"""How a dataset is opened, as the code that its card shows."""
+"""The section of a dataset card on loading the dataset."""
 
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
@@ -9,8 +9,8 @@ def loading(dataset: Dataset, source: str | None) -> str:
     """Return the card's section on loading: with lerobot, with datasets and with astra-data.
 
     Args:
-        dataset: which is to be opened.
-        source: where it is shared; None if it is nowhere but in a folder.
+        dataset: the one that the card describes.
+        source: where it is shared; None if it is only in a local folder.
     """
     name, tag = dataset.description["name"], f"data-{dataset.description['version']}"
     place = None if source is None else parse_source(source)[0]

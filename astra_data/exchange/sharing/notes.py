@@ -1,4 +1,4 @@
-"""What only a person can say about a dataset: a TOML file beside its card."""
+"""The part of a dataset card that a person writes, a TOML file."""
 
 from typing import Annotated
 
@@ -10,15 +10,15 @@ Text = Annotated[str, Field(min_length=1)]
 
 
 class Notes(Config):
-    """The human part of a dataset card; every text is Markdown and may be left out."""
+    """The hand-written part of a dataset card; every text is Markdown and optional."""
 
     license: Text = "unknown"
     """One of the Hub's identifiers, such as "apache-2.0"."""
     summary: str = ""
-    """What the dataset is: opens the card."""
+    """What the dataset is; shown at the top of the card."""
     behavior: str = ""
     """Who or what acts in it, and how."""
     intended_use: str = ""
-    """What it is good for."""
+    """What it is meant for."""
     limits: str = ""
-    """What it does not hold, and what it should not be used for."""
+    """What it does not contain, and what it should not be used for."""

@@ -1,4 +1,4 @@
-"""Fetch a version of a dataset; what was interrupted goes on where it stopped."""
+"""Download a version of a shared dataset; an interrupted download is continued."""
 
 import shutil
 from collections.abc import Mapping
@@ -24,21 +24,21 @@ from astra_data.exchange.sharing.urls import UrlStore
 def pull(
     source: str, *, out: Path | None = None, version: str | None = None, progress: Progress = silent
 ) -> Dataset:
-    """Fetch a version of the dataset at `source`; do nothing if it is there already.
+    """Download a version of the dataset at `source`; do nothing if it is there already.
 
-    Files that a pull has fetched before it was stopped are kept in a hidden folder beside the dataset's,
-    and the next pull goes on from them. The dataset appears when it is whole and its values are verified.
+    Files are downloaded to a hidden folder beside the dataset's, from which an interrupted pull continues.
+    The dataset appears there once it is complete and its values are verified.
 
     Args:
         source: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or the URL of the dataset's
             folder, whose last part is its name; "@data-1.2.0" after it names a version.
         out: the dataset's folder, by default its place at home.
         version: such as "1.2.0", by default the newest.
-        progress: is told how far it is.
+        progress: called with the fraction done.
 
     Raises:
         BadInputError: the source has no such version, or the folder holds something else.
-        SharingError: the source cannot be reached, refuses, or is not to be trusted.
+        SharingError: the source cannot be reached, denies access, or is not a valid dataset.
 
     Example:
         >>> from pathlib import Path
@@ -65,7 +65,7 @@ def pull(
     description = remote.description()
     name, called = description.get("name"), description.get("version")
     if not isinstance(name, str) or not NAME.fullmatch(name) or called != str(chosen):
-        raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it is not to be trusted.")
+        raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it cannot be trusted.")
     target = place(description) if out is None else out
     if target.exists():
         return _present(target, description)
@@ -112,17 +112,17 @@ def _present(target: Path, description: Mapping[str, Any]) -> Dataset:
 
 
 def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], name: str) -> None:
-    """Refuse what was fetched unless it is the whole dataset; what others wrote may be anything."""
+    """Check that the downloaded files are the complete dataset; they may have been written by anybody."""
     try:
         dataset = Dataset.open(folder)
         faults = dataset.verify()
         outside = [str(path) for path in dataset.paths if path.relative_to(folder).as_posix() not in sums]
         if dataset.content_hash != description.get("content_hash"):
-            faults.append("its description changed while it was fetched")
+            faults.append("its description changed during the download")
     except Exception as error:
         shutil.rmtree(folder)
-        raise SharingError(f"{name} is no whole dataset: {error}") from error
+        raise SharingError(f"{name} is not a complete dataset: {error}") from error
     faults += [f"{path} does not belong to it" for path in outside]
     if faults:
         shutil.rmtree(folder)
-        raise SharingError(f"{name} is no whole dataset: {'; '.join(faults)}.")
+        raise SharingError(f"{name} is not a complete dataset: {'; '.join(faults)}.")

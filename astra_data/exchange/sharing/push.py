@@ -25,25 +25,25 @@ def push(
     private: bool = False,
     progress: Progress = silent,
 ) -> str:
-    """Send `dataset` to `destination`, with its card; do nothing if it is there already.
+    """Upload `dataset` with its card to `destination`; do nothing if it is there already.
 
     Args:
         dataset: a folder, name@data-1.2.0, or name for the newest at home.
         destination: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or any URL that fsspec
             knows, below which <name>/data-<version>/ is made.
-        notes: TOML file with the human part of the card, see `Notes`.
-        private: whether the repository on the Hub is private: one that is made is, a public one is refused.
-        progress: is told how far it is.
+        notes: TOML file with the hand-written part of the card, see `Notes`.
+        private: create the repository on the Hub as private, and refuse one that is public.
+        progress: called with the fraction done.
 
     Returns:
-        where `pull` finds it, with its version.
+        the source from which `pull` downloads it, with its version.
 
     Raises:
         BadInputError: there is no such dataset, the place holds something else under this version, the
-            Hub does not take the card, or a repository that is to be private is public.
+            Hub rejects the card, or a repository that should be private is public.
         CorruptDatasetError: the dataset is incomplete or was altered.
-        RecipeError: the notes are not what they should be.
-        SharingError: the place refuses or cannot be reached.
+        RecipeError: the notes have faults.
+        SharingError: the place denies access or cannot be reached.
 
     Example:
         >>> from astra_data import push
@@ -54,7 +54,9 @@ def push(
     place = parse_place(destination)
     written = load_recipe(notes, Notes) if notes else Notes()
     if private and isinstance(place, Url):
-        raise BadInputError(f"{place}: private is for the Hugging Face Hub; elsewhere the storage decides.")
+        raise BadInputError(
+            f"{place}: private is for the Hugging Face Hub; elsewhere, set the permissions of the storage."
+        )
     faults = local.verify()
     if faults:
         raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")

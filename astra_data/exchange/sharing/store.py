@@ -1,4 +1,4 @@
-"""What every place offers where datasets are shared."""
+"""Interface of the places where datasets are shared."""
 
 import json
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class RemoteFolder:
     Attributes:
         filesystem: an fsspec file system.
         path: of the folder in it.
-        name: of the version, for people.
+        name: of the version, for messages.
     """
 
     filesystem: Any
@@ -37,8 +37,8 @@ class RemoteFolder:
         except FileNotFoundError as error:
             raise SharingError(f"{self.name} has no {path}: it was not pushed by astra-data.") from error
         except Exception as error:
-            told = f"{type(error).__name__}: {error}"
-            raise SharingError(f"{self.name}: {path} cannot be read ({told}).") from error
+            cause = f"{type(error).__name__}: {error}"
+            raise SharingError(f"{self.name}: {path} cannot be read ({cause}).") from error
 
     def description(self) -> dict[str, Any]:
         """Return meta/astra/dataset.json.
@@ -50,23 +50,25 @@ class RemoteFolder:
         try:
             return dict(json.loads(text))
         except (TypeError, ValueError) as error:
-            raise SharingError(f"{self.name}: {layout.DATASET_PATH} is no JSON object ({error}).") from error
+            raise SharingError(
+                f"{self.name}: {layout.DATASET_PATH} is not a JSON object ({error})."
+            ) from error
 
 
 class Store(Protocol):
     """A place that holds the versions of one dataset."""
 
     def versions(self) -> list[Version]:
-        """Return the versions that are there whole, the oldest first."""
+        """Return the complete versions, the oldest first."""
 
     def folder(self, version: Version) -> RemoteFolder:
-        """Return where the files of `version` are read."""
+        """Return the folder with the files of `version`."""
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Add `dataset` as a new version; it counts as there once everything is.
+        """Upload `dataset` as a new version, which is listed once it is complete.
 
         Args:
-            dataset: whole and verified.
+            dataset: complete and verified.
             card: a folder with SHA256SUMS, README.md and perhaps its figure.
-            progress: is told how far it is.
+            progress: called with the fraction done.
         """

@@ -1,4 +1,4 @@
-"""SHA256SUMS: which files a shared dataset has, and what each of them holds; `sha256sum -c` reads it too."""
+"""SHA256SUMS: the files of a shared dataset and their checksums, in the format of `sha256sum`."""
 
 import re
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from astra_data.core.errors import SharingError
 SUMS_PATH = "SHA256SUMS"
 
 _PATH = re.compile(r"(data|meta)(/[A-Za-z0-9_][A-Za-z0-9._=-]*)+")
-"""Every file of a dataset; no such path leaves the folder that it is joined to."""
+"""Paths of the files of a dataset; none of them leads out of its folder."""
 
 _LINE = re.compile(r"(?P<digest>[0-9a-f]{64}) [ *](?P<path>.+)")
 
@@ -30,15 +30,15 @@ def parse_sums(text: str, source: str) -> Mapping[str, str]:
     """Read SHA256SUMS: file path to sha256.
 
     Raises:
-        SharingError: a line is none, or a path is not one of a dataset, such as one that leads out of the
-            folder; lists every fault.
+        SharingError: a line is malformed, or a path is not one of a dataset, such as one that leads out of
+            the folder; lists every fault.
     """
     sums: dict[str, str] = {}
     faults = []
     for number, line in enumerate(text.splitlines(), start=1):
         found = _LINE.fullmatch(line)
         if not found:
-            faults.append(f"line {number} is no sha256 with a path")
+            faults.append(f"line {number} is not a sha256 with a path")
         elif not _PATH.fullmatch(found["path"]):
             faults.append(f"line {number} has the path {found['path']!r}, expected one within data/ or meta/")
         elif found["path"] in sums:
@@ -49,6 +49,6 @@ def parse_sums(text: str, source: str) -> Mapping[str, str]:
     faults += [f"{path} is listed as a file and as a folder" for path in sums if path in folders]
     if faults:
         raise SharingError(
-            f"{source}: {SUMS_PATH} is not to be trusted: {'; '.join(faults)}. Nothing was fetched."
+            f"{source}: {SUMS_PATH} cannot be trusted: {'; '.join(faults)}. Nothing was downloaded."
         )
     return sums

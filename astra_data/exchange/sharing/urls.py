@@ -14,36 +14,38 @@ from astra_data.exchange.sharing.store import RemoteFolder
 from astra_data.exchange.sharing.sums import SUMS_PATH, dataset_files
 
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
-"""Which extra of this package reads which URLs."""
+"""Protocol → the extra of this package that is needed for it."""
 
 
 class UrlStore:
-    """The versions of one dataset below a URL; a version is there once its `layout.DATASET_PATH` is."""
+    """The versions of one dataset below a URL; a version counts once its `layout.DATASET_PATH` exists."""
 
     def __init__(self, url: str) -> None:
         """Take the folder `url`, whose last part is the dataset's name.
 
         Raises:
-            BadInputError: nothing installed reads such a URL.
+            BadInputError: no installed package handles such a URL.
         """
         import fsspec  # noqa: PLC0415 - slow to import
 
         self._url = url
         protocol = url.partition("://")[0].lower()
         options = {"auto_mkdir": True} if protocol in ("file", "local") else {}
-        with _told(url):
+        with _explained(url):
             try:
                 self._filesystem, self._path = fsspec.core.url_to_fs(url, **options)
             except ImportError as error:
                 extra = EXTRAS.get(protocol)
                 how = cure(extra) if extra else error
-                raise BadInputError(f"{url}: what reads {protocol}:// is not installed: {how}") from error
+                raise BadInputError(
+                    f"{url}: the package for {protocol}:// is not installed: {how}"
+                ) from error
             except ValueError as error:
                 raise BadInputError(f"{url}: {error}; expected a URL such as s3://bucket/folder") from error
 
     def versions(self) -> list[Version]:
-        """Return the versions that are there whole, the oldest first."""
-        with _told(self._url):
+        """Return the complete versions, the oldest first."""
+        with _explained(self._url):
             self._filesystem.invalidate_cache()
             try:
                 found = self._filesystem.ls(self._path, detail=False)
@@ -54,18 +56,18 @@ class UrlStore:
             return sorted(version for version in versions if self._filesystem.exists(self._mark(version)))
 
     def folder(self, version: Version) -> RemoteFolder:
-        """Return where the files of `version` are read."""
+        """Return the folder with the files of `version`."""
         return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self._url}/{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Add `dataset`: `layout.DATASET_PATH` is written last and marks it as whole.
+        """Upload `dataset`: `layout.DATASET_PATH` is written last and marks it as complete.
 
-        SHA256SUMS is written first and says whose folder it is: an upload that was stopped is gone over
-        again by the next one of the same files, and nothing that is there is ever deleted.
+        SHA256SUMS is written first and identifies the upload: the next push of the same files repeats an
+        interrupted one, and no existing file is ever deleted.
 
         Raises:
             BadInputError: the folder holds other files.
-            SharingError: the place refuses or cannot be reached.
+            SharingError: the place denies access or cannot be reached.
         """
         version = Version.parse(dataset.description["version"])
         remote = self.folder(version)
@@ -73,12 +75,12 @@ class UrlStore:
         files = {path: dataset.root / path for path in dataset_files(dataset.root)}
         files |= {path.name: path for path in sorted(card.iterdir()) if path != sums}
         files[layout.DATASET_PATH] = files.pop(layout.DATASET_PATH)
-        with _told(self._url):
+        with _explained(self._url):
             self._filesystem.invalidate_cache()
             if not self._filesystem.find(remote.path):
                 self._filesystem.put_file(str(sums), f"{remote.path}/{SUMS_PATH}")
             for number, (path, file) in enumerate(files.items()):
-                # Each time anew: a push of other values may have begun at the same moment.
+                # Checked before every file: a push of other values may have begun at the same time.
                 self._refuse_others(remote, sums.read_bytes())
                 progress(number / len(files), path)
                 self._filesystem.put_file(str(file), f"{remote.path}/{path}")
@@ -101,8 +103,8 @@ class UrlStore:
 
 
 @contextmanager
-def _told(url: str) -> Iterator[None]:
-    """Turn what a back end raises into one line; each of them has its own kinds of errors."""
+def _explained(url: str) -> Iterator[None]:
+    """Turn the exceptions of a back end, each of which has its own, into one-line messages."""
     try:
         yield
     except AstraDataError:

@@ -53,8 +53,8 @@ def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
     apart = Dataset.open(tmp_path / "set")
     with pytest.raises(BadInputError, match="a next state is not the state of the next step"):
         export(apart, tmp_path / "random-v0", format="minari")
-    with pytest.raises(BadInputError, match="no id of Minari"):
+    with pytest.raises(BadInputError, match="not a Minari id"):
         export(apart, tmp_path / "no id!", format="minari")
-    with pytest.raises(BadInputError, match="no id of Minari; end --out with a name and a version"):
+    with pytest.raises(BadInputError, match="not a Minari id; end --out with a name and a version"):
         export(apart, tmp_path / "without-version", format="minari")
     assert [path.name for path in tmp_path.iterdir()] == ["set"]

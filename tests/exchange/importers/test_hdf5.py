@@ -157,7 +157,7 @@ def test_groups_that_are_links_are_refused(tmp_path: Path, link: object, place: 
             if place == "runs/two":
                 file[f"runs/one/{name}"] = values
         file[place] = link
-    with pytest.raises(BadInputError, match=f"log.h5/{place} is a link; copy what it names into its place"):
+    with pytest.raises(BadInputError, match=f"log.h5/{place} is a link; replace it by a copy of its target"):
         imported(tmp_path, tmp_path / "log.h5", 'episodes = "runs/*"\n' + MAPPING)
     assert not (tmp_path / "out").exists()
 

@@ -54,8 +54,8 @@ def test_time_far_apart_costs_nothing(tmp_path: Path) -> None:
     ("change", "told"),
     [
         (("/command:turn", "/comand:turn"), r"no topic '/comand': did you mean '/command'"),
-        (("/command:turn", "/command:turns"), "'/command:turns' is no number"),
-        (("/pose:joints", "/pose:position"), "'/pose:position' is no number"),
+        (("/command:turn", "/command:turns"), "'/command:turns' is neither a number"),
+        (("/pose:joints", "/pose:position"), "'/pose:position' is neither a number"),
         (("/pose:joints", "joints"), "'joints', expected '/topic:path.in.message'"),
         (("gap_s = 0.35", ""), "split.gap_s is missing"),
         (("fps = 10", 'fps = 10\ntime = "/pose:t"'), "time: leave it out"),

@@ -74,5 +74,5 @@ def test_another_content_than_listed_is_refused_and_not_kept(remote: RemoteFolde
 
 
 def test_a_file_that_is_not_there_is_told(remote: RemoteFolder, tmp_path: Path) -> None:
-    with pytest.raises(SharingError, match=r"data/none cannot be fetched \(FileNotFoundError.*run the same"):
+    with pytest.raises(SharingError, match=r"data/none cannot be downloaded \(FileNotFoundError.*run"):
         fetch(remote, "data/none", tmp_path / "here", DIGEST)

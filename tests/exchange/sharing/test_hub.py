@@ -149,9 +149,9 @@ def test_a_repository_that_does_not_exist_is_told(hub: Hub) -> None:
 
 def test_a_name_that_the_hub_does_not_take_is_told(hub: Hub, fake: Dataset) -> None:
     for name in ("me/a--b", "me/it.git"):
-        with pytest.raises(BadInputError, match="is no name of a repository"):
+        with pytest.raises(BadInputError, match="is not a valid repository name"):
             push(fake.root, name)
-        with pytest.raises(BadInputError, match="is no name of a repository"):
+        with pytest.raises(BadInputError, match="is not a valid repository name"):
             pull(name)
 
 
@@ -170,7 +170,7 @@ def test_an_upload_that_breaks_off_is_told(hub: Hub, fake: Dataset) -> None:
 
 def test_a_card_that_the_hub_refuses_is_told(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
     (tmp_path / "notes.toml").write_text('license = "none-such"\n')
-    with pytest.raises(BadInputError, match=r'does not take this: (.|\n)*"license" must be one of a list'):
+    with pytest.raises(BadInputError, match=r'rejects this: (.|\n)*"license" must be one of a list'):
         push(fake.root, "me/it", notes=tmp_path / "notes.toml")
     assert not hub.repos
     push(fake.root, "me/it")

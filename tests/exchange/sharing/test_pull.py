@@ -132,7 +132,7 @@ def test_a_damaged_file_is_told_and_not_kept(fake: Dataset, shared: Path, tmp_pa
 
 def test_a_missing_file_is_told(shared: Path, tmp_path: Path) -> None:
     (shared / DATA).unlink()
-    with pytest.raises(SharingError, match=f"{DATA} cannot be fetched .*run the same command again"):
+    with pytest.raises(SharingError, match=f"{DATA} cannot be downloaded .*run the same command again"):
         pull(source(shared), out=tmp_path / "out")
 
 
@@ -142,7 +142,7 @@ def test_a_listing_that_leads_out_of_the_folder_fetches_nothing(shared: Path, tm
     sums = (shared / "SHA256SUMS").read_text()
     for path in ("data/../../prey", "/etc/passwd", "../prey"):
         (shared / "SHA256SUMS").write_text(f"{sums}{digest}  {path}\n")
-        with pytest.raises(SharingError, match=r"not to be trusted.*Nothing was fetched"):
+        with pytest.raises(SharingError, match=r"cannot be trusted.*Nothing was downloaded"):
             pull(source(shared), out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert not hidden(tmp_path / "out")
@@ -177,7 +177,7 @@ def test_what_is_no_whole_dataset_is_refused(
     content = json.loads((shared / path).read_text()) | change
     (shared / path).write_text(json.dumps(content))
     resign(shared)
-    with pytest.raises(SharingError, match="is no whole dataset"):
+    with pytest.raises(SharingError, match="is not a complete dataset"):
         pull(source(shared), out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert not hidden(tmp_path / "out")

@@ -31,7 +31,7 @@ def test_a_description_that_is_no_object_is_told(
     folder: RemoteFolder, tmp_path: Path, content: bytes
 ) -> None:
     (tmp_path / "meta/astra/dataset.json").write_bytes(content)
-    with pytest.raises(SharingError, match=r"dataset\.json is no JSON object"):
+    with pytest.raises(SharingError, match=r"dataset\.json is not a JSON object"):
         folder.description()
 
 
