@@ -65,7 +65,8 @@ def real(values: Tensor) -> Tensor:
 
 def latents(used: GroundingModel) -> Tensor:
     given = windows()
-    return used.encoder(used.encoder_input(given.state, given.goal, given.previous_action))[0]
+    latent: Tensor = used.encoder(used.encoder_input(given.state, given.goal, given.previous_action))[0]
+    return latent
 
 
 def test_scales_are_means_and_deviations_of_the_columns() -> None:

@@ -52,9 +52,9 @@ def test_a_step_is_that_of_a_gru_written_out(encoder: HistoryEncoder) -> None:
     inputs, hidden = torch.randn(3, 5), torch.randn(3, 32)
     embedded = inputs @ encoder.embedding.weight.T + encoder.embedding.bias
     embedded = torch.where(embedded > 0, embedded, embedded.exp() - 1.0)
-    gru = encoder.recurrence
-    of_input = (embedded @ gru.weight_ih_l0.T + gru.bias_ih_l0).split(32, dim=-1)
-    of_hidden = (hidden @ gru.weight_hh_l0.T + gru.bias_hh_l0).split(32, dim=-1)
+    gru = dict(encoder.recurrence.named_parameters())
+    of_input = (embedded @ gru["weight_ih_l0"].T + gru["bias_ih_l0"]).split(32, dim=-1)
+    of_hidden = (hidden @ gru["weight_hh_l0"].T + gru["bias_hh_l0"]).split(32, dim=-1)
     reset, update = ((of_input[i] + of_hidden[i]).sigmoid() for i in (0, 1))
     candidate = torch.tanh(of_input[2] + reset * of_hidden[2])
     expected = (1.0 - update) * candidate + update * hidden

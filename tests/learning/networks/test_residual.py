@@ -59,8 +59,9 @@ def test_a_correction_is_that_of_an_lstm_written_out() -> None:
     normal = [(one[:, 0] - net.state_mean) / net.state_std for one in (state, simulated)]
     embedded = net.embedding(torch.cat([normal[0], action[:, 0], normal[1]], dim=-1))
     embedded = torch.where(embedded > 0, embedded, 0.01 * embedded)
-    lstm = net.recurrence
-    gates = embedded @ lstm.weight_ih_l0.T + lstm.bias_ih_l0 + hidden @ lstm.weight_hh_l0.T + lstm.bias_hh_l0
+    lstm = dict(net.recurrence.named_parameters())
+    gates = embedded @ lstm["weight_ih_l0"].T + hidden @ lstm["weight_hh_l0"].T
+    gates = gates + lstm["bias_ih_l0"] + lstm["bias_hh_l0"]
     let_in, forget, candidate, out = gates.split(8, dim=-1)
     cell = forget.sigmoid() * cell + let_in.sigmoid() * candidate.tanh()
     hidden = out.sigmoid() * cell.tanh()
