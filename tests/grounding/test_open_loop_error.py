@@ -1,11 +1,12 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.open_loop_error import distances, gap_report
+from astra_data.grounding.open_loop_error import _interval, distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.worlds.registry import TASKS
@@ -78,3 +79,65 @@ def test_a_constant_correction_closes_a_constant_gap() -> None:
     report = gap_report(TASK, grounding, one, seed=0)
     assert report["raw"]["position_m"]["mean"][-1] > 0.5
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=2e-3)
+
+
+def test_replays_that_run_into_padding_do_not_count() -> None:
+    """Episodes of 60, 60 and 40 steps; in the padding the target is far away."""
+    given = episodes(speed=0.9)
+    far = given.windows.next_state + 1e3 * (1.0 - given.windows.mask).unsqueeze(-1)
+    spoiled = replace(given, windows=replace(given.windows, next_state=far))
+    report = gap_report(TASK, untrained(), spoiled, seed=0)
+    assert report == gap_report(TASK, untrained(), given, seed=0)
+    # After 10 steps all replays count, also those from step 25 of the short episode; after 50, two.
+    speeds = [3 * 0.5, 3 * 0.8, 2 * 1.0]
+    expected = 0.1 * sum(speeds) / 8 * 10 * TASK.timestep_s
+    assert report["raw"]["position_m"]["mean"][1] == pytest.approx(expected, rel=0.01)
+    assert report["raw"]["position_m"]["high"][2] < 1.0
+
+
+def test_the_last_real_step_counts_and_the_one_after_does_not() -> None:
+    given = episodes(speed=0.9)
+    mask = torch.zeros(3, STEPS)
+    mask[0, :50], mask[1, :49], mask[2, :10] = 1.0, 1.0, 1.0
+    cut = replace(given, windows=replace(given.windows, mask=mask))
+    raw = gap_report(TASK, untrained(), cut, seed=0)["raw"]["position_m"]
+    # 50 steps fit into the first episode alone: the mean over one replay, without any spread.
+    assert raw["mean"][2] == pytest.approx(0.1 * 0.5 * 50 * TASK.timestep_s, rel=0.01)
+    assert raw["low"][2] == raw["mean"][2] == raw["high"][2]
+
+
+def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
+    torch.manual_seed(0)
+    errors, episode = torch.rand(400, dtype=torch.float64), torch.arange(400)
+    mean, low, high = _interval(errors, episode, np.random.default_rng(0))
+    assert mean == pytest.approx(float(errors.mean()))
+    error = float(errors.std()) / 400**0.5
+    assert (mean - low, high - mean) == pytest.approx((1.96 * error, 1.96 * error), rel=0.15)
+    # What repeats within an episode tells nothing new.
+    again = _interval(errors.repeat(5), episode.repeat(5), np.random.default_rng(0))
+    assert again == pytest.approx((mean, low, high))
+
+
+def test_a_grounding_starts_with_the_history_before_each_replay() -> None:
+    """Its correction is the action before the last: open loop it depends on the memory at the start."""
+    torch.manual_seed(0)
+    grounding, given = untrained(), episodes(speed=0.9)
+    for head in grounding.model.corrections:
+        torch.nn.init.normal_(list(head.parameters())[-2], std=0.2)
+    action = 2 * torch.rand(3, STEPS, 2) - 1
+    previous = torch.cat([torch.zeros(3, 1, 2), action[:, :-1]], dim=1)
+    goal = torch.randn(3, 1, 2).expand(3, STEPS, 2)
+    changed = replace(given.windows, action=action, previous_action=previous, goal=goal)
+    given = replace(given, windows=changed)
+    windows, model = given.windows, grounding.model.requires_grad_(False)
+    report = gap_report(TASK, grounding, given, seed=0)
+    latent, _ = model.encode(windows)
+    simulator = TASK.simulator(3 * STEPS)
+    simulator.reset_to(windows.state.reshape(-1, 4))
+    landed = simulator.step(windows.action.reshape(-1, 2)).reshape(3, STEPS, 4)
+    corrected = model.correct(latent, windows.action, landed)
+    wrong = distances(TASK, corrected - windows.next_state)[:, ::25]
+    # Replays from steps 0, 25 and 50; the third episode ends after 40.
+    expected = torch.cat([wrong[0], wrong[1], wrong[2, :2]]).mean(0)
+    for index, quantity in enumerate(TASK.quantities):
+        assert report["grounded"][quantity]["mean"][0] == pytest.approx(float(expected[index]), rel=1e-3)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures
+from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures, mlp
 
 
 @pytest.fixture
@@ -45,3 +45,35 @@ def test_position_features_have_halving_wavelengths() -> None:
     phases = [2 * math.pi * place / wavelength for place in (1.5, -2.0) for wavelength in (16, 8, 4)]
     assert len(values) == features.size == 12
     assert values == pytest.approx([math.sin(p) for p in phases] + [math.cos(p) for p in phases], abs=1e-6)
+
+
+def test_a_step_is_that_of_a_gru_written_out(encoder: HistoryEncoder) -> None:
+    """Cho et al. 2014: gates r and z, candidate n, h' = (1 - z) n + z h; the input is embedded with ELU."""
+    inputs, hidden = torch.randn(3, 5), torch.randn(3, 32)
+    embedded = inputs @ encoder.embedding.weight.T + encoder.embedding.bias
+    embedded = torch.where(embedded > 0, embedded, embedded.exp() - 1.0)
+    gru = dict(encoder.recurrence.named_parameters())
+    of_input = (embedded @ gru["weight_ih_l0"].T + gru["bias_ih_l0"]).split(32, dim=-1)
+    of_hidden = (hidden @ gru["weight_hh_l0"].T + gru["bias_hh_l0"]).split(32, dim=-1)
+    reset, update = ((of_input[i] + of_hidden[i]).sigmoid() for i in (0, 1))
+    candidate = torch.tanh(of_input[2] + reset * of_hidden[2])
+    expected = (1.0 - update) * candidate + update * hidden
+    torch.testing.assert_close(encoder.step(inputs, hidden), expected, atol=1e-6, rtol=1e-5)
+
+
+def test_episodes_in_one_sequence_do_not_touch(encoder: HistoryEncoder) -> None:
+    inputs, hidden, start = torch.randn(2, 6, 5), torch.randn(2, 32), torch.zeros(2, 6)
+    start[0, 4] = start[1, 0] = 1.0
+    states = encoder.through_episodes(inputs, hidden, start)
+    torch.testing.assert_close(states[:1, :4], encoder(inputs[:1, :4], hidden[:1])[1])
+    torch.testing.assert_close(states[:1, 4:], encoder(inputs[:1, 4:])[1])
+    torch.testing.assert_close(states[1:], encoder(inputs[1:])[1])
+
+
+def test_an_mlp_has_activations_between_its_layers_alone() -> None:
+    network = mlp((3, 4, 5, 2), torch.nn.ReLU)
+    assert [type(layer).__name__ for layer in network] == ["Linear", "ReLU", "Linear", "ReLU", "Linear"]
+    sizes = [
+        (layer.in_features, layer.out_features) for layer in network if isinstance(layer, torch.nn.Linear)
+    ]
+    assert sizes == [(3, 4), (4, 5), (5, 2)]

@@ -1,0 +1,111 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_episodes import toy_episodes
+
+from astra_data.grounding.diagnostics import correction_r2, telemetry
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
+
+WEIGHTS = LossWeights()
+
+
+def episodes() -> PairedEpisodes:
+    """Return four episodes of 12 steps; the last has only 7, and other numbers in its padding."""
+    torch.manual_seed(0)
+    state, error = torch.randn(4, 12, 4), 0.1 * torch.randn(4, 12, 4)
+    mask = torch.ones(4, 12)
+    mask[3, 7:] = 0.0
+    failing = torch.zeros(4, 12)
+    failing[0, -1], failing[3, 6] = -10.0, -6.0
+    reward = torch.randn(4, 12) * (failing == 0)
+    spoiled = 1e3 * (1.0 - mask).unsqueeze(-1)
+    return toy_episodes(
+        state,
+        torch.randn(4, 12, 2),
+        next_state=state + error + spoiled,
+        simulated_next=state,
+        goal=torch.randn(4, 12, 2),
+        mask=mask,
+        parts=torch.stack([reward, failing], dim=-1) + spoiled * torch.tensor([1.0, 0.0]),
+    )
+
+
+def model(given: PairedEpisodes) -> GroundingModel:
+    torch.manual_seed(1)
+    made = GroundingModel(GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,), position_octaves=0))
+    made.set_reward_scales(given.steps(given.windows.reward))
+    with torch.no_grad():
+        list(made.corrections.parameters())[-2].normal_(std=0.05)
+    return made.requires_grad_(False)
+
+
+def r2(predicted: torch.Tensor, true: torch.Tensor) -> float:
+    return float(1.0 - (predicted - true).square().sum() / (true - true.mean(0)).square().sum())
+
+
+def test_shares_of_variance_are_those_of_real_steps() -> None:
+    given = episodes()
+    used, windows, real = model(given), given.windows, given.windows.mask.bool()
+    figures = telemetry(used, given, WEIGHTS)
+    latent, _ = used.encode(windows)
+    parts = used.predict_reward_parts(latent, windows.action)[real]
+    reward, failing = windows.reward[real].unbind(-1)
+    fails = failing != 0
+    assert figures["r2_reward"] == pytest.approx(r2(parts[~fails, 0], reward[~fails]), rel=1e-4)
+    # A failure counts for its mean cost, whatever it cost by itself.
+    mean_cost = (-10.0 - 6.0) / 2 - float(used.reward_mean)
+    assert figures["r2_final_reward"] == pytest.approx(r2(parts[:, 1], fails * mean_cost), rel=1e-4)
+    mean, _ = used.predict_latent(latent[:, :-1], windows.action[:, :-1])
+    both = real[:, 1:]
+    assert figures["r2_latent"] == pytest.approx(r2(mean[both], latent[:, 1:][both]), rel=1e-4)
+    corrected = used.correct(latent, windows.action, windows.simulated_next)
+    assert figures["r2_state"] == correction_r2(corrected, windows, used.correction_std)
+
+
+def test_only_heads_that_are_trained_are_told_of() -> None:
+    given = episodes()
+    always = {"r2_state", "latent_std", "latent_rank"}
+    nas = telemetry(model(given), given, LossWeights(latent=0.0, reward=0.0))
+    assert nas.keys() == always
+    assert telemetry(model(given), given, LossWeights(latent=0.0)).keys() == always | {
+        "r2_reward",
+        "r2_final_reward",
+    }
+    assert telemetry(model(given), given, LossWeights(reward=0.0)).keys() == always | {"r2_latent"}
+
+
+def test_the_latents_spread_and_rank() -> None:
+    given = episodes()
+    used = model(given)
+    samples = used.encode(given.windows)[0][given.windows.mask.bool()]
+    figures = telemetry(used, given, WEIGHTS)
+    assert figures["latent_std"] == pytest.approx(float(samples.std(0).mean()), rel=1e-5)
+    shares = torch.linalg.svdvals(samples - samples.mean(0)).square()
+    shares = shares / shares.sum()
+    rank = float((-(shares * shares.clamp_min(1e-30).log()).sum()).exp())
+    assert figures["latent_rank"] == pytest.approx(rank, rel=1e-3)
+    assert 1.0 < rank < 6.0
+
+
+def test_a_correction_explains_what_it_removes_of_the_squared_error() -> None:
+    given = episodes()
+    windows, std = given.windows, torch.tensor([1.0, 2.0, 0.5, 1.0])
+    error = windows.next_state - windows.simulated_next
+    assert correction_r2(windows.next_state, windows, std) == pytest.approx(1.0)
+    assert correction_r2(windows.simulated_next, windows, std) == pytest.approx(0.0, abs=1e-6)
+    half = windows.simulated_next + 0.5 * error
+    assert correction_r2(half, windows, std) == pytest.approx(0.75, abs=1e-5)
+    twice = windows.simulated_next - error
+    assert correction_r2(twice, windows, std) == pytest.approx(-3.0, abs=1e-4)
+    # Entries count in units of their own deviation.
+    first = windows.simulated_next + error * torch.tensor([1.0, 0.0, 0.0, 0.0])
+    shares = (given.steps(error) / std).square().sum(0)
+    assert correction_r2(first, windows, std) == pytest.approx(float(shares[0] / shares.sum()), rel=1e-4)
+
+
+def test_a_perfect_simulator_leaves_nothing_to_explain() -> None:
+    given = episodes()
+    windows = replace(given.windows, simulated_next=given.windows.next_state)
+    assert correction_r2(windows.next_state + 1.0, windows, torch.ones(4)) is None
