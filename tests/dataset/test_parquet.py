@@ -7,6 +7,7 @@ import pytest
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import parquet
+from astra_data.dataset.columns import Array
 from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_lists, to_numpy
 
 
@@ -20,7 +21,7 @@ from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to
         (np.array([[True, False], [False, False]]), pa.list_(pa.bool_(), 2)),
     ],
 )
-def test_values_go_to_arrow_and_back(values: np.ndarray, kind: pa.DataType) -> None:
+def test_values_go_to_arrow_and_back(values: Array, kind: pa.DataType) -> None:
     column = to_arrow(values, kind)
     assert (column.type, column.to_pylist()) == (kind, values.tolist())
     chunks = pa.chunked_array([column[:1], column[1:]])
