@@ -180,7 +180,7 @@ class Dataset(Contents):
     def verify(self) -> list[str]:
         """Read every value again and compare the content hash; return what is wrong, empty if nothing is.
 
-        The hash covers every column, LeRobot's own included. `doctor.check` tells which value is wrong.
+        The hash covers every column, LeRobot's own included. `doctor.check` finds the wrong value.
         """
         running = ContentHash()
         try:

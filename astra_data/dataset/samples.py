@@ -56,7 +56,7 @@ class Samples(data.Dataset[Batch]):
 
 
 class Order:
-    """Indices of `count` samples, batch by batch, shuffled anew each epoch.
+    """Indices of `count` samples, batch by batch, reshuffled each epoch.
 
     An epoch's order depends on (seed, epoch) alone. Iterating yields the batches (B,) that are left of the
     current epoch; the next iteration continues from there. An `Order` also serves a `DataLoader` as

@@ -1,10 +1,6 @@
 """What we write, seen by lerobot: its loader opens it, and the constants that we repeat are its own."""
 
 import json
-import warnings
-from collections.abc import Iterator
-from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,26 +19,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::F
 
 
 @pytest.fixture(scope="module")
-def lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
-    """The modules of lerobot that the tests need, with a cache of their own and no network."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("HF_HUB_OFFLINE", "1")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        modules = SimpleNamespace(
-            package=import_module("lerobot.datasets"),
-            features=import_module("lerobot.datasets.feature_utils"),
-            dataset=import_module("lerobot.datasets.lerobot_dataset"),
-            files=import_module("lerobot.datasets.utils"),
-            names=import_module("lerobot.utils.constants"),
-        )
-    cache = tmp_path_factory.mktemp("cache")
-    patch.setattr(import_module("datasets").config, "HF_DATASETS_CACHE", cache)
-    yield modules
-    patch.undo()
-
-
-@pytest.fixture(scope="module")
 def reference(lerobot: SimpleNamespace, fake: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same values, written by lerobot itself."""
     root = tmp_path_factory.mktemp("reference") / "set"
@@ -56,36 +32,6 @@ def reference(lerobot: SimpleNamespace, fake: Dataset, tmp_path_factory: pytest.
         written.save_episode()
     written.finalize()
     return root
-
-
-def test_constants_are_lerobots(lerobot: SimpleNamespace) -> None:
-    files = lerobot.files
-    assert layout.CODEBASE_VERSION == lerobot.package.CODEBASE_VERSION
-    assert layout.CHUNK_SIZE == files.DEFAULT_CHUNK_SIZE
-    assert layout.DATA_FILE_SIZE_MB == files.DEFAULT_DATA_FILE_SIZE_IN_MB
-    assert layout.VIDEO_FILE_SIZE_MB == files.DEFAULT_VIDEO_FILE_SIZE_IN_MB
-    assert (layout.INFO_PATH, layout.STATS_PATH) == (files.INFO_PATH, files.STATS_PATH)
-    assert layout.TASKS_PATH == files.DEFAULT_TASKS_PATH
-    assert layout.EPISODES_PATH == files.DEFAULT_EPISODES_PATH
-    assert layout.DATA_PATH == files.DEFAULT_DATA_PATH
-    assert list(layout.QUANTILES) == lerobot.package.DEFAULT_QUANTILES
-    defaults = {c.name: c.feature() | {"shape": (c.size,)} for c in layout.DEFAULT_COLUMNS}
-    assert defaults == lerobot.names.DEFAULT_FEATURES
-
-
-def test_the_arrow_schema_is_lerobots(lerobot: SimpleNamespace) -> None:
-    stored = layout.stored_columns(COLUMNS)
-    features = {column.name: column.feature() | {"shape": (column.size,)} for column in stored}
-    expected = lerobot.features.get_hf_features_from_features(features).arrow_schema
-    ours = layout.data_schema(stored)
-    assert ours.remove_metadata().equals(expected.remove_metadata())
-    assert json.loads(ours.metadata[b"huggingface"]) == json.loads(expected.metadata[b"huggingface"])
-
-
-def test_info_has_lerobots_fields(lerobot: SimpleNamespace, fake: Dataset) -> None:
-    info = lerobot.files.DatasetInfo.from_dict(json.loads((fake.root / "meta/info.json").read_text()))
-    assert info.to_dict() == fake.info
-    assert set(asdict(info)) - set(fake.info) == {"tools"}
 
 
 def test_files_equal_those_that_lerobot_writes(fake: Dataset, reference: Path) -> None:

@@ -1,14 +1,13 @@
 import itertools
-import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from damaged import truncate
 from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -115,68 +114,6 @@ def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="no dataset there"):
         Dataset.open(tmp_path / "typo")
-
-
-def truncate(name: str) -> Callable[[Path], object]:
-    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-20])
-
-
-def edit(name: str, **changes: object) -> Callable[[Path], None]:
-    def change(root: Path) -> None:
-        path = root / name
-        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-    return change
-
-
-def drop_rows(root: Path) -> None:
-    path = root / "data/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(path).slice(0, 50).drop_columns(["action"]), path)
-
-
-@pytest.mark.parametrize(
-    ("damage", "parts"),
-    [
-        (truncate("data/chunk-000/file-000.parquet"), ["file-000.parquet is truncated"]),
-        (truncate("meta/episodes/chunk-000/file-000.parquet"), ["file-000.parquet cannot be read"]),
-        (truncate("meta/astra/episodes.parquet"), ["episodes.parquet cannot be read"]),
-        (truncate("meta/info.json"), ["info.json is no JSON"]),
-        (lambda root: (root / "data/chunk-000/file-000.parquet").unlink(), ["file-000.parquet is missing"]),
-        (lambda root: (root / "meta/stats.json").unlink(), ["meta/stats.json missing"]),
-        (
-            lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
-            ["meta/episodes has no rows"],
-        ),
-        (
-            edit("meta/info.json", total_frames=54, total_episodes=4),
-            ["has 5 episodes, expected 4", "expected 54"],
-        ),
-        (edit("meta/info.json", codebase_version="v2.1"), ["the format is v2.1, expected v3.0"]),
-        (edit("meta/astra/subsets.json", uids=[1, 2]), ["lists other episodes"]),
-        (drop_rows, ["has 50 rows, expected 55", "lacks column action"]),
-        (
-            lambda root: (root / "data/chunk-000/file-001.parquet").write_bytes(b""),
-            ["file-001.parquet does not belong"],
-        ),
-        (
-            lambda root: (root / "meta/info.json").write_text('{"codebase_version": "v3.0"}'),
-            ["has 5 faults: fps: expected a value", "; features: expected a value"],
-        ),
-    ],
-)
-def test_damage_is_told_in_one_line(
-    tmp_path: Path, damage: Callable[[Path], object], parts: list[str]
-) -> None:
-    root = write_fake(tmp_path / "set").root
-    damage(root)
-    with pytest.raises(CorruptDatasetError) as caught:
-        Dataset.open(root)
-    message = str(caught.value)
-    assert message.startswith(f"{root} is incomplete or was altered: ")
-    assert message.endswith(f"or save what is whole of it: `astra-data repair {root} --out FOLDER`.")
-    assert "\n" not in message
-    for part in parts:
-        assert part in message
 
 
 def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from fake_dataset import (
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset, DatasetWriter, episode_rows, parquet
-from astra_data.dataset.columns import ACTION, DONE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
+from astra_data.dataset.columns import ACTION, REWARD, STATE, Column, Episode
 
 
 def files(root: Path) -> dict[str, bytes]:
@@ -204,23 +204,3 @@ def test_outside_its_block_a_writer_says_so(tmp_path: Path, make: Callable[[Path
     with pytest.raises(BadInputError, match=r"inside `with \w+\(\.\.\.\) as writer:`"):
         made.add(fake_episode(1, 4))
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "frame", "value", "told"),
-    [
-        (DONE, 3, False, "next.done: false in the last frame"),
-        (DONE, 1, True, "next.done: true in frame 1, expected in the last one only"),
-        (TERMINATED, 0, True, "next.terminated: true in frame 0"),
-        (TRUNCATED, 2, True, "next.truncated: true in frame 2"),
-    ],
-)
-def test_only_the_last_step_ends_an_episode(
-    tmp_path: Path, name: str, frame: int, value: bool, told: str
-) -> None:
-    columns = fake_columns(4, seed=1)
-    columns[name][frame] = value
-    with writer(tmp_path / "set") as open_writer:
-        open_writer.add(fake_episode(1, 4))
-        with pytest.raises(BadInputError, match=told):
-            open_writer.add(Episode(2, columns))

@@ -6,50 +6,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from damaged import DATA, EPISODES, alter, drop, edit, truncate, write
 from fake_dataset import fake_columns, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.findings import MOST
-
-DATA = "data/chunk-000/file-000.parquet"
-EPISODES = "meta/episodes/chunk-000/file-000.parquet"
-
-
-def alter(name: str, column: str, row: int, value: object) -> Callable[[Path], None]:
-    """Change one value of a parquet file."""
-
-    def change(root: Path) -> None:
-        table = pq.read_table(root / name)
-        values = table.column(column).to_pylist()
-        values[row] = value
-        at = table.column_names.index(column)
-        field = table.schema.field(column)
-        changed = table.set_column(at, field, pa.array(values, field.type))
-        pq.write_table(changed, root / name, row_group_size=10)
-
-    return change
-
-
-def edit(name: str, **changes: object) -> Callable[[Path], None]:
-    def change(root: Path) -> None:
-        path = root / name
-        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-    return change
-
-
-def drop(name: str) -> Callable[[Path], None]:
-    return lambda root: (root / name).unlink()
-
-
-def truncate(name: str) -> Callable[[Path], object]:
-    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-20])
-
-
-def write(name: str, content: bytes) -> Callable[[Path], object]:
-    return lambda root: (root / name).write_bytes(content)
 
 
 def change_statistics(root: Path) -> None:

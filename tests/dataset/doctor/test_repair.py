@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from damaged import DATA, EPISODES, alter_rows
 from fake_dataset import fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
@@ -18,9 +19,6 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.format import DATASET_PATH, POLICY_PATH
-
-DATA = "data/chunk-000/file-000.parquet"
-EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 
 
 @pytest.fixture(scope="module")
@@ -97,20 +95,10 @@ def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(
     assert_saved(tmp_path / "saved", repaired.episodes)
 
 
-def alter(root: Path, column: str, changes: dict[int, object]) -> None:
-    """Change rows of the data."""
-    table = pq.read_table(root / DATA)
-    values = table.column(column).to_pylist()
-    for row, value in changes.items():
-        values[row] = value
-    at, field = table.column_names.index(column), table.schema.field(column)
-    pq.write_table(table.set_column(at, field, pa.array(values, field.type)), root / DATA)
-
-
 def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
-    alter(root, "next.reward", {25: float("nan")})
-    alter(root, "next.done", {3: True})
+    alter_rows(root / DATA, "next.reward", {25: float("nan")})
+    alter_rows(root / DATA, "next.done", {3: True})
     (root / EPISODES).unlink()
     (root / "meta/stats.json").unlink()
     repaired = repair(root, out=tmp_path / "saved")
@@ -133,7 +121,7 @@ def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
 
 def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
-    alter(root, "episode_uid", dict.fromkeys(range(8, 20), 4))
+    alter_rows(root / DATA, "episode_uid", dict.fromkeys(range(8, 20), 4))
     repaired = repair(root, out=tmp_path / "saved")
     assert "left out episode 2: its uid 4 is taken or negative" in repaired.notes
     assert Dataset.open(tmp_path / "saved").uids.tolist() == [13, 4, 6, 0]
@@ -141,7 +129,7 @@ def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
 
 def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
-    alter(root, "frame_index", {9: 7})
+    alter_rows(root / DATA, "frame_index", {9: 7})
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.episodes == 2
     assert "stopped before episode 2: frame_index is 7 in episode 2 frame 1, expected 1" in repaired.notes
@@ -149,7 +137,7 @@ def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path:
 
 def test_episodes_without_a_uid_keep_their_number(killed: Path, tmp_path: Path) -> None:
     shutil.copytree(killed / "whole", tmp_path / "set")
-    alter(tmp_path / "set", "next.reward", {0: float("nan")})
+    alter_rows(tmp_path / "set" / DATA, "next.reward", {0: float("nan")})
     repair(tmp_path / "set", out=tmp_path / "saved")
     saved = Dataset.open(tmp_path / "saved")
     assert saved.uids.tolist() == list(range(1, 8))
@@ -160,7 +148,7 @@ def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
     root = tmp_path / "set"
     shutil.copytree(killed / "whole", root)
     indices = pq.read_table(root / DATA).column("task_index").to_pylist()
-    alter(root, "task_index", {row: index + 1 for row, index in enumerate(indices)})
+    alter_rows(root / DATA, "task_index", {row: index + 1 for row, index in enumerate(indices)})
     table = pa.table({"task_index": [1, 2], "task": ["walk", "run"]})
     pq.write_table(table, root / "meta/tasks.parquet")
     (root / EPISODES).unlink()

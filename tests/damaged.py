@@ -1,0 +1,42 @@
+"""Damage for datasets in tests: each function returns a change of the dataset in a folder."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+def alter_rows(path: Path, column: str, changes: Mapping[int, object]) -> None:
+    """Change values of a parquet file, by their rows."""
+    table = pq.read_table(path)
+    values = table.column(column).to_pylist()
+    for row, value in changes.items():
+        values[row] = value
+    at, field = table.column_names.index(column), table.schema.field(column)
+    pq.write_table(table.set_column(at, field, pa.array(values, field.type)), path, row_group_size=10)
+
+
+def alter(name: str, column: str, row: int, value: object) -> Callable[[Path], None]:
+    return lambda root: alter_rows(root / name, column, {row: value})
+
+
+def edit(name: str, **changes: object) -> Callable[[Path], object]:
+    """Change keys of a JSON file."""
+    return lambda root: (root / name).write_text(json.dumps(json.loads((root / name).read_text()) | changes))
+
+
+def drop(name: str) -> Callable[[Path], None]:
+    return lambda root: (root / name).unlink()
+
+
+def truncate(name: str) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-20])
+
+
+def write(name: str, content: bytes) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes(content)

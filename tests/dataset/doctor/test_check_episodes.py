@@ -1,0 +1,100 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from damaged import DATA, EPISODES, alter, drop
+from fake_dataset import LENGTHS, fake_episodes, write_fake
+
+from astra_data.dataset import Dataset
+from astra_data.dataset.doctor.check_episodes import ESTIMATED, EXACT, EpisodeChecks, is_close
+from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.plain import plain_columns
+
+
+def checked(root: Path, is_ours: bool = True) -> tuple[EpisodeChecks, Report]:
+    info = json.loads((root / "meta/info.json").read_text())
+    report = Report()
+    checks = EpisodeChecks(root, info, plain_columns(info["features"])[0], is_ours, report)
+    checks.run()
+    checks.totals()
+    return checks, report
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_fake(tmp_path / "set").root
+
+
+def test_a_whole_dataset_is_counted_and_hashed(root: Path) -> None:
+    checks, report = checked(root)
+    assert (report.faults, report.notes) == ([], [])
+    assert (report.episodes, report.frames) == (5, 55)
+    assert checks.uids == [episode.uid for episode in fake_episodes()]
+    assert checks.lengths == list(LENGTHS)
+    assert checks.hash.hexdigest() == Dataset.open(root).content_hash
+
+
+def test_statistics_of_ours_are_compared_exactly_and_others_loosely(root: Path) -> None:
+    found = json.loads((root / "meta/stats.json").read_text())["mode"]["max"][0]
+    number = next(
+        number for number, episode in enumerate(fake_episodes()) if episode.columns["mode"].max() == found
+    )
+    alter(EPISODES, "stats/mode/max", number, [found * (1 + 1e-4)])(root)
+    _, report = checked(root)
+    assert len(report.faults) == 1
+    assert f"max of mode in episode {number} is" in report.faults[0]
+    _, report = checked(root, is_ours=False)
+    assert (report.faults, report.notes) == ([], [])
+    alter(EPISODES, "stats/mode/max", number, [found * 1.01])(root)
+    alter(EPISODES, "stats/mode/std", number, [1.0])(root)  # an estimate of lerobot's: not compared
+    _, report = checked(root, is_ours=False)
+    assert report.faults == []
+    assert len(report.notes) == 1
+    assert f"max of mode in episode {number} is" in report.notes[0]
+
+
+def test_the_extremes_of_a_plain_dataset_are_compared(root: Path) -> None:
+    path = root / "meta/stats.json"
+    stats = json.loads(path.read_text())
+    stats["action"]["min"][1] -= 0.5
+    path.write_text(json.dumps(stats))
+    assert checked(root)[1].notes == []
+    [note] = checked(root, is_ours=False)[1].notes
+    assert note.startswith("statistics: min of action is ")
+
+
+def test_rows_and_episodes_without_each_other_are_found(root: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(root, other)
+    shutil.copy(root / DATA, other / "data/chunk-000/file-001.parquet")
+    _, report = checked(other)
+    assert "meta/episodes lacks episode 5" in report.faults
+    assert "total_episodes is 5, expected 10" in report.faults
+    assert "episodes 0 and 5 have the same uid 13" in report.faults
+    drop(DATA)(root)
+    _, report = checked(root)
+    assert "meta/episodes has episode 4, the data has not" in report.faults
+
+
+@pytest.mark.parametrize(
+    ("stored", "expected", "tolerance", "close"),
+    [
+        ([1.0, 2.0], [1.0, 2.0], EXACT, True),
+        ([1.0, 2.0 + 1e-7], [1.0, 2.0], EXACT, True),
+        ([1.0, 2.0 + 1e-4], [1.0, 2.0], EXACT, False),
+        ([1.0, 2.0 + 1e-4], [1.0, 2.0], ESTIMATED, True),
+        # Relative to the largest: a small value beside a large one is known less well.
+        ([1e-5, 100.0], [0.0, 100.0], EXACT, True),
+        ([1e-3, 100.0], [0.0, 100.0], EXACT, False),
+        ([[1.0], [2.0]], [1.0, 2.0], EXACT, True),
+        ([1.0], [1.0, 2.0], EXACT, False),
+        (None, [1.0], EXACT, False),
+        (["x"], [1.0], EXACT, False),
+        ([10**400], [1.0], EXACT, False),
+        ([float("nan")], [1.0], EXACT, False),
+    ],
+)
+def test_statistics_are_close(stored: object, expected: list[float], tolerance: float, close: bool) -> None:
+    assert is_close(stored, np.array(expected), tolerance) is close

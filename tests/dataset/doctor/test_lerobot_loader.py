@@ -1,0 +1,47 @@
+from pathlib import Path
+
+import pytest
+from damaged import EPISODES, alter, drop
+from fake_dataset import write_fake
+
+from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+
+@pytest.fixture(autouse=True)
+def offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")  # set by the function, and restored here
+
+
+def compared(root: Path, episodes: int = 5, frames: int = 55) -> list[str]:
+    report = Report(episodes, frames)
+    compare_with_lerobot(root, report)
+    return report.faults
+
+
+def test_lerobot_reads_the_same_windows(tmp_path: Path) -> None:
+    assert compared(write_fake(tmp_path / "set").root) == []
+
+
+def test_other_boundaries_of_episodes_are_found(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    # lerobot takes boundaries from meta/episodes: the fourth episode now begins two steps early.
+    alter(EPISODES, "dataset_to_index", 2, 18)(root)
+    alter(EPISODES, "dataset_from_index", 3, 18)(root)
+    faults = compared(root)
+    assert any("has other padding" in fault for fault in faults)
+    assert any("has other values" in fault for fault in faults)
+
+
+def test_other_counts_are_found(tmp_path: Path) -> None:
+    faults = compared(write_fake(tmp_path / "set").root, episodes=6, frames=50)
+    assert faults == ["lerobot sees 5 episodes, 55 frames, not 6, 50"]
+
+
+def test_what_lerobot_cannot_open_is_a_fault(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    drop("meta/tasks.parquet")(root)
+    [fault] = compared(root)
+    assert fault.startswith("lerobot cannot open it: ")

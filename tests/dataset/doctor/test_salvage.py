@@ -1,0 +1,76 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from damaged import DATA, EPISODES, alter, drop
+from fake_dataset import LENGTHS, fake_episodes, write_fake
+
+from astra_data.dataset.columns import STATE
+from astra_data.dataset.doctor.salvage import whole_runs
+from astra_data.dataset.plain import plain_columns, read_object
+
+UIDS = [episode.uid for episode in fake_episodes()]
+
+
+def salvaged(root: Path) -> tuple[list[int], list[str]]:
+    """Return the uids of the intact episodes, whose states are compared, and the notes."""
+    info = read_object(root / "meta/info.json")
+    assert not isinstance(info, str)
+    notes: list[str] = []
+    states = {episode.uid: episode.columns[STATE] for episode in fake_episodes()}
+    uids = []
+    for uid, run in whole_runs(root, plain_columns(info["features"])[0], 20, notes):
+        np.testing.assert_array_equal(run.columns[STATE], states[uid])
+        uids.append(uid)
+    return uids, notes
+
+
+def test_all_of_a_whole_dataset_is_read(tmp_path: Path) -> None:
+    assert salvaged(write_fake(tmp_path / "set").root) == (UIDS, [])
+
+
+@pytest.mark.parametrize(
+    ("damage", "left", "note"),
+    [
+        # A wrong value costs its episode, a wrong structure all that follow.
+        (alter(DATA, "action", 9, [np.nan, 0]), [0, 1, 3, 4], "left out episode 2: action is nan"),
+        (alter(DATA, "next.done", 9, True), [0, 1, 3, 4], "left out episode 2: next.done is True"),
+        (alter(DATA, "index", 9, 70), [0, 1], "stopped before episode 2: index is 70"),
+        (alter(DATA, "timestamp", 9, 7.0), [0, 1], "stopped before episode 2: timestamp is 7.0"),
+        (alter(EPISODES, "length", 2, 11), [0, 1], "episode 2 has 12 frames, expected 11"),
+        (drop(EPISODES), [0, 1, 2, 3, 4], "meta/episodes was missing and was rebuilt from the data"),
+    ],
+)
+def test_what_is_intact_is_read(
+    tmp_path: Path, damage: Callable[[Path], object], left: list[int], note: str
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    damage(root)
+    uids, notes = salvaged(root)
+    assert uids == [UIDS[index] for index in left]
+    assert len(notes) == 1
+    assert note in notes[0]
+
+
+def test_without_a_footer_whole_row_groups_are_read(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    path = root / DATA
+    metadata = pq.read_metadata(path)
+    assert [metadata.row_group(group).num_rows for group in range(5)] == list(LENGTHS)
+    path.write_bytes(path.read_bytes()[: metadata.row_group(3).column(0).data_page_offset + 300])
+    uids, notes = salvaged(root)
+    assert uids == UIDS[:3]
+    assert notes == ["chunk-000/file-000.parquet has no footer: 3 whole row groups were found in it"]
+
+
+def test_an_episode_that_may_be_incomplete_is_left_out(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    path = root / DATA
+    pq.write_table(pq.read_table(path), path, row_group_size=20)  # groups that are not episodes
+    data = path.read_bytes()
+    path.write_bytes(data[: -8 - int.from_bytes(data[-8:-4], "little")])
+    uids, notes = salvaged(root)
+    assert uids == UIDS[:4]
+    assert notes[-1] == "the last 5 frames in file-000.parquet may be part of an episode and were left out"

@@ -1,0 +1,77 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import (
+    COLUMNS,
+    fake_columns,
+    fake_episode,
+    writer,
+)
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.admission import Admission
+from astra_data.dataset.columns import ACTION, DONE, REWARD, TERMINATED, TRUNCATED, Episode
+
+
+def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_path: Path) -> None:
+    bad = fake_columns(4, seed=0) | {"extra": np.zeros(4, np.float32), "mode": np.zeros(4, bool)}
+    del bad[REWARD]
+    bad[ACTION] = np.zeros((4, 3), np.float32)
+    with pytest.raises(BadInputError) as caught, writer(tmp_path / "set") as open_writer:
+        open_writer.add(fake_episode(1, 5))
+        open_writer.add(Episode(1, bad, {"return": 1, "length": 4}))
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in (
+        "Episode 1",
+        "next.reward: missing",
+        "extra: unknown column",
+        "action: shape (4, 3), expected (T, 2)",
+        "mode: dtype bool, expected int64",
+        "metadata return: int, earlier episodes have float",
+        "metadata length: is filled in by the writer",
+        "same uid",
+    ):
+        assert part in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "frame", "value", "told"),
+    [
+        (DONE, 3, False, "next.done: false in the last frame"),
+        (DONE, 1, True, "next.done: true in frame 1, expected in the last one only"),
+        (TERMINATED, 0, True, "next.terminated: true in frame 0"),
+        (TRUNCATED, 2, True, "next.truncated: true in frame 2"),
+    ],
+)
+def test_only_the_last_step_ends_an_episode(
+    tmp_path: Path, name: str, frame: int, value: bool, told: str
+) -> None:
+    columns = fake_columns(4, seed=1)
+    columns[name][frame] = value
+    with writer(tmp_path / "set") as open_writer:
+        open_writer.add(fake_episode(1, 4))
+        with pytest.raises(BadInputError, match=told):
+            open_writer.add(Episode(2, columns))
+
+
+def test_metadata_keys_keep_the_type_of_their_first_value() -> None:
+    admission = Admission(COLUMNS)
+    admission.admit(Episode(1, fake_columns(3, seed=1), {"success": True}))
+    admission.admit(Episode(2, fake_columns(3, seed=2), {"return": 0.5}))
+    assert admission.metadata_types == {"success": bool, "return": float}
+    with pytest.raises(BadInputError, match="metadata success: int, earlier episodes have bool"):
+        admission.admit(Episode(3, fake_columns(3, seed=3), {"success": 1}))
+
+
+def test_a_refused_episode_leaves_no_trace() -> None:
+    admission = Admission(COLUMNS)
+    with pytest.raises(BadInputError, match=r"Episode 1: next\.reward: missing"):
+        columns = {name: values for name, values in fake_columns(3, seed=1).items() if name != REWARD}
+        admission.admit(Episode(1, columns, {"success": True}))
+    assert admission.metadata_types == {}
+    admission.admit(Episode(1, fake_columns(3, seed=1)))
+    with pytest.raises(BadInputError, match="an earlier episode has the same uid"):
+        admission.admit(Episode(1, fake_columns(4, seed=1)))

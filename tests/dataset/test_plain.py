@@ -1,0 +1,218 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from damaged import DATA
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, TIMESTAMP, Array
+from astra_data.dataset.plain import (
+    PlainColumn,
+    Run,
+    episode_rows,
+    flag_faults,
+    plain_columns,
+    read_footer,
+    read_object,
+    read_statistics,
+    read_tasks,
+    run_faults,
+    runs,
+)
+
+
+def test_only_rows_of_numbers_are_plain_columns() -> None:
+    features = {
+        "state": {"dtype": "float64", "shape": [3]},
+        "count": {"dtype": "uint8", "shape": (1,)},
+        "image": {"dtype": "video", "shape": [3, 8, 8]},
+        "text": {"dtype": "string", "shape": [1]},
+        "empty": {"dtype": "float32", "shape": [0]},
+        "true": {"dtype": "float32", "shape": [True]},
+        "huge": {"dtype": "float32", "shape": [2**31]},
+        "none": None,
+        "shapeless": {"dtype": "float32"},
+    }
+    columns, others = plain_columns(features)
+    assert columns == [PlainColumn("state", "float64", 3), PlainColumn("count", "uint8", 1)]
+    assert others == list(features)[2:]
+
+
+def test_a_column_fits_lists_with_and_without_their_size() -> None:
+    column = PlainColumn("state", "float32", 3)
+    assert column.fits(pa.list_(pa.float32(), 3))
+    assert column.fits(pa.list_(pa.float32()))
+    assert not column.fits(pa.list_(pa.float32(), 2))
+    assert not column.fits(pa.list_(pa.float64()))
+    single = PlainColumn("reward", "float32", 1)
+    assert single.fits(pa.float32())
+    assert not single.fits(pa.list_(pa.float32()))
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('{"a": [1]}', {"a": [1]}),
+        ("[1]", "is no JSON object but list"),
+        ("{", "is no JSON object ("),
+        ("[" * 100_000, "is no JSON object ("),
+        (None, "is missing"),
+    ],
+)
+def test_json_is_an_object_or_a_fault(tmp_path: Path, text: str | None, found: object) -> None:
+    path = tmp_path / "info.json"
+    if text is not None:
+        path.write_text(text)
+    read = read_object(path)
+    assert read.startswith(found) if isinstance(found, str) and isinstance(read, str) else read == found
+
+
+def test_statistics_are_objects_per_column(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/stats.json").write_text('{"a": {"min": [0]}, "b": 1, "c": []}')
+    assert read_statistics(tmp_path) == "has no JSON object for b, c"
+    (tmp_path / "meta/stats.json").write_text('{"a": {"min": [0]}}')
+    assert read_statistics(tmp_path) == {"a": {"min": [0]}}
+
+
+@pytest.mark.parametrize(
+    ("table", "found"),
+    [
+        ({"task_index": [0, 2], "task": ["walk", "run"]}, {0: "walk", 2: "run"}),
+        ({"task_index": [0], "__index_level_0__": ["walk"]}, {0: "walk"}),
+        ({"task_index": [0, 0], "task": ["walk", "run"]}, "expected one text per task_index"),
+        ({"task_index": [0, None], "task": ["walk", "run"]}, "expected one text per task_index"),
+        ({"index": [0], "task": ["walk"]}, "expected task_index and one of texts"),
+        ({"task_index": [0], "task": [1]}, "expected task_index and one of texts"),
+        ({"task_index": [0], "task": ["walk"], "more": ["x"]}, "expected task_index and one of texts"),
+    ],
+)
+def test_tasks_are_texts_by_their_index(
+    tmp_path: Path, table: dict[str, list[object]], found: object
+) -> None:
+    (tmp_path / "meta").mkdir()
+    assert read_tasks(tmp_path) == "is missing"
+    pq.write_table(pa.table(table), tmp_path / "meta/tasks.parquet")
+    read = read_tasks(tmp_path)
+    assert found in read if isinstance(found, str) and isinstance(read, str) else read == found
+
+
+def test_a_footer_holds_rows_and_schema(fake: Dataset, tmp_path: Path) -> None:
+    footer = read_footer(fake.root / DATA)
+    assert not isinstance(footer, str)
+    assert footer[0] == 55
+    assert footer[1].field("action").type == pa.list_(pa.float32(), 2)
+    assert read_footer(tmp_path / "none.parquet") == "is missing"
+    (tmp_path / "cut.parquet").write_bytes((fake.root / DATA).read_bytes()[:-10])
+    cut = read_footer(tmp_path / "cut.parquet")
+    assert isinstance(cut, str)
+    assert cut.startswith("is truncated or no parquet file (")
+
+
+def test_rows_of_episodes_come_in_order(fake: Dataset) -> None:
+    assert [row["length"] for row in episode_rows(fake.root)] == fake.lengths.tolist()
+
+
+COLUMNS = [PlainColumn(EPISODE_INDEX, "int64", 1), PlainColumn(FRAME_INDEX, "int64", 1)]
+
+
+def split(episodes: list[int], frames: list[int], block: int) -> list[tuple[list[int], list[int]]]:
+    table = pa.table({EPISODE_INDEX: episodes, FRAME_INDEX: frames})
+
+    def blocks() -> Iterator[pa.Table]:
+        for first in range(0, len(table), block):
+            yield table.slice(first, block)
+
+    found = runs(Path("data/file.parquet"), blocks(), COLUMNS)
+    return [(run.columns[EPISODE_INDEX].tolist(), run.columns[FRAME_INDEX].tolist()) for run in found]
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, 100])
+def test_rows_are_split_where_episodes_begin(block: int) -> None:
+    assert split([0, 0, 0, 1, 2, 2], [0, 1, 2, 0, 0, 1], block) == [
+        ([0, 0, 0], [0, 1, 2]),
+        ([1], [0]),
+        ([2, 2], [0, 1]),
+    ]
+    # One wrong value of either stays inside of its episode.
+    assert split([0, 9, 0, 1], [0, 1, 2, 0], block) == [([0, 9, 0], [0, 1, 2]), ([1], [0])]
+    assert split([0, 0, 0, 1], [0, 0, 2, 0], block) == [([0, 0, 0], [0, 0, 2]), ([1], [0])]
+    assert split([], [], block) == []
+
+
+def test_columns_of_another_type_are_refused() -> None:
+    table = pa.table({EPISODE_INDEX: [0.5], "more": [1]})
+    with pytest.raises(CorruptDatasetError, match=r"lacks column frame_index; has episode_index as double"):
+        list(runs(Path("data/file.parquet"), iter([table]), COLUMNS))
+
+
+def a_run(**changes: Array) -> Run:
+    """Return episode 3 of 4 steps at 10 steps per second, whose first row is 20."""
+    frame = np.arange(4)
+    columns: dict[str, Array] = {
+        INDEX: frame + 20,
+        EPISODE_INDEX: np.full(4, 3),
+        FRAME_INDEX: frame,
+        TIMESTAMP: (frame / 10).astype(np.float32),
+        "state": np.zeros((4, 2), np.float32),
+    }
+    return Run(Path("file.parquet"), columns | changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value", "sentence"),
+    [
+        (INDEX, 1, 9, "index is 9 in episode 3 frame 1, expected 21"),
+        (EPISODE_INDEX, 2, 2, "episode_index is 2 in episode 3 frame 2, expected 3"),
+        (FRAME_INDEX, 3, 0, "frame_index is 0 in episode 3 frame 3, expected 3"),
+        (TIMESTAMP, 1, 0.1002, "in episode 3 frame 1, expected 0.1"),
+        (TIMESTAMP, 1, np.nan, "timestamp is nan in episode 3 frame 1, expected 0.1"),
+        ("state", (2, 1), np.inf, "state is inf in episode 3 frame 2 index 1, expected a finite number"),
+    ],
+)
+def test_wrong_values_of_a_run_are_found(
+    name: str, at: int | tuple[int, int], value: float, sentence: str
+) -> None:
+    assert list(run_faults(a_run(), number=3, row=20, fps=10)) == []
+    values = a_run().columns[name].copy()
+    values[at] = value
+    [(column, fault)] = run_faults(a_run(**{name: values}), number=3, row=20, fps=10)
+    assert column == name
+    assert sentence in fault
+
+
+def test_a_timestamp_may_be_rounded() -> None:
+    rounded = np.array([0, 0.1, 0.20009, 0.3])
+    assert list(run_faults(a_run(**{TIMESTAMP: rounded}), number=3, row=20, fps=10)) == []
+
+
+def test_further_wrong_values_are_counted() -> None:
+    [(_, fault)] = run_faults(a_run(**{INDEX: np.array([20, 9, 9, 9])}), number=3, row=20, fps=10)
+    assert fault.endswith("expected 21 (3 values are wrong)")
+
+
+@pytest.mark.parametrize(
+    ("terminated", "truncated", "done", "faults"),
+    [
+        ("0001", "0000", "0001", []),
+        ("0000", "0001", "0001", []),
+        ("0001", "0001", "0001", []),
+        ("0100", "0000", "0100", [("terminated", "frame 1"), ("done", "frame 1")]),
+        ("0000", "0000", "0001", [("done", "expected False")]),
+        ("0001", "0000", "0000", [("done", "expected True")]),
+    ],
+)
+def test_flags_end_the_last_step_only_and_agree(
+    terminated: str, truncated: str, done: str, faults: list[tuple[str, str]]
+) -> None:
+    flags = {"next.terminated": terminated, "next.truncated": truncated, "next.done": done}
+    run = a_run(**{name: np.array([bit == "1" for bit in bits]) for name, bits in flags.items()})
+    found = list(flag_faults(run, 3))
+    assert len(found) == len(faults)
+    for sentence, (name, part) in zip(found, faults, strict=True):
+        assert sentence.startswith(f"next.{name} is ")
+        assert part in sentence
