@@ -26,7 +26,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def results(root: Path) -> Results:
-    return assemble("antmaze_u", "antmaze-u", ROWS, SEEDS, root=root, command="", replicates=100)
+    return assemble("antmaze_u", "antmaze-u", ROWS, SEEDS, root=root, command="", replicates=10)
 
 
 def drawn(
