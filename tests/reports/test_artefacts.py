@@ -92,7 +92,7 @@ def test_tensors_are_checked_and_become_float64(tmp_path: Path) -> None:
 def test_rows_must_be_evaluated_alike(path: Path) -> None:
     file = read_json(Evaluation, path)
     assert check_alike({"astra": {1: file, 2: file}}, "antmaze-u") == 4
-    others = {"task": "antmaze-long"}, {"leg_scale": 1.25}, {"episodes": 9}
+    others: tuple[dict[str, object], ...] = {"task": "antmaze-long"}, {"leg_scale": 1.25}, {"episodes": 9}
     rows = {"astra": {1: file}, "nas": {seed: file.model_copy(update=one) for seed, one in enumerate(others)}}
     with pytest.raises(BadInputError) as error:
         check_alike(rows, "antmaze-u")

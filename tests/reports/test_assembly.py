@@ -11,7 +11,7 @@ from astra_data.reports.schema import Results
 
 
 def assembled(root: Path, methods: tuple[str, ...] = ROWS, seeds: tuple[int, ...] = SEEDS) -> Results:
-    return assemble("antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=100)
+    return assemble("antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=10)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_the_papers_figures_are_those_of_reported_rows(root: Path) -> None:
         SEEDS,
         root=root,
         command="",
-        replicates=100,
+        replicates=10,
         paper_success={"astra": 0.4, "nas": 0.27},
     )
     assert found.paper_success == {"astra": 0.4}

@@ -19,7 +19,7 @@ def assembled(
     published: Results | None = None,
 ) -> Results:
     found = assemble(
-        "antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=100, published=published
+        "antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=10, published=published
     )
     # Published results come from a file.
     return Results.model_validate_json(found.model_dump_json(by_alias=True))

@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,7 @@ def page_of(results: Results, **changes: object) -> str:
     return render(results.model_copy(update=changes), {})
 
 
-def rows_of(results: Results, **changes: dict[str, object]) -> dict[str, MethodResults]:
+def rows_of(results: Results, **changes: Mapping[str, object]) -> dict[str, MethodResults]:
     """Return the rows, some of them changed and summarised again."""
     edited = {
         name: summarised(results.methods[name].model_copy(update=of), 100) for name, of in changes.items()
