@@ -8,6 +8,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from astra_data.cli.app import app
+from astra_data.core.config import Config
 from astra_data.core.progress import silent
+from astra_data.experiments import recipe  # noqa: F401 - has all tables of settings
 from astra_data.stages.align import align
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.ground import ground
@@ -165,6 +168,18 @@ def test_options_named_in_the_text_exist() -> None:
         unknown = {word for word in words if word.startswith("--")} - known
         faults += [f"{page}: {code}: no option {option}" for option in unknown]
     assert not faults, "\n".join(faults)
+
+
+def test_recipe_keys_named_in_the_text_exist() -> None:
+    known = set(chain.from_iterable(model.model_fields for model in subclasses(Config)))
+    named = re.compile(r"`(?:\[\w+\]\s+)?(\w+)\s+=\s[^`]*`|`\[\w+\]\s+(\w+)`")
+    keys = [(page, a or b) for page, text in PAGES.items() for a, b in named.findall(text)]
+    assert len(keys) > 10
+    assert [(page, key) for page, key in keys if key not in known] == []
+
+
+def subclasses(model: type[Config]) -> set[type[Config]]:
+    return {model}.union(*map(subclasses, model.__subclasses__()))
 
 
 def test_blocks_that_are_not_run_say_why_and_are_few() -> None:
