@@ -2,13 +2,16 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from small_run import ALIGN
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
-from astra_data.grounding.files import load_target_encoder
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import STATE
+from astra_data.grounding.files import load_history_model, load_target_encoder
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.stages.align import align
 
@@ -26,6 +29,50 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
     assert 0 < last["mmd"] < first["mmd"]
     assert last["mmd"] == metrics["mmd"]
     assert load_target_encoder(aligned / "target_encoder.safetensors").encoder.latent_size == 16
+
+
+def test_the_agreement_is_that_of_held_out_episodes_alone(
+    paired: Path, grounded: Path, aligned: Path
+) -> None:
+    model = load_history_model(grounded / "grounding.safetensors")
+    encoder = load_target_encoder(aligned / "target_encoder.safetensors")
+    _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
+    windows, squares = held_out.windows, []
+    for row, length in enumerate(held_out.lengths.tolist()):
+        steps = slice(row, row + 1), slice(0, length)
+        history = [windows.goal[steps], windows.previous_action[steps]]
+        source, _ = model.encoder(model.encoder_input(windows.state[steps], *history))
+        target, _ = encoder.encoder(encoder.encoder_input(held_out.target_state[steps], *history))
+        squares.append((target - source).square().flatten())
+    metrics = json.loads((aligned / "metrics.json").read_text())
+    assert metrics["latent_rmse"] == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-4)
+
+
+def test_states_are_scaled_by_training_episodes_alone(paired: Path, aligned: Path) -> None:
+    _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
+    states = [episode.columns[STATE] for episode in Dataset.open(paired).episodes([STATE])]
+    known = [held_out.target_state[row, :length].numpy() for row, length in enumerate(held_out.lengths)]
+    training = [values for values in states if not any(np.array_equal(values, other) for other in known)]
+    assert len(training) == len(states) - len(held_out)
+    encoder = load_target_encoder(aligned / "target_encoder.safetensors")
+    values = np.concatenate(training).astype(np.float64)
+    np.testing.assert_allclose(encoder.state_mean.numpy(), values.mean(0), atol=1e-4)
+    np.testing.assert_allclose(
+        encoder.state_std.numpy(), values.std(0, ddof=1).clip(1e-3), rtol=1e-3, atol=1e-5
+    )
+
+
+def test_the_paired_weight_adds_the_distance_of_paired_latents(
+    paired: Path, grounded: Path, tmp_path: Path
+) -> None:
+    """It is far larger than the discrepancy here, so that a few updates with it come closer."""
+    distances = []
+    for weight in (0.0, 100.0):
+        out = tmp_path / str(weight)
+        config = ALIGN.model_copy(update={"updates": 10, "paired_weight": weight})
+        align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
+        distances.append(json.loads((out / "metrics.json").read_text())["latent_rmse"])
+    assert distances[1] < distances[0]
 
 
 def test_the_same_seed_gives_the_same_bytes(

@@ -116,6 +116,17 @@ def test_simulators_that_all_rows_share_begin_and_reward_alike(
     assert min(follower["raw"]["return"]) > max(transferred["raw"]["return"])
 
 
+def test_longer_legs_change_the_target_alone(task: str, tmp_path: Path) -> None:
+    usual, paths = make(task, "follower", tmp_path / "usual")
+    longer, others = make(
+        task, "follower", tmp_path / "longer", config=CONFIG.model_copy(update={"leg_scale": 1.25})
+    )
+    assert (usual["leg_scale"], longer["leg_scale"]) == (1.0, 1.25)
+    assert longer["raw"] == usual["raw"]
+    assert torch.equal(others["goal"], paths["goal"])
+    assert not torch.equal(others["target.position"][:, 10], paths["target.position"][:, 10])
+
+
 def test_a_policy_that_was_in_no_simulator_is_tested_in_the_target_alone(
     task: str, trained: Path, tmp_path: Path
 ) -> None:
