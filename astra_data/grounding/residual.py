@@ -17,7 +17,7 @@ from astra_data.worlds.variation import Variation
 
 
 class ResidualSimulator(EpisodeSimulator):
-    """Step the simulator, add what the residual model predicts that it lacks, and set it there.
+    """Step the simulator, add the correction that the residual model predicts, and set it there.
 
     Attributes:
         model: the trained residual model; only read.

@@ -1,4 +1,4 @@
-"""The policy and its value: Gaussian actor and critic, with or without a recurrent memory of their own."""
+"""Gaussian actor and critic, with or without a recurrent memory of their own."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from astra_data.learning.networks.policy import Policy, PolicyShape
 
 @dataclass(frozen=True)
 class ActorCriticShape(PolicyShape):
-    """Sizes of actor and critic, and the logarithm of the deviation that actions begin with."""
+    """Sizes of actor and critic, and the logarithm of the initial standard deviation of actions."""
 
     initial_log_std: float = -0.5
 
@@ -37,7 +37,7 @@ class ActorCritic(Policy):
         return mean, self.log_std.exp().expand_as(mean)
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the mean action (..., A), or with `generator` one that is drawn and cut off at ±1."""
+        """Return the mean action (..., A), or with `generator` a sample that is clipped to ±1."""
         mean, std = self.policy(features)
         return mean if generator is None else torch.normal(mean, std, generator=generator).clamp(-1.0, 1.0)
 

@@ -1,7 +1,7 @@
 """Rapid motor adaptation (Kumar et al. 2021): policies that act on extrinsics.
 
-Extrinsics are what matters of a world's parameters. The teacher is told the parameters and encodes them; the
-student estimates the same extrinsics from what it has seen and done.
+Extrinsics encode those parameters of the environment that matter. The teacher observes the parameters and
+encodes them; the student estimates the same extrinsics from its observations and actions.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class AdaptiveShape(ActorCriticShape):
     """Sizes of teacher and student.
 
     Attributes:
-        extrinsics_size: E. history_length: H, steps that the student's estimate looks back.
+        extrinsics_size: E. history_length: H, steps that the student's estimate is made from.
     """
 
     extrinsics_size: int = 8
@@ -30,12 +30,12 @@ class AdaptiveShape(ActorCriticShape):
 
     @property
     def feature_size(self) -> int:
-        """F, of what actor and critic see: observation, memory and extrinsics."""
+        """F, size of the input of actor and critic: observation, memory and extrinsics."""
         return super().feature_size + self.extrinsics_size
 
 
 class Teacher(ActorCritic):
-    """Actor and critic that are told their world's parameters: the last P values of what they observe."""
+    """Actor and critic that observe the environment's parameters, as the last P values of observations."""
 
     shape: AdaptiveShape
 
@@ -44,12 +44,12 @@ class Teacher(ActorCritic):
         sizes = (parameter_count, *shape.hidden_sizes, shape.extrinsics_size)
         self.encoder = nn.Sequential(*mlp(sizes), nn.Tanh())
 
-    def extrinsics(self, told: Tensor) -> Tensor:
-        """Encode the parameters in `told` (..., O + P); return extrinsics (..., E) in [-1, 1]."""
-        return torch.as_tensor(self.encoder(told[..., self.shape.observation_size :]))
+    def extrinsics(self, observation: Tensor) -> Tensor:
+        """Encode the parameters in `observation` (..., O + P); return extrinsics (..., E) in [-1, 1]."""
+        return torch.as_tensor(self.encoder(observation[..., self.shape.observation_size :]))
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one step `observation` (B, O + P); return features (B, F) and the next hidden (B, M)."""
+        """Process one step `observation` (B, O + P); return features (B, F) and the next hidden (B, M)."""
         seen = observation[:, : self.shape.observation_size]
         features, hidden = super().remember(seen, previous_action, hidden)
         return torch.cat([features, self.extrinsics(observation)], dim=-1), hidden
@@ -64,7 +64,7 @@ class Teacher(ActorCritic):
 
 
 class HistoryEstimate(nn.Module):
-    """Estimate extrinsics from H rows of I values each, by the convolutions of Kumar et al. 2021."""
+    """Estimate extrinsics from H rows of I values each, with the convolutions of Kumar et al. 2021."""
 
     def __init__(self, row_size: int, length: int, extrinsics_size: int) -> None:
         super().__init__()
@@ -86,8 +86,8 @@ class HistoryEstimate(nn.Module):
 class Student(ActorCritic):
     """Actor and critic with extrinsics that are estimated from the last H observations and actions.
 
-    The hidden state is the memory (B, M) and, after it, the history (B, H * (O + A)): in each row an
-    observation and the action before it, the newest last, zeros for what was before the start.
+    The hidden state is the memory (B, M) followed by the history (B, H * (O + A)): each row holds an
+    observation and the action before it, the newest last; rows from before the start are zero.
     """
 
     shape: AdaptiveShape
@@ -108,13 +108,13 @@ class Student(ActorCritic):
         return student
 
     def initial_hidden(self, count: int) -> Tensor:
-        """Return memory and history (count, M + H * (O + A)) at the start of an episode: nothing."""
+        """Return memory and history (count, M + H * (O + A)) at the start of an episode: zeros."""
         shape = self.shape
         history = shape.history_length * (shape.observation_size + shape.action_size)
         return torch.zeros(count, shape.memory_size + history, device=self.log_std.device)
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one step; return the features (B, F), the estimate last, and the next hidden."""
+        """Process one step; return the features (B, F), the estimate last, and the next hidden."""
         memory, history = hidden.tensor_split([self.shape.memory_size], dim=-1)
         features, memory = super().remember(observation, previous_action, memory)
         newest = torch.cat([observation, previous_action], dim=-1)

@@ -19,19 +19,19 @@ class CausalConfig(Config):
     batch_size: Count = 128
     """Samples per update."""
     learning_rate: Positive = 3e-3
-    """Of the networks."""
+    """Learning rate of the networks."""
     mask_learning_rate: Positive = 0.03
-    """Of the mask."""
+    """Learning rate of the mask."""
     sparsity: NotNegative = 0.01
     """Weight of the mean probability of the masks."""
     mask_threshold: Share = 0.3
-    """A cause matters where its mask is more probable than this."""
+    """A cause counts where the probability of its mask is above this."""
 
 
 class CausalModel(nn.Module):
-    """Predict y_j = d(Σ_i m_ij e(x_i, i), j), where the mask m says which cause i reaches which effect j.
+    """Predict y_j = d(Σ_i m_ij e(x_i, i), j), where the mask m has a 1 where cause i reaches effect j.
 
-    The networks e and d are shared by all causes and all effects, which they tell apart by learned codes.
+    The networks e and d are shared by all causes and all effects, each of which has a learned embedding.
 
     Attributes:
         logits: of the mask's probabilities, (I, J).
@@ -75,10 +75,10 @@ def fit_causes(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalised
     All randomness comes from torch's global generator.
 
     Args:
-        cause: values of about one.
-        effect: of each.
+        cause: scaled to about one.
+        effect: normalised.
         config: the settings.
-        penalised: number of causes, the first, whose masks are to be sparse.
+        penalised: the masks of the first so many causes are to be sparse.
     """
     model = CausalModel(cause.shape[1], effect.shape[1]).to(cause.device)
     networks = [weight for name, weight in model.named_parameters() if name != "logits"]

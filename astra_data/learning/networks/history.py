@@ -61,7 +61,7 @@ class HistoryEncoder(nn.Module):
         return self.latent(states), states
 
     def step(self, inputs: Tensor, hidden: Tensor) -> Tensor:
-        """Take in one step `inputs` (B, I); return the next hidden state (B, Z)."""
+        """Process one step `inputs` (B, I); return the next hidden state (B, Z)."""
         return self._next(functional.elu(self.embedding(inputs)), hidden)
 
     def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:

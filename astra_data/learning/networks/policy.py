@@ -1,4 +1,4 @@
-"""What every policy is: a memory of its own where observations hold no latent, and a head that acts."""
+"""The base of all policies: a recurrent memory where observations hold no latent, and a head that acts."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class PolicyShape:
 
     @property
     def feature_size(self) -> int:
-        """F, of what heads see: the observation and the memory."""
+        """F, size of the input of the heads: the observation and the memory."""
         return self.observation_size + self.memory_size
 
     def new_memory(self) -> HistoryEncoder | None:
@@ -50,7 +50,7 @@ def features_of(
 ) -> Tensor:
     """Return the features (B, T, F) of `observation` (B, T, O), (B, T, A), from `hidden` (B, M).
 
-    `start` (B, T) is 1 where a new episode begins: there the memory is emptied.
+    `start` (B, T) is 1 where a new episode begins: there the memory is set to zero.
     """
     if memory is None:
         return observation
@@ -59,9 +59,9 @@ def features_of(
 
 
 class Policy(nn.Module, ABC):
-    """Acts on what it observes and remembers.
+    """Acts on observations and its memory of them.
 
-    Memory is handed in and out as `hidden` (B, M), never kept; without memory M = 0.
+    The memory is an argument and a result, `hidden` (B, M), never kept; without memory M = 0.
 
     Attributes:
         squashes: whether actions are the tanh of draws from the Gaussian that `policy` returns.
@@ -79,7 +79,7 @@ class Policy(nn.Module, ABC):
         return torch.zeros(count, self.shape.memory_size, device=next(self.parameters()).device)
 
     def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one step; return the features (B, F), and the next hidden (B, M)."""
+        """Process one step; return the features (B, F), and the next hidden (B, M)."""
         if self.memory is None:
             return observation, hidden
         hidden = self.memory.step(torch.cat([observation, previous_action], dim=-1), hidden)
@@ -97,4 +97,4 @@ class Policy(nn.Module, ABC):
 
     @abstractmethod
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the action (..., A), within ±1: the likeliest, or with `generator` one that is drawn."""
+        """Return the action (..., A), within ±1: the mode, or with `generator` a sample."""

@@ -32,10 +32,10 @@ class ResidualShape:
 
 
 class ResidualModel(nn.Module):
-    """Predict what a simulator's next state lacks, from (s_i, a_i, simulated s_{i+1}) and all steps before.
+    """Predict the error of a simulator's next state, from (s_i, a_i, simulated s_{i+1}) and all steps before.
 
-    The memory (B, M) is handed in and out, never kept. Scales are buffers, set from the training episodes
-    by `set_scales`, so a checkpoint carries them.
+    The memory (B, M) is an argument and a result, never kept. Scales are buffers, so checkpoints hold them;
+    `set_scales` takes them from the training episodes.
     """
 
     def __init__(self, shape: ResidualShape) -> None:
@@ -55,7 +55,7 @@ class ResidualModel(nn.Module):
         self.residual_factor: Tensor
 
     def set_scales(self, state: Tensor, correction: Tensor) -> None:
-        """Take means and deviations from training steps: of states and of what they lacked, (N, X)."""
+        """Take means and deviations from training steps: of states and of the simulator's errors, (N, X)."""
         self.state_mean.copy_(state.mean(0))
         self.state_std.copy_(state.std(0).clamp_min(1e-3))
         self.correction_std.copy_(correction.std(0).clamp_min(1e-3))

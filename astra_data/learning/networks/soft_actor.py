@@ -1,4 +1,4 @@
-"""The policy of soft actor-critic: a Gaussian whose draws are squashed by tanh."""
+"""The policy of soft actor-critic: a Gaussian whose samples are squashed by tanh."""
 
 import math
 
@@ -15,13 +15,13 @@ _UNIT_SCALE = math.log(math.e - 1.0)
 
 
 def gaussian(output: Tensor) -> tuple[Tensor, Tensor]:
-    """Return location and scale (..., A) that an actor's `output` (..., 2 A) stands for."""
+    """Return location and scale (..., A) from the `output` (..., 2 A) of an actor."""
     loc, width = output.chunk(2, dim=-1)
     return loc, functional.softplus(width + _UNIT_SCALE) + _SMALLEST_SCALE
 
 
 class SoftActor(Policy):
-    """Location and scale of a Gaussian, both of the features; actions are the tanh of its draws."""
+    """A Gaussian whose location and scale both depend on the features; actions are the tanh of samples."""
 
     squashes = True
 
@@ -34,6 +34,6 @@ class SoftActor(Policy):
         return gaussian(self.actor(features))
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the tanh of the location, (..., A), or with `generator` that of a draw."""
+        """Return the tanh of the location, (..., A), or with `generator` that of a sample."""
         loc, scale = self.policy(features)
         return torch.tanh(loc if generator is None else torch.normal(loc, scale, generator=generator))

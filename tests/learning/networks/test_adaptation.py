@@ -23,20 +23,20 @@ def test_a_history_is_zeros_before_the_start_and_ends_with_the_newest_step() -> 
 @torch.no_grad()
 def test_features_are_those_of_an_actor_critic_and_the_extrinsics() -> None:
     torch.manual_seed(0)
-    teacher, told = Teacher(SHAPE, parameter_count=6), torch.randn(5, 9, 3 + 6)
+    teacher, observed = Teacher(SHAPE, parameter_count=6), torch.randn(5, 9, 3 + 6)
     student, plain = Student.of_teacher(teacher), ActorCritic(ActorCriticShape(3, 2, memory_size=8))
     assert plain.memory is not None and teacher.memory is not None
     plain.memory.load_state_dict(teacher.memory.state_dict())
     action, start = torch.randn(5, 9, 2), torch.zeros(5, 9)
     start[2, 4] = 1.0
-    features = teacher.remember_sequence(told, action, torch.zeros(5, 8), start)
-    remembered = plain.remember_sequence(told[..., :3], action, torch.zeros(5, 8), start)
-    torch.testing.assert_close(features, torch.cat([remembered, teacher.extrinsics(told)], dim=-1))
-    assert teacher.extrinsics(told).shape == (5, 9, 4)
-    alone, _ = teacher.remember(told[:, 0], action[:, 0], torch.zeros(5, 8))
+    features = teacher.remember_sequence(observed, action, torch.zeros(5, 8), start)
+    remembered = plain.remember_sequence(observed[..., :3], action, torch.zeros(5, 8), start)
+    torch.testing.assert_close(features, torch.cat([remembered, teacher.extrinsics(observed)], dim=-1))
+    assert teacher.extrinsics(observed).shape == (5, 9, 4)
+    alone, _ = teacher.remember(observed[:, 0], action[:, 0], torch.zeros(5, 8))
     torch.testing.assert_close(alone, features[:, 0])
     hidden = student.initial_hidden(5)
-    seen, hidden = student.remember(told[:, 0, :3], action[:, 0], hidden)
+    seen, hidden = student.remember(observed[:, 0, :3], action[:, 0], hidden)
     torch.testing.assert_close(seen[:, :11], remembered[:, 0])
     assert torch.equal(seen[:, 11:], student.adaptation(hidden[:, 8:]))
 
@@ -44,10 +44,10 @@ def test_features_are_those_of_an_actor_critic_and_the_extrinsics() -> None:
 @torch.no_grad()
 def test_a_teachers_extrinsics_depend_on_the_parameters_alone() -> None:
     torch.manual_seed(0)
-    teacher, told = Teacher(SHAPE, parameter_count=6), torch.randn(5, 9)
-    elsewhere = torch.cat([torch.randn(5, 3), told[:, 3:]], dim=1)
-    assert torch.equal(teacher.extrinsics(elsewhere), teacher.extrinsics(told))
-    assert (teacher.extrinsics(told[:, [0, 1, 2, 8, 7, 6, 5, 4, 3]]) - teacher.extrinsics(told)).any()
+    teacher, observed = Teacher(SHAPE, parameter_count=6), torch.randn(5, 9)
+    elsewhere = torch.cat([torch.randn(5, 3), observed[:, 3:]], dim=1)
+    assert torch.equal(teacher.extrinsics(elsewhere), teacher.extrinsics(observed))
+    assert (teacher.extrinsics(observed[:, [0, 1, 2, 8, 7, 6, 5, 4, 3]]) - teacher.extrinsics(observed)).any()
 
 
 @torch.no_grad()
