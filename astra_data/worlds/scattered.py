@@ -1,4 +1,4 @@
-"""A simulator whose state is scattered after every step, by Gaussian noise of a given shape."""
+"""A simulator with Gaussian noise of a given covariance on its state after every step."""
 
 import torch
 from torch import Tensor
@@ -7,25 +7,25 @@ from astra_data.worlds.protocols import PlacedSimulator
 
 
 class RandomizedSimulator:
-    """Step the simulator, add noise, and settle it there.
+    """Steps a simulator, adds noise to its state, and settles it there.
 
     Attributes:
         state: (B, X). blocked: (B,) bool, the last step was stopped at the edge of the free space.
     """
 
     def __init__(self, simulator: PlacedSimulator, noise_factor: Tensor) -> None:
-        """Wrap `simulator`; the noise is `noise_factor` (X, X) times standard normal numbers."""
+        """Wrap `simulator`; the noise has covariance L Lᵀ, where L is `noise_factor` (X, X)."""
         self.simulator = simulator
         self.noise_factor = noise_factor
 
     @property
     def state(self) -> Tensor:
-        """The scattered states, (B, X)."""
+        """The present states, noise included, (B, X)."""
         return self.simulator.state
 
     @property
     def blocked(self) -> Tensor:
-        """Which were stopped at the edge of the free space, (B,) bool."""
+        """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
         return self.simulator.blocked
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
