@@ -1,15 +1,16 @@
-"""Why policies of the humanoid fall: which way, whether the grounding foretells it, what φ would allow.
+"""Why policies of the humanoid fall: in which direction, whether the grounding predicts it, what φ allows.
 
     uv run python tools/check_humanoid.py runs/humanoid_walker2d --seed 0
 
 reads a finished run and prints
 
-1. how long a humanoid lasts whose legs are told to stay straight;
-2. how humanoids lean some steps before they fall, in held-out recorded episodes and by the policies of rows,
-   and what height NAS's simulator, if it knows of heights, foretells for the fall, given the true history and
-   actions;
-3. how long a humanoid lasts that is shown φ alone, and remembers, once Full Obs has told it on its own way
-   what to do (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
+1. how long a humanoid lasts whose legs are commanded to stay straight;
+2. the lean of humanoids some steps before they fall, in held-out recorded episodes and under the policies of
+   rows, and the height that the simulator of NAS, if its state has one, predicts for the fall from the true
+   history
+   and actions;
+3. how long a recurrent policy on φ alone lasts that was taught by Full Obs on the states that it gets into
+   itself (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
 """
 
 import json
@@ -66,7 +67,7 @@ def no_goals(count: int) -> Tensor:
 
 
 def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
-    """Return how the policy of `row` acts on `count` humanoids; latents come from the simulator's encoder."""
+    """Return the policy of `row` for `count` humanoids; latents come from the simulator's encoder."""
     trained = PolicyFile.load(run / "train" / row / f"seed_{seed}" / "policy.safetensors")
     grounds = method_named(row).grounds
     folder = run / "ground" / base_method(row) / f"seed_{seed}"
@@ -78,14 +79,14 @@ def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
 
 
 def straight(state: Tensor) -> Tensor:
-    """Return the actions (B, 4) that tell hips and knees to stay at 0 and -2 degrees."""
+    """Return the actions (B, 4) that hold hips at 0 and knees at -2 degrees."""
     angles = torch.deg2rad(torch.tensor([0.0, -2.0] * 2))
     return CommandRanges().commands(angles).expand(len(state), -1)
 
 
 @torch.no_grad()
 def walks(act: Act, env: HumanoidEnv) -> list[Walk]:
-    """Let each of the humanoids walk once."""
+    """Run one episode of each humanoid."""
     env.reset()
     active = torch.ones(env.num_envs, dtype=torch.bool)
     lengths = torch.zeros(env.num_envs, dtype=torch.long)
@@ -116,7 +117,7 @@ def recorded(dataset: Path, held_out_share: float, seed: int) -> list[Walk]:
 
 @torch.no_grad()
 def foretold_heights(task: Task, falls: list[Walk], before: int, model: GroundingModel) -> Tensor:
-    """Return the last height (n,) in m as the grounded simulator foretells it `before` steps ahead."""
+    """Return the last height (n,) in m as the grounded simulator predicts it `before` steps ahead."""
     hidden, starts, previous = [], [], []
     for fall in falls:
         start = len(fall.state) - 1 - before
@@ -141,7 +142,7 @@ def foretold_heights(task: Task, falls: list[Walk], before: int, model: Groundin
 
 
 def print_falls(task: Task, name: str, walked: list[Walk], model: GroundingModel) -> None:
-    """Print how humanoids lean before they fall, and what height the grounded simulator foretells."""
+    """Print the lean of humanoids before they fall, and the height that the grounded simulator predicts."""
     all_falls = [walk for walk in walked if walk.fell]
     falls = [fall for fall in all_falls if len(fall.state) > max(BEFORE_FALL) + 1]
     print(f"{name}: {len(all_falls)} falls, {len(falls)} of them after {max(BEFORE_FALL) + 1} steps")
@@ -151,16 +152,16 @@ def print_falls(task: Task, name: str, walked: list[Walk], model: GroundingModel
     for before in BEFORE_FALL:
         ahead, left, up = rotation(torch.stack([fall.state[-1 - before, 3:7] for fall in falls]))[:, 2].T
         roll, pitch = torch.atan2(left, up).abs().rad2deg(), -torch.asin(ahead).rad2deg()
-        told = f"{before:2d} steps earlier: leans {roll.mean():4.1f} deg to a side, {pitch.mean():5.1f} ahead"
+        text = f"{before:2d} steps earlier: leans {roll.mean():4.1f} deg to a side, {pitch.mean():5.1f} ahead"
         if "height_m" in task.quantities:
             wrong = foretold_heights(task, falls, before, model) - last
             rmse = wrong.square().mean().sqrt()
-            told += f"; height foretold for the fall: {wrong.mean():+.2f} m (RMSE {rmse:.2f})"
-        print(f"  {told}", flush=True)
+            text += f"; height predicted for the fall: {wrong.mean():+.2f} m (RMSE {rmse:.2f})"
+        print(f"  {text}", flush=True)
 
 
 class Student(nn.Module):
-    """Sees φ and remembers."""
+    """A recurrent network on φ."""
 
     def __init__(self, task: Task, seen: int, actions: int) -> None:
         super().__init__()
@@ -177,7 +178,7 @@ class Student(nn.Module):
         return torch.tanh(self.head(torch.cat([seen, latent], -1)))
 
     def acts(self, count: int) -> Act:
-        """Return how this acts on `count` humanoids from their starts on."""
+        """Return this as a policy for `count` humanoids from their starts on."""
         hidden, previous = torch.zeros(count, 128), torch.zeros(count, self.actions)
 
         def act(state: Tensor) -> Tensor:
@@ -191,12 +192,12 @@ class Student(nn.Module):
 
 
 def observed(task: Task, state: Tensor) -> Tensor:
-    """Return what is seen of target states (B, S): φ, scaled as for all policies, (B, O)."""
+    """Return observations (B, O) of target states (B, S): φ, scaled as for all policies."""
     return target_observation(task, state, no_goals(len(state)), None, "abstract")
 
 
 def lesson(task: Task, walk: Walk, teacher: Act) -> Tensor:
-    """Return what was seen, done before, and right, (T, O + A + A)."""
+    """Return observation, previous action and the teacher's action, (T, O + A + A)."""
     before = torch.cat([torch.zeros_like(walk.action[:1]), walk.action[:-1]])
     return torch.cat([observed(task, walk.state), before, teacher(walk.state)], -1)
 
@@ -214,16 +215,17 @@ def drawn(lessons: list[Tensor], count: int) -> tuple[Tensor, Tensor]:
 
 
 def teach(task: Task, teacher: Act, env: HumanoidEnv, rounds: int) -> None:
-    """Teach a student on its own way, and print how long it lasts."""
+    """Teach a student on states of its own (DAgger), and print how long it lasts."""
     seen_size, action_size = observed(task, env.state).shape[-1], env.action_size
     student, lessons = Student(task, seen_size, action_size), list[Tensor]()
     optimizer = torch.optim.Adam(student.parameters())
     for number in range(rounds + 1):
         lived = walks(student.acts(env.num_envs) if number else teacher, env)
         lessons += [lesson(task, walk, teacher) for walk in lived]
-        lasted, told = fmean(len(walk.state) for walk in lived), sum(map(len, lessons))
+        lasted, count = fmean(len(walk.state) for walk in lived), sum(map(len, lessons))
         print(
-            f"{'student' if number else 'teacher'} lasts {lasted:.0f} steps; {told:,} told so far", flush=True
+            f"{'student' if number else 'teacher'} lasts {lasted:.0f} steps; {count:,} lessons so far",
+            flush=True,
         )
         for group in optimizer.param_groups:
             group["lr"] = 1e-3 * (1 - number / (rounds + 1))
@@ -242,7 +244,7 @@ def main(
         Path, typer.Argument(help="A finished run of a recipe of the humanoid, as runs/humanoid_walker2d.")
     ],
     seed: Annotated[int, typer.Option(help="One of the run's seeds, and that of all randomness here.")] = 0,
-    rounds: Annotated[int, typer.Option(help="Of teaching.")] = 40,
+    rounds: Annotated[int, typer.Option(help="Rounds of teaching.")] = 40,
 ) -> None:
     """Print why policies of the humanoid fall."""
     try:
@@ -252,15 +254,15 @@ def main(
 
 
 def check(run: Path, seed: int, rounds: int) -> None:
-    """Print what there is to tell of one seed of a run.
+    """Print the results of one seed of a run.
 
     Raises:
         AstraDataError: something that is needed has not been run.
     """
-    told = run / "recipe.json"
-    if not told.is_file():
-        raise BadInputError(f"{told} does not exist: expected a run's folder, such as runs/humanoid_walker2d")
-    recipe = json.loads(told.read_text())
+    file = run / "recipe.json"
+    if not file.is_file():
+        raise BadInputError(f"{file} does not exist: expected a run's folder, such as runs/humanoid_walker2d")
+    recipe = json.loads(file.read_text())
     task = task_named(recipe["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)

@@ -23,7 +23,7 @@ from astra_data.worlds.nao.steps import Floats
 from astra_data.worlds.plane.geometry import wrapped
 
 Tick = Callable[[float], None]
-"""Called with the fraction of a check that is done."""
+"""Takes the fraction of a check that is done."""
 COMMANDS = (
     (0.10, 0.0, 0.0),
     (0.20, 0.0, 0.0),
@@ -41,7 +41,7 @@ AXES = ("forward", "sideways", "turn")
 
 
 class Check(StrEnum):
-    """What can be checked."""
+    """The checks."""
 
     speeds = "speeds"
     lag = "lag"
@@ -52,9 +52,9 @@ class Check(StrEnum):
 
 
 def main(
-    only: Annotated[list[Check] | None, typer.Option(help="Check this alone; may be repeated.")] = None,
+    only: Annotated[list[Check] | None, typer.Option(help="Run only this check; may be repeated.")] = None,
     seed: Annotated[int, typer.Option(help="Of robots and commands.")] = 0,
-    robots: Annotated[int, typer.Option(help="How many walk at random, and for the throughput.")] = 64,
+    robots: Annotated[int, typer.Option(help="Number of robots for random commands and throughput.")] = 64,
 ) -> None:
     """Print one table per check."""
     checks: dict[Check, Callable[[Tick], str]] = {
@@ -73,7 +73,7 @@ def main(
 
 
 def shown(progress: Progress, task: TaskID, fraction: float) -> None:
-    """Move a task's bar."""
+    """Advance the progress bar of a check."""
     progress.update(task, completed=fraction)
 
 
@@ -189,7 +189,7 @@ def falls(robots: int, seed: int, tick: Tick) -> str:
 
 
 def kicks(seed: int, tick: Tick) -> str:
-    """Let robots kick a ball ahead of them from where they stand, and walk into one."""
+    """Measure the speeds of balls that standing robots kick and that walking robots walk into."""
     ways = [(distance, True) for distance in (0.16, 0.18, 0.20, 0.22, 0.25, 0.30)] + [(0.30, False)]
     each, steps, rows = 32, 12, []
     for done, (distance, kick) in enumerate(ways):

@@ -25,7 +25,7 @@ SPEED_M_S = 0.2
 BALL_M = 0.7
 """Ahead of the robot at the start."""
 KICK_M = 0.18
-"""How far ahead it is when the robot kicks."""
+"""Distance of the ball ahead of the robot when it kicks."""
 UPPER_BODY = (
     ((0.0, -0.02, 0.17), (0.0, 0.02, 0.17), 0.055),
     ((0.0, 0.098, 0.1), (0.02, 0.12, 0.0), 0.025),
@@ -33,7 +33,7 @@ UPPER_BODY = (
     ((0.0, -0.098, 0.1), (0.02, -0.12, 0.0), 0.025),
     ((0.02, -0.12, 0.0), (0.1, -0.1, -0.05), 0.022),
 )
-"""Head and arms, for the eye alone: from and to in the torso's frame, radius, in m."""
+"""Head and arms, for the picture only: from and to in the torso's frame, radius, in m."""
 
 
 def main(
@@ -83,7 +83,7 @@ def render(seed: int, width: int) -> list[Image.Image]:
 
 
 def _draw_limbs(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Draw rods from joint to joint, arms and a head; the model itself has only what touches things."""
+    """Draw rods from joint to joint, arms and a head; the model itself has only colliding shapes."""
     capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
     torso, turned = data.xpos[1], data.xmat[1].reshape(3, 3)
     rods = [(data.xpos[model.body_parentid[body]], data.xpos[body], 0.028) for body in range(2, model.nbody)]

@@ -39,17 +39,21 @@ def main(
         recordings = read_recordings(data, MAPPING, Path(home), WalkingConfig())
     pieces = [(piece, one.fps * CONTROL_STEP_S) for one in recordings for piece in one.pieces]
     counts = [int(len(piece) / rows) for piece, rows in pieces]
-    walked, told, fallen = _walked(_actions(pieces, counts), seed)
+    walked, commanded, fallen = _walked(_actions(pieces, counts), seed)
     motions = []
     for number, (piece, rows) in enumerate(pieces):
         for step in range(BEGUN, counts[number] - AHEAD):
             first, last = round(step * rows), round((step + AHEAD) * rows)
             if not piece.broken[first:last].any() and not fallen[step + AHEAD, number]:
                 logged = torch.from_numpy(piece.state[[first, last], :3])
-                pairs = (logged, walked[[step, step + AHEAD], number], told[[step, step + AHEAD], number])
+                pairs = (
+                    logged,
+                    walked[[step, step + AHEAD], number],
+                    commanded[[step, step + AHEAD], number],
+                )
                 motions.append(torch.stack([between(before, after) for before, after in pairs]))
     robot, simulated, raw = torch.stack(motions, dim=1).numpy()
-    print("| in 0.96 s | robot, rms | simulated NAO, rms error | moving at once as told | correlations |")
+    print("| in 0.96 s | robot, rms | simulated NAO, rms error | moving as commanded | correlations |")
     print("| --- | --- | --- | --- | --- |")
     for axis, name in enumerate(("forward (m)", "sideways (m)", "turn (rad)")):
         errors = [_rms(robot[:, axis])] + [_rms((its - robot)[:, axis]) for its in (simulated, raw)]
@@ -73,13 +77,13 @@ def _walked(actions: Tensor, seed: int) -> tuple[Tensor, Tensor, NDArray[np.bool
     """Return poses (T + 1, B, 3) of simulated NAOs and abstract simulator, and which fell, (T + 1, B)."""
     robots = actions.shape[1]
     nao, abstract = BatchedNao(robots, seed=seed), PlanarWalker(robots, timestep_s=CONTROL_STEP_S)
-    walked, told, fallen = [nao.pose], [abstract.state[:, :3]], [nao.fallen.copy()]
+    walked, commanded, fallen = [nao.pose], [abstract.state[:, :3]], [nao.fallen.copy()]
     for action in track(actions, description="walking", transient=True):
         nao.step(walk_command(action).double().numpy())
         walked.append(nao.pose)
-        told.append(abstract.step(action)[:, :3])
+        commanded.append(abstract.step(action)[:, :3])
         fallen.append(nao.fallen.copy())
-    return torch.from_numpy(np.stack(walked)), torch.stack(told).double(), np.stack(fallen)
+    return torch.from_numpy(np.stack(walked)), torch.stack(commanded).double(), np.stack(fallen)
 
 
 def _rms(errors: NDArray[np.float64]) -> float:

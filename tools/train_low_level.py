@@ -26,7 +26,7 @@ from astra_data.worlds.ant.velocity import AntVelocityConfig, AntVelocityEnv
 SETTLED_STEPS = 20
 """One second after a command change, tracking counts as settled."""
 LONGEST_STEPS = 1000
-"""After so many, ants are set up anew."""
+"""Control steps after which ants are reset."""
 
 app = typer.Typer(add_completion=False, help=__doc__)
 
@@ -63,7 +63,7 @@ def train(
 
 
 def save(actor: SoftActor, torque_scale: float, path: Path) -> None:
-    """Write the part of a SAC actor that its mean comes from as a controller checkpoint."""
+    """Write the layers of a SAC actor's mean as a controller checkpoint."""
     linears = [layer for layer in actor.actor if isinstance(layer, nn.Linear)]
     tensors = {"torque_scale": np.array(torque_scale, dtype=np.float32)}
     for index, layer in enumerate(linears):

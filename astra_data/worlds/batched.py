@@ -1,11 +1,11 @@
-"""What a learner needs of a world: B environments stepped at once, rows reset when the learner says so.
+"""The batched environment: B environments stepped at once, whose rows the caller resets.
 
     observation = env.reset()                    (B, O)
     step = env.step(action)                      action (B, A) -> Step, each field (B, ...)
-    observation = env.reset(step.terminated)     only the finished rows start anew
+    observation = env.reset(step.terminated)     restarts the finished rows only
 
-`step.observation` is always what the action led to, also in the last step of an episode, so that learners
-can bootstrap from it; nothing restarts behind the caller's back.
+`step.observation` is always the state that the action led to, also in the last step of an episode, so that
+learners can bootstrap from it. No row restarts by itself.
 """
 
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ class Step:
     Attributes:
         observation: (B, O) float32, after the action.
         reward: (B,) float32.
-        terminated: (B,) bool, the task ended: no value beyond it.
-        success: (B,) bool, the task was fulfilled in this step.
+        terminated: (B,) bool, the episode ended: the value of the next state is 0.
+        success: (B,) bool, the goal was reached in this step.
     """
 
     observation: Tensor
@@ -41,7 +41,7 @@ class BatchedEnv(Protocol):
     action_size: int
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Start the rows in `mask` (B,) anew, by default all; return observations (B, O)."""
+        """Restart the rows in `mask` (B,), by default all; return observations (B, O)."""
         ...
 
     def step(self, action: Tensor) -> Step:
@@ -65,12 +65,12 @@ class TargetEnv(BatchedEnv, Protocol):
 
     @property
     def position(self) -> Tensor:
-        """Where the robots really are, and their balls if they have any, (B, 2) or (B, 4) float32 in m."""
+        """True positions of robots, then of their balls where there are any, (B, 2) or (B, 4) float32, m."""
         ...
 
     @property
     def failed(self) -> Tensor:
-        """Which robots ended badly in their last step, (B,) bool."""
+        """Which robots failed in their last step, (B,) bool."""
         ...
 
     @property
@@ -79,7 +79,7 @@ class TargetEnv(BatchedEnv, Protocol):
         ...
 
     def reseed(self, seed: int) -> None:
-        """Draw whatever is drawn later from `seed`."""
+        """Restart the random numbers at `seed`."""
         ...
 
     def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
@@ -87,11 +87,11 @@ class TargetEnv(BatchedEnv, Protocol):
         ...
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Apply `action` (B, A); rows outside `active` (B,) stand frozen."""
+        """Apply `action` (B, A); rows outside `active` (B,) stay as they are."""
         ...
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
+        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
         ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:

@@ -1,8 +1,8 @@
 """Step B copies of one MuJoCo model at once, on every core.
 
-The copies' states, warm starts included, lie in one array, so that each goes on exactly as a single
-Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thread carries them through one
-`MjData`, which so stays in the core's cache; `mj_step` releases the interpreter lock.
+The copies' states, warm starts included, are rows of one array, so that each goes on exactly as a single
+Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thread steps its copies in one
+`MjData`, which therefore stays in the core's cache; `mj_step` releases the interpreter lock.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,10 +27,11 @@ class BatchedPhysics:
     Attributes:
         qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`.
         qvel: velocities, (B, nv) float64, likewise.
-        state: all that the copies' futures depend on, warm starts included, (B, N) float64; what was copied
-            from it may be written back into it.
+        state: the full state of each copy, warm start included, (B, N) float64; a copy of it can be written
+            back.
         touching: whether anything touched a watched geom when the copy was last stepped, (B,) bool.
-        measured: what was measured of each copy when it was last stepped or set, (B, M) float64.
+        measured: the numbers that `measure` read off each copy when it was last stepped or set, (B, M)
+            float64.
     """
 
     def __init__(
@@ -46,11 +47,11 @@ class BatchedPhysics:
         """Allocate B copies in the model's initial state.
 
         Args:
-            model: what is stepped.
+            model: the model.
             num_envs: B.
             substeps: physics steps per control step.
-            watched_geoms: first and last id of the geoms whose touch is reported, by default none.
-            measure: reads M numbers off a copy that was just stepped or set; must not change its state.
+            watched_geoms: first and last id of the geoms whose contacts are reported, by default none.
+            measure: reads M numbers off a copy that was just stepped or set, without changing its state.
             num_threads: by default one per core.
         """
         self.model = model
@@ -88,7 +89,7 @@ class BatchedPhysics:
     def step(self, control: Floats, active: Bools | None = None) -> None:
         """Apply `control` (B, nu) for one control step to the copies in `active` (B,), by default to all."""
         self._control[:] = control
-        # All threads draw from one iterator (its `next` is atomic), so that none waits for a slow share.
+        # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
         waiting = iter(range(self.num_envs) if active is None else np.flatnonzero(active).tolist())
         helpers = [self._pool.submit(self._step_rows, data, waiting) for data in self._data[1:]]
         self._step_rows(self._data[0], waiting)

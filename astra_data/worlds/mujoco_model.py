@@ -13,8 +13,8 @@ from astra_data.core.errors import BadInputError
 class MujocoModel:
     """B copies of a MuJoCo model; state: qpos (nq) then qvel (nv), action: the motors' controls (nu).
 
-    Every step starts cold, without the solver's memory of the last one: what a pair needs, whose state has
-    just been reset.
+    Every step starts cold, without the solver's warm start from the last one: pairs need that, for their
+    states have just been reset.
 
     Attributes:
         state: (B, nq + nv) float32.
@@ -26,16 +26,18 @@ class MujocoModel:
         """Allocate B copies in the model's initial state.
 
         Args:
-            model: what is stepped.
+            model: the model.
             num_envs: B.
             substeps: physics steps per step.
             num_threads: by default one per core.
 
         Raises:
-            BadInputError: the model's motors have states of their own, which (qpos, qvel) does not hold.
+            BadInputError: the model's actuators have states of their own, which (qpos, qvel) leaves out.
         """
         if model.na:
-            raise BadInputError(f"the model has {model.na} actuator states; expected motors without")
+            raise BadInputError(
+                f"the model has {model.na} actuator states: expected actuators without states"
+            )
         self.model = model
         self.substeps = substeps
         self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]

@@ -1,4 +1,4 @@
-"""TASKS: all of them, by name."""
+"""The tasks by name."""
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError

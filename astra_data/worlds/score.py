@@ -1,4 +1,4 @@
-"""What the rows of a task are compared by."""
+"""Measures by which methods are compared on a task."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,10 @@ class Score:
 
     Attributes:
         measure: its name in evaluation.json, which has one number per episode.
-        title: in a column's head.
-        quantity: what its mean over episodes is, in a sentence.
+        title: of a table's column.
+        quantity: name of its mean over episodes, within a sentence.
         digits: shown behind the decimal point.
-        limit: the largest possible, where axes end; None where they end with what is drawn.
+        limit: the largest possible value, at which axes end; None where there is none.
     """
 
     measure: str

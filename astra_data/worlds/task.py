@@ -1,4 +1,4 @@
-"""What a task is: a target environment, an abstract simulator, the map between them, and what to achieve."""
+"""A task: target environment, abstract simulator, the map between their states, and the objective."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class Varied:
 
 @dataclass(frozen=True)
 class Plane:
-    """What is known of a robot in a plane, among the walls of a maze.
+    """What tasks in a maze have besides.
 
     Attributes:
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
@@ -57,22 +57,23 @@ class Task:
     """A problem of abstract sim2real.
 
     Attributes:
-        name: in recipes. instruction: what LeRobot calls the task.
+        name: in recipes. instruction: LeRobot's task description.
         objective: horizon, reward and success; the maze, if there is one.
-        make_target, make_simulator: the worlds.
+        make_target, make_simulator: build the target environment and the abstract simulator.
         abstraction: φ, target states (..., S) to abstract states (..., X).
-        beyond: what φ drops of target states, scaled to a length of about one, (..., S) to (..., R).
+        beyond: the part of target states that φ drops, scaled to about 1, (..., S) to (..., R).
         state_columns: the columns that hold states, goal and action, with units, frames and roles.
         abstract_state: the column of abstract states, likewise.
         timestep_s: the control period.
-        action_limit: largest action along each axis; both worlds cut off what is beyond.
-        quantities: of abstract states that the gap report tells of, named with their unit: their indices.
+        action_limit: largest action along each axis; target and simulator clip actions to it.
+        quantities: indices in abstract states of what the gap report lists, by name with unit.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
         varied: the same simulator with parameters that vary.
         plane: what only a task in a maze has; None for others.
-        photograph: pictures (K, height, width, 3) of target states (K, S), where they are worth seeing.
-        target_id: what the target is called where several tasks have it, so that episodes of one serve all.
+        photograph: renders target states (K, S) as pictures (K, height, width, 3); None where reports show
+            none.
+        target_id: name of a target that several tasks share, so that episodes of one serve all.
 
     Example:
         >>> from astra_data import TASKS
@@ -103,7 +104,7 @@ class Task:
     target_id: str | None = None
 
     def shares_target(self, other: "Task") -> bool:
-        """Tell whether both tasks have the same target, and differ in what is simulated of it."""
+        """Tell whether both tasks have the same target and differ only in the simulator."""
         return self.target_id is not None and self.target_id == other.target_id
 
     @property
@@ -111,7 +112,7 @@ class Task:
         """What only a task in a maze has.
 
         Raises:
-            BadInputError: this one has no maze.
+            BadInputError: the task has no maze.
         """
         if self.plane is None:
             raise self.without_maze()
@@ -122,29 +123,29 @@ class Task:
         """The maze.
 
         Raises:
-            BadInputError: there is none.
+            BadInputError: the task has no maze.
         """
         if self.objective.layout is None:
             raise self.without_maze()
         return self.objective.layout
 
     def without_maze(self) -> BadInputError:
-        """Return the error of who asks for something planar though there is no maze."""
+        """Return the error for settings that need a maze."""
         return BadInputError(
-            f"expected a task in a maze, got '{self.name}', which has neither walls nor places: leave out "
-            "what needs them (augment, follower, support_penalty, command_limit_m_s, "
+            f"expected a task in a maze, got '{self.name}', which has none: leave out the settings that need "
+            "one (augment, follower, support_penalty, command_limit_m_s, "
             "clearance_m, start 'anywhere')"
         )
 
     @property
     def ball_index(self) -> int | None:
-        """Where in abstract states the position of a ball begins; None where there is none."""
+        """Index in abstract states of the ball's x; None where there is no ball."""
         ball = self.quantities.get("ball_position_m")
         return ball[0] if ball else None
 
     @property
     def fps(self) -> int:
-        """Control steps per second, rounded: LeRobot's are whole numbers."""
+        """Control steps per second, rounded, for LeRobot takes whole numbers."""
         return round(1.0 / self.timestep_s)
 
     def target(self, num_envs: int, **options: Any) -> TargetEnv:  # noqa: ANN401 - handed on
@@ -168,6 +169,6 @@ def roles(
     entries: list[str],
     mirror: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Return what a `Column` is told of its entries: names, units, frames, roles and mirror images."""
+    """Return a `Column`'s arguments on its entries: names, units, frames, roles and mirror images."""
     astra = {"unit": units, "frame": frames, "role": entries}
     return {"names": names, "astra": astra if mirror is None else {**astra, "mirror": mirror}}

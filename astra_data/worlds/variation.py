@@ -40,10 +40,10 @@ class Variation(Config):
     """Ranges of the P parameters of an episode, drawn uniformly; by default all are the plain simulator's.
 
     Attributes:
-        steering: those that replays of recordings tell. They tell no noise: with it none comes closer to a
-            recording, however noisy the target is.
-        sensing: scales of sensors, plain in replays. These begin at states as they were recorded, so a scale
-            could only bring them closer by hiding errors of the motion, and drowns all else.
+        steering: parameters that replays of recordings identify. Noise is none of them: it brings no replay
+            closer to a recording, however noisy the target is.
+        sensing: scales of sensors, plain in replays. Replays begin at recorded states, so a scale could bring
+            them closer only by hiding errors of the motion, and its effect drowns all others.
     """
 
     steering: ClassVar[tuple[str, ...]] = ()
@@ -51,7 +51,7 @@ class Variation(Config):
 
     @staticmethod
     def of_json(ranges: Mapping[str, Sequence[float]]) -> "Variation":
-        """Return what `model_dump` gave, after a way through JSON."""
+        """Return the variation whose `model_dump` was written to JSON."""
         kinds = (BallVariation, JointVariation)
         kind = next((kind for kind in kinds if kind.model_fields.keys() == ranges.keys()), PlanarVariation)
         return kind(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
@@ -90,15 +90,15 @@ class Variation(Config):
         """Map parameters (..., P) to -1 at the lower and 1 at the upper end of their ranges, (..., P)."""
         low, high = self.ranges().to(parameters.device).unbind(-1)
         middle, half = (low + high) / 2, (high - low) / 2
-        # A parameter that does not vary tells nothing: it is 0.
+        # A parameter that does not vary is 0.
         return torch.where(half > 0, (parameters - middle) / half.clamp_min(1e-9), 0.0)
 
 
 class PlanarVariation(Variation):
-    """Of a robot in a plane.
+    """Ranges for a robot in a plane.
 
-    In this simulator friction, action scale and timestep all lengthen or shorten the way of a command, so
-    positions tell their product only; velocities, that of the first two.
+    Friction, action scale and timestep all scale the distance that a command covers, so positions identify
+    only the product of the three; velocities, that of the first two.
     """
 
     steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
@@ -106,13 +106,13 @@ class PlanarVariation(Variation):
     friction: FactorRange = (1.0, 1.0)
     """Factor on the speed that a command gives."""
     action_scale: Range = (0.0, 0.0)
-    """Share by which commands are too long."""
+    """Relative error of commands: 0.1 makes them 10 % longer."""
     action_noise: NoiseRange = (0.0, 0.0)
     """Standard deviation of Gaussian noise on commands, in m/s."""
     position_noise_m: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on shown positions."""
+    """Half width of the uniform noise on observed positions."""
     velocity_noise_m_s: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on shown velocities."""
+    """Half width of the uniform noise on observed velocities."""
     heading_bias_deg: Range = (0.0, 0.0)
     """Commands are turned by this angle."""
     timestep_scale: FactorRange = (1.0, 1.0)
@@ -120,7 +120,7 @@ class PlanarVariation(Variation):
 
 
 class BallVariation(PlanarVariation):
-    """Of a robot in a plane, with a ball."""
+    """Ranges for a robot in a plane, with a ball."""
 
     steering: ClassVar[tuple[str, ...]] = (
         *PlanarVariation.steering,
@@ -131,43 +131,43 @@ class BallVariation(PlanarVariation):
     ball_friction: FactorRange = (1.0, 1.0)
     """Factor on the deceleration of the rolling ball."""
     ball_position_noise_m: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on shown positions of the ball."""
+    """Half width of the uniform noise on observed positions of the ball."""
     ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on shown velocities of the ball."""
+    """Half width of the uniform noise on observed velocities of the ball."""
     contact_direction_deg: Range = (0.0, 0.0)
     """The ball leaves a contact or a kick turned by this angle."""
 
 
 class JointVariation(Variation):
-    """Of joints under position control.
+    """Ranges for joints under position control.
 
-    Friction and timestep both lengthen or shorten a joint's way to its target: where nothing else moves the
-    joint, angles tell little but their quotient; rates, the first alone.
+    Friction and timestep both change how far a joint gets to its target: where nothing else moves the joint,
+    angles identify little but their quotient; rates, the first alone.
     """
 
     steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "timestep_scale")
     sensing: ClassVar[tuple[str, ...]] = ("observation_scale",)
 
     friction: FactorRange = (1.0, 1.0)
-    """Factor on the joints' own damping, beside which that of the position control stays."""
+    """Factor on the joints' own damping; that of the position control stays."""
     action_scale: Range = (0.0, 0.0)
-    """Share by which commands are too long."""
+    """Relative error of commands: 0.1 makes them 10 % longer."""
     action_noise: NoiseRange = (0.0, 0.0)
-    """Standard deviation of Gaussian noise on commands, which are ±1."""
+    """Standard deviation of Gaussian noise on commands, which range over ±1."""
     observation_scale: FactorRange = (1.0, 1.0)
-    """Factor on all that is shown of the state."""
+    """Factor on all entries of the observed state."""
     timestep_scale: FactorRange = (1.0, 1.0)
     """Factor on the control period."""
 
 
 class AnyVariation(BallVariation, JointVariation):
-    """Of any simulator, as recipes give them: parameters that it does not have stay plain."""
+    """Ranges for any simulator, as recipes give them: parameters that it does not have stay plain."""
 
     def of_kind[V: Variation](self, kind: type[V]) -> V:
         """Return the ranges of the parameters that `kind` has.
 
         Raises:
-            BadInputError: another one is not plain.
+            BadInputError: a parameter that `kind` does not have is not plain.
         """
         plain = AnyVariation()
         others = [name for name in plain.names if name not in kind.model_fields]
@@ -233,7 +233,7 @@ class VariedSimulator(ABC):
 
 
 RANDOMIZED_ACTIONS = PlanarVariation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
-"""Of domain randomization in navigation, as printed (Section V-A)."""
+"""Of domain randomization in navigation, as printed in the paper (Section V-A)."""
 
 WIDE_RANGES = PlanarVariation(
     friction=(0.8, 1.2),
@@ -244,8 +244,8 @@ WIDE_RANGES = PlanarVariation(
     heading_bias_deg=(-5.0, 5.0),
     timestep_scale=(0.75, 1.25),
 )
-"""Of COMPASS in navigation, as printed (Section V-A): a control period of 0.015 to 0.025 s is read as shares
-of one of 0.02 s."""
+"""Of COMPASS in navigation, as printed in the paper (Section V-A): a control period of 0.015 to 0.025 s is
+read as factors on one of 0.02 s."""
 
 
 def noisy_command(action: Tensor, deviation: Tensor) -> Tensor:

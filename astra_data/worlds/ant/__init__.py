@@ -1,1 +1,1 @@
-"""Gymnasium's ant in a maze, and the point mass that stands for it."""
+"""Gymnasium's ant in a maze, its low-level controller, and its tasks."""

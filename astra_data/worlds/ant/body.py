@@ -1,8 +1,8 @@
 """The ant's body: its MuJoCo model, its heading frame, its four-fold symmetry, its low-level controller.
 
-The controller turns a planar world-frame velocity command into eight joint torques. It sees the body in a
-heading frame; because the four legs are exact copies, a command is first turned into the quarter that
-points ±45° around the frame's x axis, and the legs are renumbered to match.
+The controller turns a planar world-frame velocity command into eight joint torques. It observes the body in a
+heading frame. The four legs are exact copies, so the frame is first turned by the multiple of 90° for which
+the command points within ±45° of the x axis, and the legs are renumbered to match.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -34,8 +34,8 @@ TOPPLE_COSINE = 0.2
 """The ant has toppled when the cosine between its up axis and the vertical falls below this."""
 TORSO_HEIGHT_M = 0.75
 WALL_REACH_M = 1.3
-"""Farther from all walls than this, measured on the maze's grid, the ant touches none: a stretched leg ends
-1.21 m from the torso's centre, and the grid is up to 0.1 m off."""
+"""With more clearance than this on the maze's grid the ant touches no wall: a stretched leg ends 1.21 m from
+the torso's centre, and the grid is up to 0.1 m off."""
 WALL_HEIGHT = 0.5
 """In units of the maze scale, as in gymnasium-robotics."""
 # Ankle axes alternate; these signs make every leg look like leg 1 (angle 30..70 degrees).
@@ -133,7 +133,7 @@ def rotation_matrix(quaternion: Floats) -> Floats:
 
 
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Describe body and command in the heading frame's quarter that the command points to.
+    """Describe body and command in the heading frame that is turned toward the command.
 
     Args:
         qpos: positions, (B, 15).
@@ -194,8 +194,8 @@ def torques_to_body(torques: Floats, quarters: NDArray[np.intp]) -> Floats:
 class VelocityController:
     """The frozen low-level controller: world-frame planar velocity command in, joint torques out.
 
-    A two-layer ReLU network with tanh output, stored as safetensors. It is evaluated in torch, for numpy's
-    matrix products leave a thread per core spinning, which halves the speed of the physics beside them.
+    A two-layer ReLU network with tanh output, stored as safetensors. It is evaluated in torch because numpy's
+    matrix products leave a thread per core spinning, which halves the speed of the physics.
     """
 
     def __init__(self, layers: Sequence[tuple[Tensor, Tensor]], torque_scale: float) -> None:

@@ -25,7 +25,7 @@ class AntMazeEnv:
     """B ants in a maze; action: world-frame velocity command in m/s, (B, 2), clipped to ±1 per axis.
 
     State (B, 29): qpos (15) then qvel (14), as in Gymnasium. Observation (B, 31): state, then goal (2).
-    Reaching the goal and toppling end an episode; touching a wall is recorded, not punished.
+    Reaching the goal and toppling end an episode; wall contacts are recorded, not punished.
 
     Attributes:
         state: (B, 29) float32. goal: (B, 2) float32. failed: (B,) bool, toppled in the last step.
@@ -52,7 +52,7 @@ class AntMazeEnv:
             num_envs: B.
             seed: of starts, goals and headings.
             leg_scale: factor on the legs' length.
-            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
+            start_anywhere: start anywhere in the free space, not at the task's start (for data collection).
             controller: the low-level controller, by default the one shipped.
             num_threads: physics threads, by default one per core.
         """
@@ -80,7 +80,7 @@ class AntMazeEnv:
 
     @property
     def position(self) -> Tensor:
-        """Where the ants are, (B, 2) float32 in m."""
+        """Positions of the ants, (B, 2) float32 in m."""
         return torch.from_numpy(self.physics.qpos[:, :2]).float()
 
     @property
@@ -89,11 +89,11 @@ class AntMazeEnv:
         return torch.from_numpy(self.physics.touching)
 
     def reseed(self, seed: int) -> None:
-        """Draw later starts, goals and headings from `seed`."""
+        """Restart the random numbers of starts, goals and headings at `seed`."""
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Stand the ants in `mask` (B,) up at new starts with random headings, by default all."""
+        """Set the ants in `mask` (B,), by default all, upright at new starts with random headings."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         count = len(rows)
         objective = self.objective
@@ -112,7 +112,7 @@ class AntMazeEnv:
         self.failed[rows] = False
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
+        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
         return {"physics": torch.from_numpy(self.physics.state.copy()), "goal": self.goal.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -121,7 +121,7 @@ class AntMazeEnv:
         self.goal = state["goal"].clone()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stand frozen."""
+        """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stay."""
         command = action.clamp(-1.0, 1.0).numpy().astype(np.float64)
         before = self.position
         torques = self.controller(self.physics.qpos, self.physics.qvel, command)

@@ -1,4 +1,4 @@
-"""The ant on an open plane, following velocity commands: where its low-level controller is trained."""
+"""The ant on an open plane, following velocity commands: the environment that trains its controller."""
 
 from dataclasses import dataclass
 
@@ -24,10 +24,10 @@ from astra_data.worlds.batched_mujoco import BatchedPhysics, Bools
 
 @dataclass(frozen=True)
 class AntVelocityConfig:
-    """How commands are drawn, how strong the motors are, and what tracking earns.
+    """Distribution of commands, strength of the motors, and rewards.
 
-    At full torque the ant is so violent that SAC learns to stand still (0.45 m/s after 256 k steps); at
-    0.7 of it, it walks. A higher bonus for staying upright has the same effect as full torque.
+    At full torque the ant moves so violently that SAC learns to stand still (0.45 m/s after 256 k steps); at
+    0.7 of it, it learns to walk. A higher reward for staying upright also makes it stand still.
     """
 
     num_envs: int = 64
@@ -67,7 +67,7 @@ class AntVelocityEnv:
         self._quarters: NDArray[np.intp] = np.zeros(config.num_envs, dtype=np.intp)
 
     def reset(self, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """Stand the ants in `mask` (B,) up at random headings, by default all; return (B, 28)."""
+        """Set the ants in `mask` (B,), by default all, upright at random headings; return (B, 28)."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         count = len(rows)
         qpos = standing_pose(count)

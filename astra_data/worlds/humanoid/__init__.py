@@ -1,4 +1,4 @@
-"""Gymnasium's humanoid under four joint commands: its model, its bodies at once, what is abstracted of it."""
+"""Gymnasium's humanoid under four joint commands: model, batched bodies, target, abstract simulators."""
 
 from astra_data.worlds.humanoid.bodies import Humanoids
 from astra_data.worlds.humanoid.locomotion import Locomotion

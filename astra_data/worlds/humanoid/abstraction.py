@@ -1,7 +1,7 @@
-"""φ of the humanoid: what each of its abstract simulators knows of target states (..., 47).
+"""φ of the humanoid, one function per abstract simulator, from target states (..., 47).
 
-numpy in, numpy out, torch in, torch out. Where the humanoid is on the floor is dropped by all: it does not
-matter to how it walks.
+numpy in, numpy out, torch in, torch out. All of them drop the position on the floor, which the dynamics do
+not depend on.
 """
 
 from collections.abc import Callable
@@ -26,14 +26,13 @@ _RATES = slice(POSITIONS + 6, None)
 
 
 def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
-    """Keep what a planar walker has: (..., 47) to (..., 15).
+    """Keep the state of a planar walker: (..., 47) to (..., 15).
 
-    Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee;
-    velocities of all of these, after the torso's forward one; and whether left and right foot touch the
-    floor, 1 or 0. The pitch is the angle by which the torso's forward axis points below the horizon, whatever
-    its heading. Velocities forward, which is level, and up are in m/s. Dropped: the velocity to the side, the
-    heading, how the torso rolls and turns, and the joints that no command moves, though the feet's height is
-    theirs too.
+    Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee; the
+    torso's horizontal velocity along its heading in m/s, then the velocities of all of these; and whether
+    left and right foot touch the floor, 1 or 0. The pitch is the angle of the torso's forward axis below the
+    horizon. Dropped: the velocity to the side, the heading, roll and turning of the torso, and the joints
+    that no command moves, though the feet's heights depend on those too.
     """
     return _mapped(_walker2d, state)
 
@@ -41,7 +40,7 @@ def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tenso
 def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
     """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34).
 
-    Dropped: everything that tells how the body stands in the world.
+    Dropped: position, orientation and velocity of the body.
     """
     return _mapped(_kinematics, state)
 
@@ -49,22 +48,23 @@ def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Ten
 def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
     state: Array,
 ) -> Array:
-    """Keep all joints, how the centre of mass moves and how the torso leans: (..., 47) to (..., 46).
+    """Keep all joints, the motion of the centre of mass and the lean of the torso: (..., 47) to (..., 46).
 
-    After the joints (34): x and y of the centre of mass, seen from the middle between the feet, and its
-    height above the floor, in m; its velocity (3) in m/s. These along level axes of which x is the torso's
-    heading, so that a step looks the same in whatever direction it goes. A humanoid that falls first moves
-    its centre of mass from above its feet, then down. Then, along the torso's axes, which way is up (3) and
-    how fast the torso turns (3) in rad/s: what the paper calls robot-level information, with a reference
-    whose robot is shown both (Radosavovic et al. 2024). Dropped: the heading.
+    After the joints (34): x and y of the centre of mass relative to the midpoint of the feet, and its height
+    above the floor, in m; its velocity (3) in m/s. These are in a level frame whose x axis is the torso's
+    heading, so that steps look the same in all directions. The centre of mass of a falling humanoid first
+    leaves the area above the feet, then drops. Then, in the torso's frame, the direction of up (3) and the
+    torso's angular velocity (3) in rad/s: what the paper calls robot-level information, citing a robot that
+    observes both (Radosavovic et al. 2024). Dropped: the heading.
     """
     return _mapped(_extended_kinematics, state)
 
 
 def beyond_walker2d(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_walker2d` drops: (..., 47) to (..., 34), in spreads.
+    """Return the part that `humanoid_to_walker2d` drops: (..., 47) to (..., 34), in spreads.
 
-    How the torso is turned and spins, its velocity to the left, and the joints that no command moves.
+    The torso's orientation and angular velocity, its velocity to the left, and the joints that no command
+    moves.
     """
     seen = in_spreads(state)
     velocity = _headed(rotation(state[..., _QUATERNION]), state[..., _VELOCITY])
@@ -75,14 +75,14 @@ def beyond_walker2d(state: Tensor) -> Tensor:
 
 
 def beyond_kinematics(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_kinematics` drops, but for x and y: (..., 47) to (..., 11), in spreads."""
+    """Return what `humanoid_to_kinematics` drops except x and y: (..., 47) to (..., 11), in spreads."""
     seen = in_spreads(state)
     height, quaternion = seen[..., [_HEIGHT]], seen[..., _QUATERNION]
     return torch.cat([height, quaternion, seen[..., _VELOCITY], seen[..., _SPIN]], dim=-1)
 
 
 def beyond_extended_kinematics(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_extended_kinematics` drops, but for x and y: (..., 47) to (..., 2).
+    """Return what `humanoid_to_extended_kinematics` drops except x and y: (..., 47) to (..., 2).
 
     The heading, as cosine and sine.
     """
@@ -99,7 +99,7 @@ def _walker2d(state: Tensor) -> Tensor:
     height, spin = state[..., _HEIGHT], state[..., _SPIN]
     joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
     velocity = _headed(turn, state[..., _VELOCITY])
-    # How far the torso's axes point up.
+    # The vertical components of the torso's axes.
     forward, left, up = turn[..., 2, :].unbind(-1)
     level = torch.hypot(left, up).clamp_min(1e-6)
     pitch = torch.atan2(-forward, level)
@@ -133,12 +133,12 @@ def _extended_kinematics(state: Tensor) -> Tensor:
 
 
 def _heading(turn: Tensor) -> Tensor:
-    """Return where torsos turned by (..., 3, 3) look on the floor, as cosine and sine (..., 2)."""
+    """Return the headings of torsos with rotations (..., 3, 3), as cosine and sine (..., 2)."""
     return functional.normalize(turn[..., :2, 0], dim=-1)
 
 
 def _headed(turn: Tensor, vector: Tensor) -> Tensor:
-    """Return vectors (..., 3) along level axes of which x is where torsos turned by (..., 3, 3) look."""
+    """Return vectors (..., 3) in the level frames along the headings of torsos with rotations (..., 3, 3)."""
     cosine, sine = _heading(turn).unbind(-1)
     x, y, z = vector.unbind(-1)
     return torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=-1)

@@ -1,4 +1,4 @@
-"""B humanoids under joint controls, judged as Gymnasium's Humanoid-v5 judges one."""
+"""B humanoids under joint controls, with the rewards and ends of Gymnasium's Humanoid-v5."""
 
 import mujoco
 import numpy as np
@@ -16,14 +16,14 @@ from astra_data.worlds.humanoid.model import (
 
 
 class Humanoids:
-    """B humanoids on floors of their own.
+    """B humanoids, each on a floor of its own.
 
-    Controls count in the reward as Gymnasium's motors' would: those of position actuators as the torques that
-    they apply, each divided by the gear of the motor in its place. Otherwise targets would cost, not effort.
+    The reward's control cost is that of Gymnasium's motors: position actuators count by the torques that they
+    apply, each divided by the gear of the motor in its place. Otherwise targets would cost, not effort.
 
     Attributes:
         physics: their bodies.
-        reward: of the last step, (B,) float64; 0 where a humanoid stood frozen.
+        reward: of the last step, (B,) float64; 0 for humanoids that were not active.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Humanoids:
         Args:
             locomotion: the task.
             num_envs: B.
-            actuators: what controls mean, see `humanoid_model`.
+            actuators: meaning of the controls, see `humanoid_model`.
             num_threads: physics threads, by default one per core.
         """
         self.locomotion = locomotion
@@ -68,7 +68,7 @@ class Humanoids:
         self.reward[rows] = 0.0
 
     def step(self, control: Floats, active: Bools | None = None) -> None:
-        """Apply `control` (B, 17), in the order of the actuators, for 0.015 s; rows not `active` freeze."""
+        """Apply `control` (B, 17), in the order of the actuators, for 0.015 s to the `active` rows (B,)."""
         before = self.physics.measured[:, 0].copy()
         self.physics.step(control, active)
         after, effort, contact = self.physics.measured.T
@@ -78,7 +78,7 @@ class Humanoids:
     def _measure(self, data: mujoco.MjData) -> tuple[float, float, float]:
         """Return x of the centre of mass, and the sums of squared controls and contact forces.
 
-        Like Gymnasium's, they are those of the last evaluation of the dynamics, not of the state after it.
+        As in Gymnasium, they are of the last evaluation of the dynamics, not of the state after it.
         """
         mujoco.mj_rnePostConstraint(self._model, data)
         control = data.actuator_force / self._torque_per_control

@@ -1,4 +1,4 @@
-"""Pictures of humanoids, drawn by MuJoCo without a window."""
+"""Pictures of humanoids, rendered by MuJoCo without a window."""
 
 import os
 
@@ -12,7 +12,7 @@ from astra_data.worlds.humanoid.model import POSITIONS, humanoid_model
 
 _DISTANCE_M = 3.8
 _EYE_M = 0.95
-"""Height of what the camera looks at."""
+"""Height of the point that the camera looks at."""
 _SIDE_DEG = 90.0
 """The camera looks along y, so that x goes to the right."""
 _DOWN_DEG = -8.0
@@ -22,7 +22,7 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
     """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3).
 
     Raises:
-        BadInputError: this machine has no OpenGL that works without a window.
+        BadInputError: no OpenGL without a window is available.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     model = humanoid_model()

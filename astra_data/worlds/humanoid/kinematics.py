@@ -1,32 +1,31 @@
-"""The humanoid's joints without its body: they follow commands, whatever these do to its balance.
+"""The humanoid's joints without its body: they follow commands, whatever happens to its balance.
 
-Every joint of the humanoid is there. Commanded joints go toward their targets, all others toward zero, as
-position control moves a joint that weighs nothing against its damping: the difference shrinks by a constant
-share in each moment, K / (D + d), with the paper's gains K and D and the joint's damping d: 13 per second at
-the hips, 18 at the knees. Within commands' ranges that asks no motor for more than it has. Against the
-humanoid under random commands, each held for 7 steps, angles of commanded joints are 0.24 rad off after 10
-steps; joints that reach their targets at once are 0.36 rad off, joints that do not move 0.30 rad.
+All joints of the humanoid are there. Commanded joints approach their targets, all others zero, as position
+control moves a massless joint against its damping: the difference decays at the rate K / (D + d), with the
+paper's gains K and D and the joint's damping d: 13 per second at the hips, 18 at the knees. Within the range
+of commands no motor exceeds its torque. Against the humanoid under random commands, each held for 7 steps,
+angles of commanded joints are off by 0.24 rad after 10 steps; those of joints that reach their targets at
+once by 0.36 rad, of joints that do not move by 0.30 rad.
 
-The extended simulator adds the centre of mass and its velocity, and how the torso leans and turns. To the
-centre of mass the torso is level, so that the joints alone say how it moves, seen from the
-feet. Its velocity goes toward what it would be if the lower foot did not move, with a time constant of 0.3 s,
-about that of a body of its height when it topples; the height follows the velocity. Without that delay,
-joints that weigh nothing throw the body about: under those commands, its velocity along x is 3.3 m/s off
-after a single step, and not 0.17 m/s. The torso turns on as it did, slowed with the same time constant.
+The extended simulator adds the centre of mass and its velocity, and lean and angular velocity of the torso.
+The centre of mass moves as if the torso were level, so that its motion relative to the feet follows from the
+joints alone. Its velocity approaches the value that it would have if the lower foot did not move, with a time
+constant of 0.3 s, about that of a toppling body of its height; the height integrates the velocity. Without
+that lag, massless joints throw the body about: under those commands, its velocity along x is off by 3.3 m/s
+after a single step, with it by 0.17 m/s. The torso's angular velocity decays with the same time constant.
 
 Both leave out:
 
-* Forces. No joint is ever slowed by what it carries, or pushed by what the foot stands on; none swings past
-  its target. Rates are told, but how fast a joint was does not matter to where it goes.
-* The world, without the extension: height, balance, walking and falling are nowhere in the state.
+* Forces. No load slows a joint, no contact pushes it, and none overshoots its target. Rates are part of the
+  state, but the next state does not depend on them.
+* The world, without the extension: height, balance, walking and falling are not in the state.
 
 The extended one leaves out:
 
-* Falling by itself: there is no weight. A centre of mass that has left the feet stays beside them, and sinks
-  no faster than it did. The state can tell a fall, and so a correction of it can make one.
-* What turns the torso, and what its turning does: the motion that legs give to the centre of mass is as of an
-  upright one.
-* Flight, slipping and double support: one foot always stands, the other never brakes. The floor is nowhere.
+* Falling by itself, for there is no gravity. A centre of mass that has left the feet stays beside them, and
+  sinks no faster than it did. The state does show a fall, so that a correction can make one.
+* The causes and effects of the torso's rotation: legs move the centre of mass as if it were upright.
+* Flight, slipping and double support: one foot always stands, the other never brakes. There is no floor.
 """
 
 from collections.abc import Mapping
@@ -77,7 +76,7 @@ class HumanoidKinematics(FreeStates):
     abstraction = staticmethod(humanoid_to_kinematics)
 
     def __init__(self, num_envs: int, *, ranges: CommandRanges | None = None, device: str = "cpu") -> None:
-        """Put B humanoids' joints at zero; `ranges` says what commands stand for."""
+        """Set B humanoids' joints to zero; `ranges` are the joint angles of commands."""
         self.ranges = ranges or CommandRanges()
         standing = type(self).abstraction(torch.tensor(STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
@@ -101,7 +100,7 @@ class HumanoidKinematics(FreeStates):
         self._timestep_s = TIMESTEP_S * parameters["timestep_scale"]
 
     def step(self, action: Tensor) -> Tensor:
-        """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, X)."""
+        """Follow the commands `action` (B, 4) for one control step; return the new state (B, X)."""
         self.state = self._moved(action)
         return self.state
 
@@ -115,7 +114,7 @@ class HumanoidKinematics(FreeStates):
 
 
 class HumanoidExtendedKinematics(HumanoidKinematics):
-    """The same, with the centre of mass and its velocity, and how the torso leans and turns.
+    """The same, with the centre of mass and its velocity, and lean and angular velocity of the torso.
 
     Attributes:
         state: (B, 46) float32, as `humanoid_to_extended_kinematics` makes it.
@@ -151,8 +150,8 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
 
         Args:
             num_envs: B.
-            ranges: what commands stand for.
-            follow_s: time constant of the body's velocity and spin, above 0.
+            ranges: joint angles of commands.
+            follow_s: time constant of the body's velocity and angular velocity, above 0.
             device: torch device.
         """
         super().__init__(num_envs, ranges=ranges, device=device)

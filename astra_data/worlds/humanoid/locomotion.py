@@ -1,4 +1,4 @@
-"""The locomotion task: walk along x without falling, judged as Gymnasium's Humanoid-v5 does."""
+"""The locomotion task: walk along x without falling, with the reward of Gymnasium's Humanoid-v5."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,15 @@ _QUATERNION = slice(3, 7)
 
 @dataclass(frozen=True)
 class Locomotion:
-    """Rewards and ends of an episode.
+    """Rewards, starts and ends of episodes.
 
     Attributes:
         forward_reward: per m/s of the centre of mass along x.
         healthy_reward: for every step that ends at a healthy height.
-        healthy_m: the torso's height is between these, or the episode ends.
-        effort_cost: for the sum of the squared controls.
-        contact_cost: for the sum of the squared contact forces and torques. contact_cost_limit: its largest.
+        healthy_m: range of healthy heights of the torso, outside of which the episode ends.
+        effort_cost: per unit of the sum of the squared controls.
+        contact_cost: per unit of the sum of the squared contact forces and torques.
+        contact_cost_limit: the largest contact cost of a step.
         reset_noise: half width of the uniform noise on positions and velocities at the start.
     """
 

@@ -45,7 +45,7 @@ MOTOR_RANGE = 0.4
 """Gymnasium's motors take controls of ±0.4, times their gear the torque in N m."""
 
 CONTACT_M = 0.002
-"""A foot whose sole is closer to the floor than this touches it: the sum of both margins in the model."""
+"""A foot touches the floor when its sole is closer to it than this: the sum of both margins in the model."""
 
 Actuators = Literal["positions", "motors"]
 
@@ -53,9 +53,9 @@ Actuators = Literal["positions", "motors"]
 def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
     """Load Gymnasium's humanoid.
 
-    With "motors" it is unchanged. With "positions", controls are joint angles in rad that MuJoCo holds by the
-    paper's gains in every physics step, with torques up to those of the motors. Computed only once per
-    control step, the same gains make the joints chatter.
+    With "motors" it is unchanged. With "positions", controls are joint angles in rad that MuJoCo holds with
+    the paper's gains in every physics step, with torques up to those of the motors. If torques were computed
+    only once per control step, the same gains would make the joints chatter.
     """
     path = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "humanoid.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -73,9 +73,9 @@ def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
 
 @dataclass(frozen=True)
 class CommandRanges:
-    """Joint angles in degrees that the commands -1 and 1 stand for; not in the paper.
+    """Joint angles in degrees of the commands -1 and 1; not in the paper.
 
-    Random commands over the joints' full ranges fell the humanoid in 19 control steps, over these in 65.
+    Random commands over the joints' full ranges make the humanoid fall in 19 control steps, over these in 65.
     """
 
     hip_deg: tuple[float, float] = (-50.0, 20.0)
@@ -83,7 +83,7 @@ class CommandRanges:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The ends of the ranges by name, for what records a simulator."""
+        """The ends of the ranges by name, as datasets record them."""
         ranges = {"hip": self.hip_deg, "knee": self.knee_deg}
         return {
             f"{name}_{end}_deg": value
@@ -92,12 +92,12 @@ class CommandRanges:
         }
 
     def targets(self, action: Tensor) -> Tensor:
-        """Return the angles (..., 4) in rad that commands (..., 4), clipped to ±1, stand for."""
+        """Return the angles (..., 4) in rad of commands (..., 4), clipped to ±1."""
         low, high = self._ends(action)
         return low + (high - low) * (action.clamp(-1.0, 1.0) + 1.0) / 2.0
 
     def commands(self, target: Tensor) -> Tensor:
-        """Return the commands (..., 4) that stand for angles (..., 4) in rad."""
+        """Return the commands (..., 4) of angles (..., 4) in rad."""
         low, high = self._ends(target)
         return 2.0 * (target - low) / (high - low) - 1.0
 

@@ -1,12 +1,12 @@
-"""What walking asks for, on what each abstraction of the humanoid knows: the target's reward, without costs.
+"""The objective of walking on each abstraction of the humanoid: the target's reward without its costs.
 
-All pay for going forward and for staying up, as `Locomotion` does; none knows of effort and contact forces,
-which cost the target little. Nothing is to be reached: who lasts to the horizon without falling succeeds.
+All reward forward velocity and staying up, as `Locomotion` does; the costs of effort and contact forces,
+which are small in the target, are left out. There is no goal to reach: an episode that lasts to the horizon
+without a fall succeeds.
 
-Under random commands the pay for a step differs from the target's, costs aside, by 0.1 to 0.2 (root mean
-square) where the centre of mass is known but not the heading, by 0.6 in the plane, and by 2 of the joints
-alone, whose pay has nothing to do with the target's there: the level torso that it goes by is what such a
-body does not have.
+Under random commands the reward of a step differs from the target's, costs aside, by 0.1 to 0.2 (root mean
+square) where the centre of mass is known but not the heading, by 0.6 in the plane, and by 2 for the joints
+alone. The latter is unrelated to the target's reward under such commands, for it assumes a level torso.
 """
 
 from abc import abstractmethod
@@ -48,15 +48,15 @@ class Walking(Objective):
     """Walk along x and do not fall; there is no goal.
 
     Attributes:
-        locomotion: how the target pays and where it starts.
-        failure_reward: what a step that ends in a fall lacks, which is the reward for staying up.
+        locomotion: rewards and starts of the target.
+        failure_reward: minus the reward for staying up, which a step that ends in a fall does not get.
     """
 
     action_size = len(COMMANDED)
     goal_size = 0
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]
-    """How far each number of a state usually is from standing, (X,)."""
+    """Typical deviation of each entry of a state from standing, (X,)."""
 
     locomotion: Locomotion = field(default_factory=Locomotion)
     failure_reward: float = field(default=-5.0, kw_only=True)
@@ -66,7 +66,7 @@ class Walking(Objective):
         """Return φ of target states (count, 47), (count, X)."""
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return how far states (..., X) are from standing, in spreads and cut off at ±5, (..., X)."""
+        """Return the deviations of states (..., X) from standing, in spreads and clipped to ±5, (..., X)."""
         return normalised(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
 
     @cached_property
@@ -75,7 +75,7 @@ class Walking(Objective):
 
     @abstractmethod
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return how fast the body went forward in a step between states (B, X), (B,) in m/s."""
+        """Return the body's forward velocity in a step between states (B, X), (B,) in m/s."""
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, X) as the target does: almost upright and at rest."""
@@ -86,11 +86,11 @@ class Walking(Objective):
         return np.empty((count, 0))
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return that none of the states (B, X) ends the task well, (B,)."""
+        """Return False for all states (B, X), (B,): there is no goal to reach."""
         return torch.zeros(len(state), dtype=torch.bool, device=state.device)
 
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
-        """Return the reward (B,) of a step between states (B, X), which perhaps ended in a fall (B,)."""
+        """Return the reward (B,) of a step between states (B, X), a fall where `failed` (B,)."""
         task = self.locomotion
         return (
             task.forward_reward * self.velocity(before, after)
@@ -101,7 +101,7 @@ class Walking(Objective):
 
 @dataclass(frozen=True)
 class PlanarWalking(Walking):
-    """Of the planar walker, states (..., 15); it falls as the target does: at no healthy height."""
+    """Walking of the planar walker, states (..., 15); outside of the healthy heights it has fallen."""
 
     spread = (
         *(POSITION_M, LEAN_RAD, *_LEGS_RAD),
@@ -114,12 +114,12 @@ class PlanarWalking(Walking):
         return humanoid_to_walker2d(state)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which torsos (B,) of states (B, 15) are at no healthy height."""
+        """Tell which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
         low, high = self.locomotion.healthy_m
         return ~((state[:, 0] > low) & (state[:, 0] < high))
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return how fast the centre of mass goes forward after the step, (B,) in m/s, arms stiff."""
+        """Return the forward velocity of the centre of mass after the step, with stiff arms, (B,) in m/s."""
         joints = after.new_zeros(2, len(after), _COUNT)
         joints[..., COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
         mass, _ = mass_and_feet(joints[0])
@@ -131,7 +131,7 @@ class PlanarWalking(Walking):
 
 @dataclass(frozen=True)
 class JointWalking(Walking):
-    """Of the joints alone, states (..., 34): nothing in them tells a fall, so every episode succeeds."""
+    """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
 
     spread = (*JOINTS_RAD, *JOINT_RATES_RAD_S)
 
@@ -140,7 +140,7 @@ class JointWalking(Walking):
         return humanoid_to_kinematics(state)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return how fast a level torso goes over its lower foot, which does not slip, (B,) in m/s."""
+        """Return the velocity of a level torso over its lower foot, which does not slip, (B,) in m/s."""
         feet, later = (mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
         rows = torch.arange(len(feet), device=feet.device)
         lower = feet[..., 2].argmin(dim=-1)
@@ -149,11 +149,11 @@ class JointWalking(Walking):
 
 @dataclass(frozen=True)
 class MassWalking(Walking):
-    """Of joints, centre of mass and how the torso leans, states (..., 46).
+    """Walking of joints, centre of mass and the torso's lean, states (..., 46).
 
     Attributes:
-        lowest_mass_m: a centre of mass lower than this has fallen, two steps before the target says so on
-            average; that of one who stands is 0.9 m high.
+        lowest_mass_m: a humanoid whose centre of mass is lower than this has fallen, on average two steps
+            before the target's episode ends; standing it is 0.9 m high.
     """
 
     spread = (
@@ -168,7 +168,7 @@ class MassWalking(Walking):
         return humanoid_to_extended_kinematics(state)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which centres of mass (B,) of states (B, 46) have fallen."""
+        """Tell which centres of mass of states (B, 46) are too low, (B,) bool."""
         return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
-"""Where the humanoid's centre of mass and feet are: its kinematics, for batches of joint angles.
+"""Forward kinematics of the humanoid: centre of mass and feet, for batches of joint angles.
 
-Everything is told in the torso's frame, in m.
+Everything is in the torso's frame, in m.
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ class _Link:
     """A body below the torso, as the model describes it.
 
     Attributes:
-        parent: number of the body that carries it.
+        parent: number of the parent body.
         offset: from the parent's origin to its own, (3,). turn: from its axes to the parent's, (3, 3).
-        joints: their numbers among all 17. anchors: where their axes pass through, (3,) each.
+        joints: their numbers among all 17. anchors: a point on each joint's axis, (3,).
     """
 
     parent: int
@@ -41,7 +41,7 @@ class _Skeleton:
         links: by the body's number.
         axes: of the joints in their bodies, (17, 3). crosses: matrices K with K v = axis x v, (17, 3, 3).
         centres: of mass of each of the 13 bodies in its own frame, (3,) by its number.
-        shares: of the whole mass, (13,). moved: shares of the bodies that each joint moves, (17, 13).
+        shares: of the bodies in the total mass, (13,). moved: the shares that each joint moves, (17, 13).
         feet: number of the body that each foot belongs to, and the foot's centre, (3,).
     """
 
@@ -95,11 +95,11 @@ def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
 
 @dataclass(frozen=True)
 class _Placed:
-    """Where the parts of a humanoid are.
+    """Positions of the parts of a humanoid.
 
     Attributes:
         mass: centre of mass, (..., 3). centres: those of the bodies, (..., 13, 3). feet: (..., 2, 3).
-        axes: of the joints, (..., 17, 3). anchors: where they pass through, (..., 17, 3).
+        axes: of the joints, (..., 17, 3). anchors: points on them, (..., 17, 3).
     """
 
     mass: Tensor
@@ -152,7 +152,7 @@ def mass_and_feet(joints: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mass_velocity(joints: Tensor, rates: Tensor) -> Tensor:
-    """Return the velocity (..., 3) in m/s of the centre of mass, seen from the torso.
+    """Return the velocity (..., 3) in m/s of the centre of mass relative to the torso.
 
     `joints` (..., 17) are angles in rad, `rates` (..., 17) their rates in rad/s.
     """

@@ -16,7 +16,7 @@ class HumanoidEnv:
     """B humanoids; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
 
     State (B, 47): qpos (24) then qvel (23), as in Gymnasium. Observation (B, 45): the state without x and y,
-    which Humanoid-v5 begins with too. Falling ends an episode; nothing else does.
+    as Humanoid-v5's begins. Only falling ends an episode.
 
     Attributes:
         bodies: the humanoids. goal: (B, 0), there is none.
@@ -43,13 +43,13 @@ class HumanoidEnv:
             locomotion: reward, ends and starts.
             num_envs: B.
             seed: of starts.
-            leg_scale: 1; a humanoid's legs are as they are.
-            start_anywhere: false; a humanoid has no place, and starts upright.
-            ranges: what commands stand for.
+            leg_scale: 1, for a humanoid's legs cannot be scaled.
+            start_anywhere: false, for there is no maze.
+            ranges: joint angles of commands.
             num_threads: physics threads, by default one per core.
 
         Raises:
-            BadInputError: another leg scale or start.
+            BadInputError: `leg_scale` or `start_anywhere` has another value.
         """
         if leg_scale != 1.0:
             raise BadInputError(f"evaluate.leg_scale: expected 1 for a humanoid, got {leg_scale}")
@@ -70,16 +70,16 @@ class HumanoidEnv:
 
     @property
     def position(self) -> Tensor:
-        """Where the humanoids are, (B, 2) float32 in m."""
+        """Positions of the humanoids, (B, 2) float32 in m."""
         return self.state[:, :2]
 
     @property
     def wall_contact(self) -> Tensor:
-        """Nothing, for there are no walls: (B,) bool."""
+        """All false, for there are no walls: (B,) bool."""
         return torch.zeros(self.num_envs, dtype=torch.bool)
 
     def reseed(self, seed: int) -> None:
-        """Draw later starts from `seed`."""
+        """Restart the random numbers of starts at `seed`."""
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
@@ -94,7 +94,7 @@ class HumanoidEnv:
         self.failed[rows] = False
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a later `load_state_dict` needs to go on from here, but for later random draws."""
+        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
         physics = self.bodies.physics
         return {
             "physics": torch.from_numpy(physics.state.copy()),
@@ -107,7 +107,7 @@ class HumanoidEnv:
         self.bodies.physics.measured[:] = state["measured"].numpy()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Follow the commands `action` (B, 4) for 0.015 s; rows outside `active` (B,) stand frozen."""
+        """Follow the commands `action` (B, 4) for 0.015 s; rows outside `active` (B,) stay."""
         targets = np.zeros((self.num_envs, len(JOINTS)))
         targets[:, COMMANDED] = self.ranges.targets(action.double()).numpy()
         self.bodies.step(targets, None if active is None else active.numpy())

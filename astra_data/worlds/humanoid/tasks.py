@@ -1,4 +1,4 @@
-"""The humanoid's tasks: Gymnasium's humanoid walks, and three simulators that know less and less of it."""
+"""The humanoid's tasks: walking of Gymnasium's humanoid, with three abstract simulators (Section V-B)."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -48,7 +48,7 @@ _COLUMNS = (
 )
 
 RANDOMIZED_ACTIONS = JointVariation(action_noise=(0.05, 0.05), action_scale=(-0.05, 0.05))
-"""Of domain randomization, as printed (Section V-B)."""
+"""Of domain randomization, as printed in the paper (Section V-B)."""
 
 WIDE_RANGES = JointVariation(
     friction=(0.8, 1.2),
@@ -57,9 +57,9 @@ WIDE_RANGES = JointVariation(
     observation_scale=(0.9, 1.1),
     timestep_scale=(1.0, 0.025 / TIMESTEP_S),
 )
-"""Of COMPASS, as printed (Section V-B): "additionally" to domain randomization. A control period of 0.015 to
-0.025 s begins at the simulator's own, so it only ever gets longer; in navigation, whose simulators have
-another, it is read as shares around theirs."""
+"""Of COMPASS, as printed in the paper (Section V-B): "additionally" to domain randomization. A control period
+of 0.015 to 0.025 s begins at the simulator's own, so it only gets longer; in navigation, whose simulators
+have another one, it is read as factors around theirs."""
 
 Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
 Quantities = Mapping[str, tuple[int, ...]]

@@ -1,6 +1,6 @@
-"""The planar walker's MuJoCo model: the humanoid's legs, all else as one link, in the plane of x and z.
+"""The planar walker's MuJoCo model: the humanoid's legs under one link for the rest, in the plane of x and z.
 
-Lengths, masses, joints and motors are read off the humanoid's model in its initial pose.
+Lengths, masses, joints and motors are read from the humanoid's model in its initial pose.
 """
 
 from collections.abc import Iterable
@@ -59,11 +59,11 @@ def walker_model() -> mujoco.MjModel:
 
     Controls are the targets of these four joints in rad, held as `humanoid_model` holds them.
     """
-    return mujoco.MjModel.from_xml_string(_Drawing().model())
+    return mujoco.MjModel.from_xml_string(_Mjcf().model())
 
 
-class _Drawing:
-    """Draws parts of the humanoid, standing level with its torso at the origin, as MJCF."""
+class _Mjcf:
+    """Writes parts of the humanoid, standing level with its torso at the origin, as MJCF."""
 
     def __init__(self) -> None:
         self.humanoid = humanoid_model()
@@ -107,11 +107,11 @@ class _Drawing:
     def _joint(self, name: str) -> str:
         joint = self.humanoid.joint(name)
         words = {key: float(getattr(joint, key)[0]) for key in ("armature", "damping", "stiffness")}
-        told = " ".join(f'{key}="{value!r}"' for key, value in words.items())
-        return f'{told} limited="true" range="{_text(joint.range)}"'
+        attributes = " ".join(f'{key}="{value!r}"' for key, value in words.items())
+        return f'{attributes} limited="true" range="{_text(joint.range)}"'
 
     def _part(self, name: str, origin: Floats) -> str:
-        """Draw the body `name`, seen from `origin`."""
+        """Return the body `name` in a frame at `origin`."""
         body = self.humanoid.body(name).id
         geom = int(self.humanoid.body_geomadr[body])
         radius, half_length, _ = self.humanoid.geom_size[geom]
@@ -124,7 +124,7 @@ class _Drawing:
         return f"{self._inertia([body], origin)}<geom {shape}/>"
 
     def _inertia(self, bodies: list[int], origin: Floats) -> str:
-        """Lump `bodies` together, seen from `origin`; of their inertia only that about y counts."""
+        """Return the inertia of `bodies` taken together in a frame at `origin`; only that about y matters."""
         masses, places = self.humanoid.body_mass[bodies], self.data.xipos[bodies]
         centre = masses @ places / masses.sum()
         turns = self.data.ximat[bodies].reshape(-1, 3, 3)
@@ -140,7 +140,7 @@ def _text(values: Iterable[float]) -> str:
 
 @cache
 def _leg_offsets() -> tuple[tuple[float, float], ...]:
-    """Return x and z from torso to hip, hip to knee and knee to foot, legs stretched; both legs are alike."""
+    """Return x and z from torso to hip, hip to knee and knee to foot of a stretched leg."""
     humanoid = humanoid_model()
     data = mujoco.MjData(humanoid)
     mujoco.mj_forward(humanoid, data)
@@ -150,7 +150,7 @@ def _leg_offsets() -> tuple[tuple[float, float], ...]:
 
 
 def sole_clearance(pose: Tensor) -> Tensor:
-    """Return how far the left and the right sole are above the floor, (..., 2) in m.
+    """Return the heights of the left and the right sole above the floor, (..., 2) in m.
 
     `pose` (..., 6): height in m and pitch of the torso, left hip, left knee, right hip, right knee in rad.
     """

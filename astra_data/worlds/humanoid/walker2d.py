@@ -1,25 +1,25 @@
 """The most abstract simulator of the humanoid: a walker in the plane, with legs under one rigid link.
 
-It has what the plane has. The legs' links, feet, joints, motors and masses are the humanoid's; trunk, head
-and arms are one link that weighs and balances as they do with their joints at zero. It stands, steps, swings
-its legs and falls forward or backward, by the same physics and the same position control.
+It is the humanoid reduced to the plane of x and z. The legs' links, feet, joints, motors and masses are the
+humanoid's; trunk, head and arms are one link with their mass and centre of mass at joint angles of zero. It
+stands, steps, swings its legs and falls forward or backward, with the same physics and position control.
 
 It leaves out:
 
-* Falling to the side, as a humanoid that learns to walk mostly does. Here no policy ever pays for it, nor
+* Falling to the side, as a humanoid that learns to walk mostly does. No policy is punished for it here, or
   learns to shift its weight from foot to foot.
-* Turning. The walker always looks along x; a humanoid that turned away walks, but not there.
-* Waist, hips' other axes, arms. The humanoid's hold their angles only as well as their motors can, and give
-  way to gravity and to the legs' motion; here they are stiff.
-* Legs that hit each other.
-* Which part of a foot touches: both worlds have spheres for feet, but a humanoid that rolls lifts one of them
-  at joint angles at which the walker stands on both. Contacts that a step leads to come from the joints and
-  the torso here, others than those of a humanoid in that pose.
-* How the waist and the hips' other axes lower the feet. At the humanoid's height of the torso the walker's
-  would often be inside the floor, which would throw it into the air. So where it is set with its feet too
-  low, the floor is lower by that much, until it is set anew: in every step, where it is corrected or
-  `[plus] residual_noise` scatters it.
-* The memory of MuJoCo's solver from step to step.
+* Turning. The walker always faces along x; a humanoid that has turned walks in another direction.
+* Waist, hips' other axes, arms. The humanoid's are held by limited motors, and give way to gravity and to the
+  legs' motion; here they are stiff.
+* Collisions between the legs.
+* Rolling. Feet are spheres in both, but a rolled humanoid lifts one of them at joint angles at which the
+  walker stands on both. Contacts after a step follow from joints and torso here, and differ from those of a
+  humanoid in that pose.
+* The effect of the waist and the hips' other axes on the height of the feet. At the humanoid's torso height
+  the walker's feet would often be inside the floor, which would throw it into the air. So a walker that is
+  set with its feet too low gets a floor that is lower by that much until it is set again: in every step,
+  where it is corrected or `[plus] residual_noise` adds noise.
+* The warm start of MuJoCo's solver from step to step.
 """
 
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ class HumanoidWalker2d(FreeStates):
 
     Attributes:
         state: (B, 15) float32, as `humanoid_to_walker2d` makes it.
-        memory: how much lower than at 0 the floors are, in m, (B, 1) float64.
+        memory: depth of the floors below 0 in m, (B, 1) float64.
     """
 
     action_size = 4
@@ -78,11 +78,11 @@ class HumanoidWalker2d(FreeStates):
         num_threads: int | None = None,
         device: str = "cpu",
     ) -> None:
-        """Stand B walkers up.
+        """Build B standing walkers.
 
         Args:
             num_envs: B.
-            ranges: what commands stand for.
+            ranges: joint angles of commands.
             num_threads: physics threads, by default one per core.
             device: torch device of states and actions; the physics runs on the CPU.
         """
@@ -119,14 +119,14 @@ class HumanoidWalker2d(FreeStates):
             model.opt.timestep = scale * plain.opt.timestep
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the rows in `rows` (n,), by default all, to `state` (n, 15), on floors that bear their feet."""
+        """Set the rows in `rows` (n,), by default all, to `state` (n, 15), on floors below their feet."""
         super().reset_to(state, rows)
         sunk = self._sunk(state)
         self.memory = sunk if rows is None else self.memory.index_copy(0, rows, sunk)
 
     @staticmethod
     def _sunk(state: Tensor) -> Tensor:
-        """Return how far feet are inside the floor, (B, 1) float64 in m."""
+        """Return the depth of the lower foot in the floor, (B, 1) float64 in m."""
         return (-sole_clearance(state[:, _POSE].double()).amin(-1, keepdim=True)).clamp_min(0.0)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
@@ -135,12 +135,12 @@ class HumanoidWalker2d(FreeStates):
         return super().settle(before, torch.cat([landed[:, _MOTION], contacts], dim=-1))
 
     def step(self, action: Tensor) -> Tensor:
-        """Follow the commands `action` (B, 4) for 0.015 s, or as varied; return the new state (B, 15)."""
+        """Follow the commands `action` (B, 4) for one control step; return the new state (B, 15)."""
         model, count = self._model, len(self.state)
         initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
         motion, sunk = self.state[:, _MOTION].cpu().double(), self.memory[:, 0].cpu()
         motion[:, 0] += sunk
-        # Behind the time, and x, where every step begins anew.
+        # After the time and x, which are 0 at the start of every step.
         initial[:, 2 : 2 + _MOTION.stop] = motion.numpy()
         targets = self.ranges.targets(action.cpu().double()).numpy()
         control = np.repeat(targets[:, None], CONTROL_SUBSTEPS, axis=1)

@@ -1,4 +1,4 @@
-"""A simulated stand-in for the NAO V6: its body, its legs' kinematics, its walk, B robots at once."""
+"""A simulated stand-in for the NAO V6: body, leg kinematics, walk, batched robots, tasks."""
 
 from astra_data.worlds.nao.body import nao_model
 from astra_data.worlds.nao.robot import BatchedNao, Senses

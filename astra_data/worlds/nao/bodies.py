@@ -1,7 +1,7 @@
-"""The bodies of B NAOs: their physics, servos and ankle reflex, 16 ticks per control step, on every core.
+"""The bodies of B NAOs: physics, servos and ankle reflex, 16 ticks per control step, on every core.
 
-Each robot runs through its whole control step in one thread, so that results do not depend on how many
-threads there are. What differs between robots is written into the thread's own copy of the model before.
+A robot's whole control step runs in one thread, so that results do not depend on the number of threads. The
+robot's own friction and stiffness are first written into the thread's copy of the model.
 """
 
 import copy
@@ -37,14 +37,14 @@ class BatchedBodies:
     """B bodies of one model.
 
     Attributes:
-        state: all that MuJoCo's futures depend on, (B, N).
+        state: MuJoCo's full states, (B, N).
         qpos, qvel: views of it, (B, nq), (B, nv).
-        sent: angles under way to the servos, (B, delay + 16, 12) in rad: the last ticks of the control step
-            before, which may not have arrived, then this one's.
+        sent: angles sent to the servos, (B, delay + 16, 12) in rad: the last ticks of the previous control
+            step, which may not have arrived, then this one's.
         tilting: low-passed measured rates about x and y, (B, 2) in rad/s.
         held: angles planned for the last tick, (B, 12) in rad.
-        waited: ticks for which a foot has waited to be lifted, (B,) int.
-        gyro: rates measured last, (B, 3) in rad/s.
+        waited: ticks for which the present lift of a foot has been delayed, (B,) int.
+        gyro: last measured rates, (B, 3) in rad/s.
         pressure: on the points of the soles, left foot's then right foot's, (B, 8) in N.
         fallen: (B,) bool; a fallen robot stays as it is until its reset.
         touching: whether the robot touched a wall in its last control step, (B,) bool.
@@ -104,14 +104,14 @@ class BatchedBodies:
             noise: of the gyroscope, (B, 16, 3) in rad/s.
 
         Returns:
-            How many ticks of the targets were followed; the others were waited for, (B,) int.
+            The number of ticks of the targets that were followed, (B,) int; in the others a lift was delayed.
         """
         self.touching[rows] = False
         rows = rows[~self.fallen[rows]]
         before = self.sent.shape[1] - TICKS
         self.sent[rows, :before] = self.sent[rows, TICKS:]
         followed = np.zeros(len(self.fallen), dtype=np.intp)
-        # All threads draw from one iterator (its `next` is atomic), so that none waits for a slow share.
+        # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
         waiting = iter(rows.tolist())
         helpers = [
             self._pool.submit(self._step_rows, thread, waiting, targets, noise, followed)
@@ -153,7 +153,7 @@ class BatchedBodies:
             pitch_rate = keep * pitch_rate + (1 - keep) * float(measured[1])
             w, x, y, z = data.qpos[3:7].tolist()
             roll = atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
-            # Positive to the right: over the left foot it is negative.
+            # Positive rolls are to the right; leaning over the left foot is negative.
             lean = -(roll + style.lean_ahead_s * roll_rate) * lifts_off[followed]
             if lean > style.lean_rad and waited < style.longest_wait_ticks:
                 waited, carries = waited + 1, (True, True)

@@ -1,7 +1,7 @@
-"""The NAO's body as a MuJoCo model: twelve leg joints, arms and head held still, primitive shapes.
+"""The NAO's body as a MuJoCo model: twelve leg joints, rigid arms and head, primitive shapes.
 
-Only what matters to walking collides: four points of each sole with the floor, both feet and the chest with
-the walls, feet and shanks with the ball. A robot that has fallen has nothing to lie on.
+Only collisions that matter to walking are simulated: four points of each sole with the floor, both feet and
+the chest with the walls, feet and shanks with the ball. A fallen robot sinks into the floor.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -34,13 +34,13 @@ TICK_S = 0.012
 SUBSTEPS = 3
 """Physics steps per tick: 4 ms each."""
 STIFFNESS_NM_PER_RAD = 100.0
-"""Of a servo at full stiffness, ours like damping and armature; damped by 0.68 of the critical."""
+"""Of a servo at full stiffness, at a damping ratio of 0.68; ours, like damping and armature."""
 DAMPING_NM_S_PER_RAD = 1.5
 ARMATURE_KG_M2 = 0.012
 ROLL_TORQUE_NM = 8.0
 """Between nominal (2.5) and stall (12.0) torque of Aldebaran's motor table; yaw and roll joints."""
 PITCH_TORQUE_NM = 5.5
-"""Likewise between 1.6 and 7.8."""
+"""Between nominal (1.6) and stall torque (7.8) likewise."""
 WALL_HEIGHT_M = 0.5
 BALL_MASS_KG = 0.045
 """Of SimRobot's model of the league's ball."""
@@ -48,7 +48,7 @@ GRAVITY = 9.81
 # A rolling solid sphere is slowed by c g / (1.4 R), c being the coefficient of rolling friction.
 _ROLLING_M = ROLLING_M_S2 * 1.4 * BALL_RADIUS_M / GRAVITY
 _SOLE_POINT_RADIUS_M = 0.005
-# Bits of what collides with what.
+# Collision bits.
 _FLOOR, _WALL, _LEG = 1, 2, 4
 
 SIDES = (("L", 1.0), ("R", -1.0))

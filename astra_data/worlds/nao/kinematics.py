@@ -1,9 +1,10 @@
 """The NAO's legs: joint angles to foot poses and, in closed form, back.
 
-A foot's pose is that of its sole below the ankle, seen from the torso: x, y, z in m, roll, pitch, yaw in rad
+A foot's pose is that of its sole below the ankle, in the torso's frame: x, y, z in m, roll, pitch, yaw in rad
 (rotation Rz(yaw) Ry(pitch) Rx(roll)). Both legs share one motor that turns the hips about axes tilted by 45°
-(yaw and pitch at once), so eleven angles serve twelve joints and two feet cannot have any two yaws: the motor
-takes the mean of what the feet would want, the other joints then keep positions and soles' planes exact.
+(yaw and pitch at once), so there are eleven angles for twelve joints, and the feet's yaws depend on each
+other: the motor takes the mean of the angles that each foot alone would need; the other joints then keep the
+soles' positions and planes exact.
 
 The right leg is solved as the left leg's mirror image.
 """
@@ -48,7 +49,7 @@ class LegAngles:
     Attributes:
         angles: the eleven angles in rad, (..., 11).
         yaw_error: yaw reached minus yaw wanted, left and right, in rad, (..., 2).
-        reached: False where a foot is farther from the hip than the leg is long, (..., 2).
+        reached: whether the foot is within the leg's length from the hip, (..., 2) bool.
     """
 
     angles: Floats
@@ -147,10 +148,11 @@ def _triangle(distance: Floats) -> tuple[Floats, Floats]:
 
 
 def _wanted_hip_yaw_pitch(foot: Floats, ankle: Floats, knee: Floats, thigh_lead: Floats) -> Floats:
-    """Return the tilted joint's angle that a (left) leg alone would choose, with no error of yaw.
+    """Return the tilted joint's angle at which a (left) leg alone has no error of yaw.
 
-    Seen from the foot, the hip fixes the ankle's two angles; what they leave of the foot's rotation is the
-    hip's, Ry(shared) Rx(roll + 45°) Ry(pitch) once turned by 45°, whose angles can be read off.
+    In the foot's frame, the position of the hip determines the ankle's two angles. The rest of the foot's
+    rotation is the hip's, Ry(shared) Rx(roll + 45°) Ry(pitch) in a frame turned by 45°, whose angles can be
+    read off.
     """
     x, y, z = np.moveaxis((np.swapaxes(foot, -1, -2) @ -ankle[..., None])[..., 0], -1, 0)
     ankle_roll = np.arctan2(y, z)

@@ -20,8 +20,8 @@ NECK_M: Triple = (0.0, 0.0, 0.1265)
 TOTAL_MASS_KG = 5.36
 
 SOLE_POINTS_M = ((0.100, 0.048), (0.100, -0.038), (-0.048, 0.048), (-0.048, -0.038))
-"""Where the left sole touches the floor, from the ankle: its outline's corners, but in front, where the toes
-are round, as far ahead as its pressure sensors. In the order of those: front left, front right, back left,
+"""Contact points of the left sole, from the ankle: the corners of its outline; in front, where the toes are
+round, as far ahead as the pressure sensors. In the order of the sensors: front left, front right, back left,
 back right."""
 FOOT_M = ((-0.048, 0.114), (-0.038, 0.048))
 """Outline of the left foot, from the ankle: back and front, inner and outer."""
@@ -31,7 +31,7 @@ FOOT_TOP_M = 0.040
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid link, with the joint that carries it where it has one.
+    """A rigid link with its joint to the parent, if it has one.
 
     Attributes:
         name: its joint's name in Aldebaran's documentation, without the side.
@@ -39,7 +39,7 @@ class Link:
         mass_kg: its mass.
         centre_m: its centre of mass.
         inertia: about the centre of mass along the frame's axes, in kg m².
-        axis: the joint's axis, none for a link that never moves.
+        axis: the joint's axis; None for a fixed link.
         limits_deg: the joint's range.
     """
 
@@ -66,7 +66,7 @@ HEAD = (
     Link("HeadYaw", NECK_M, 0.0784, (0, 0, -0.02742), box_inertia(0.0784, (0.04, 0.04, 0.08))),
     Link("HeadPitch", NECK_M, 0.6594, (-0.00112, 0, 0.05258), box_inertia(0.6594, (0.11, 0.13, 0.12))),
 )
-# Offsets from the shoulder, the arm stretched forward; forearm and hand weigh about their middle, ours.
+# Offsets from the shoulder, the arm stretched forward; the centre of mass of forearm and hand is ours.
 ARM = (
     Link("ShoulderPitch", (0, 0, 0), 0.0930, (-0.00165, -0.02663, 0.00014), (8.4e-5, 8.4e-5, 8.4e-5)),
     Link(

@@ -1,8 +1,8 @@
-"""What a NAO believes of the world: where it is, and where the ball is. Batched numpy, no physics.
+"""A NAO's estimates of its own pose and of the ball. Batched numpy, no physics.
 
-Sizes of the errors are those of 65 000 rows of a physical robot's log (Badger RoboCup, published with Corrado
-et al., arXiv 2310.18247), where a ball that nobody touched scattered by 45 mm at 1 m and 106 mm beyond 3 m,
-and the robot's own position jumped by 0.2 m or more five to six times a minute; the rest is ours.
+Magnitudes of the errors are those of 65 000 rows of a physical robot's log (Badger RoboCup, published with
+Corrado et al., arXiv 2310.18247), where the estimate of a ball at rest scattered by 45 mm at 1 m and 106 mm
+beyond 3 m, and the robot's own position jumped by 0.2 m or more five to six times a minute; the rest is ours.
 """
 
 from dataclasses import dataclass
@@ -18,58 +18,58 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class PerceptionErrors:
-    """How wrong a robot is; all can be zero."""
+    """Errors of the estimates; all can be zero."""
 
     white_m: float = 0.005
     """Standard deviation of the position's error from step to step."""
     drift_m: float = 0.03
-    """Standard deviation, per axis, of the part that comes and goes slowly."""
+    """Standard deviation, per axis, of the part that drifts."""
     drift_rad: float = float(np.radians(2.0))
     """Of the heading, likewise."""
     drift_s: float = 2.0
     """Time constant of both."""
     jumps_per_s: float = 5 / 60
-    """How often the position jumps; the error then fades with the drift."""
+    """Rate at which the estimated position jumps; the error then decays like the drift."""
     jump_m: tuple[float, float] = (0.1, 0.3)
-    """How far."""
+    """Range of the distance of a jump."""
     latency_s: float = 0.067
-    """Age of an estimate: half of a camera's period of 33 ms, and 50 ms until it is used."""
+    """Age of an estimate: half of the camera's period of 33 ms, and 50 ms of processing."""
     ball_m: float = 0.012
-    """Standard deviation, per axis, of the ball's place at the robot's feet."""
+    """Standard deviation, per axis, of the ball's position at the robot's feet."""
     ball_m_per_m: float = 0.033
-    """How much it grows with the distance."""
+    """Its increase per metre of distance."""
     ball_most_m: float = 0.106
-    """Beyond this it does not grow."""
+    """Its upper limit."""
     ball_s: float = 0.5
     """Time constant of the ball's error."""
     ball_missed: float = 0.1
-    """Probability that a ball ahead is not seen in a step."""
+    """Probability that a ball in view is not seen in a step."""
     ball_seen_rad: float = float(np.radians(100.0))
     """Largest bearing at which a ball is seen: the head turns by 68 degrees, the camera sees 28 more."""
     ball_speed_keep: float = 0.6
-    """Share of the ball's estimated velocity that a new sight leaves."""
+    """Weight of the previous estimate of the ball's velocity when the ball is seen again."""
 
 
 NO_ERRORS = PerceptionErrors(*(0.0,) * 3, 2.0, 0.0, (0.0, 0.0), *(0.0,) * 4, 0.5, 0.0, np.pi, 0.0)
-"""A robot that knows it all."""
+"""Exact estimates."""
 
 
 class Localisation:
-    """Where B robots believe they are.
+    """Estimated poses of B robots.
 
     Attributes:
-        pose: x, y in m and heading in rad, as believed, (B, 3).
+        pose: estimated x, y in m and heading in rad, (B, 3).
     """
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
-        """Begin without error; steps last `step_s`."""
+        """Start without errors; control steps last `step_s`."""
         self.errors, self.step_s = errors, step_s
         self.pose: Floats = np.zeros((num_robots, 3))
         self._drift: Floats = np.zeros((num_robots, 3))
         self._true: Floats = np.zeros((num_robots, 3))
 
     def reset(self, rows: NDArray[np.intp], pose: Floats, rng: np.random.Generator) -> None:
-        """Begin anew in `rows` (n,) at the true `pose` (n, 3), with an error as large as usual."""
+        """Restart `rows` (n,) at the true `pose` (n, 3), with an error of the usual size."""
         errors = self.errors
         spread = np.array([errors.drift_m, errors.drift_m, errors.drift_rad])
         self._drift[rows] = spread * rng.normal(size=(len(rows), 3))
@@ -77,7 +77,7 @@ class Localisation:
         self.pose[rows] = pose + self._drift[rows]
 
     def update(self, pose: Floats, rng: np.random.Generator, active: Bools) -> None:
-        """Take in the true `pose` (B, 3) of the robots in `active` (B,) after a step."""
+        """Update the estimates of the robots in `active` (B,) after a step to the true `pose` (B, 3)."""
         errors, count = self.errors, len(pose)
         keep = np.exp(-self.step_s / errors.drift_s)
         spread = np.array([errors.drift_m, errors.drift_m, errors.drift_rad])
@@ -97,7 +97,7 @@ class Localisation:
         self._true = np.where(active[:, None], pose, self._true)
 
     def arrays(self) -> dict[str, Floats]:
-        """Return all that later estimates depend on."""
+        """Return the arrays that later estimates depend on."""
         return {"believed": self.pose, "believed_drift": self._drift, "believed_of": self._true}
 
     def restore(self, arrays: dict[str, Floats]) -> None:
@@ -107,15 +107,15 @@ class Localisation:
 
 
 class BallSight:
-    """Where B robots believe their balls are, in the world.
+    """Estimates of B robots of their balls, in the world frame.
 
     Attributes:
         position: in m, (B, 2). velocity: in m/s, (B, 2).
-        unseen_s: since the ball was last seen, (B,).
+        unseen_s: time since the ball was last seen, (B,).
     """
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
-        """Begin without error; steps last `step_s`."""
+        """Start without errors; control steps last `step_s`."""
         self.errors, self.step_s = errors, step_s
         self.position: Floats = np.zeros((num_robots, 2))
         self.velocity: Floats = np.zeros((num_robots, 2))
@@ -123,7 +123,7 @@ class BallSight:
         self._error: Floats = np.zeros((num_robots, 2))
 
     def reset(self, rows: NDArray[np.intp], ball: Floats) -> None:
-        """Begin anew in `rows` (n,), having seen the balls where they lie, (n, 2)."""
+        """Restart `rows` (n,) with the exact positions of the balls, (n, 2)."""
         self.position[rows] = ball
         self.velocity[rows] = 0.0
         self.unseen_s[rows] = 0.0
@@ -132,14 +132,14 @@ class BallSight:
     def update(
         self, ball: Floats, pose: Floats, believed: Floats, rng: np.random.Generator, active: Bools
     ) -> None:
-        """Look for the balls of the robots in `active` (B,).
+        """Update the estimates of the robots in `active` (B,) after a step.
 
         Args:
-            ball: where the balls are, (B, 2).
-            pose: where the robots are, (B, 3).
-            believed: where they believe they are, (B, 3).
+            ball: true positions of the balls, (B, 2).
+            pose: true poses of the robots, (B, 3).
+            believed: estimated poses, (B, 3).
             rng: of all errors.
-            active: which look.
+            active: robots whose estimates are updated, (B,).
         """
         errors = self.errors
         apart = ball - pose[:, :2]
@@ -162,7 +162,7 @@ class BallSight:
         self.unseen_s = np.where(active, np.where(seen, 0.0, self.unseen_s + self.step_s), self.unseen_s)
 
     def arrays(self) -> dict[str, Floats]:
-        """Return all that later estimates depend on."""
+        """Return the arrays that later estimates depend on."""
         return {
             "seen_ball": self.position,
             "seen_ball_velocity": self.velocity,

@@ -1,4 +1,4 @@
-"""B walking NAOs: commanded velocities in, what the robots feel and where they truly are out."""
+"""B walking NAOs: commanded velocities in, sensor readings and true poses out."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,12 +22,12 @@ from astra_data.worlds.plane.mazes import Maze
 CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS
 _MIDDLE_M = 0.03
-"""A ball that is less far aside is either foot's: from step to step the torso sways as far."""
+"""Either foot may kick a ball that is less far to the side: the torso sways as far from step to step."""
 
 
 @dataclass(frozen=True)
 class Senses:
-    """What B robots feel at the end of a control step.
+    """Sensor readings of B robots at the end of a control step.
 
     Attributes:
         angles: measured joint angles, (B, 11) in rad (`worlds.nao.kinematics.JOINTS`).
@@ -53,8 +53,8 @@ class BatchedNao:
     """B NAOs, each on a floor of its own.
 
     Attributes:
-        gait: where the robots are in their steps.
-        traits: what sets them apart.
+        gait: the robots' phases in their steps.
+        traits: individual differences of the robots.
         bodies: their physics.
     """
 
@@ -70,7 +70,7 @@ class BatchedNao:
         style: WalkStyle | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B robots that stand at the origin.
+        """Build B robots standing at the origin.
 
         Args:
             num_robots: B.
@@ -107,7 +107,7 @@ class BatchedNao:
         rng: np.random.Generator,
         ball: Floats | None = None,
     ) -> None:
-        """Stand robots up, with new traits.
+        """Set robots upright, with new traits.
 
         Args:
             rows: which robots, (n,).
@@ -116,7 +116,7 @@ class BatchedNao:
             ball: positions (n, 2) of their balls in m, by default 1 m ahead of them.
 
         Raises:
-            BadInputError: balls for robots that have none.
+            BadInputError: `ball` is given for robots without balls.
         """
         if ball is not None and not self.has_ball:
             raise BadInputError("These robots have no balls to place; build BatchedNao with ball=True.")
@@ -141,8 +141,8 @@ class BatchedNao:
 
         Args:
             command: velocities forward and to the left in m/s, turn in rad/s, (B, 3).
-            active: which robots, (B,); all others, and those that have fallen, stay as they are.
-            kick: which are to kick with the foot on the ball's side when it next swings, (B,).
+            active: which robots move, (B,); all others, and fallen ones, stay as they are.
+            kick: which robots kick with the foot on the ball's side when it next swings, (B,).
 
         Raises:
             BadInputError: `command` has another shape or is not finite.
@@ -207,7 +207,7 @@ class BatchedNao:
 
     @property
     def senses(self) -> Senses:
-        """What the robots feel now."""
+        """Present sensor readings."""
         bodies, left_first = self.bodies, [7, *range(8, 13), *range(14, 19)]
         return Senses(
             angles=bodies.qpos[:, left_first] - self.traits.joint_offset_rad,
@@ -224,17 +224,17 @@ class BatchedNao:
         return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of all that `load_state_dict` needs to go on exactly from here."""
+        """Return copies of what `load_state_dict` needs to go on exactly from here."""
         return {name: value.copy() for name, value in self._arrays().items()} | {"steps": self._steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state`, taken from robots that were built alike."""
+        """Go on from `state` of robots that were built with the same arguments."""
         for name, value in self._arrays().items():
             value[:] = state[name]
         self._steps = int(state["steps"])
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all that changes from step to step, by name, to be written to."""
+        """Return the arrays that change from step to step, by name."""
         bodies = self.bodies
         parts = ("state", "sent", "held", "waited", "tilting", "gyro", "pressure", "fallen", "touching")
         own = {name: getattr(bodies, name) for name in parts}

@@ -1,8 +1,8 @@
-"""Which steps a walking NAO takes: commanded velocities in, where the feet land out. No physics.
+"""Step planning of a walking NAO: commanded velocities in, landing positions of the feet out. No physics.
 
-A step lasts from one landing to the next. When the swinging foot lands, it stands half of the step's *spread*
-ahead of where it would stand at rest beneath the torso, the supporting foot half of it behind; spread is
-(x, y, yaw) in m, m, rad. During a step, the torso so moves by the mean of the spread before and after.
+A step lasts from one landing to the next. When the swinging foot lands, it is half of the step's *spread*
+ahead of its place at rest beneath the torso, the supporting foot half of it behind; spread is (x, y, yaw) in
+m, m, rad. During a step, the torso therefore moves by the mean of the spreads before and after.
 """
 
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ Bools = NDArray[np.bool_]
 
 
 def put_rows(robots: object, rows: NDArray[np.intp], others: object) -> None:
-    """Give the robots `rows` (n,) of B what `others`, a like dataclass of arrays, says of n robots."""
+    """Copy the fields of `others`, a dataclass of arrays of n robots, to the `rows` (n,) of `robots`."""
     for name, values in vars(others).items():
         getattr(robots, name)[rows] = values
 
 
 @dataclass(frozen=True)
 class WalkLimits:
-    """What B-Human's published walking configuration for the V6 allows, but where told otherwise."""
+    """Limits of the walk, from B-Human's published configuration for the V6 unless a field says otherwise."""
 
     forward_m_s: float = 0.250
     backward_m_s: float = 0.150
@@ -43,12 +43,12 @@ class WalkLimits:
 
 
 STRIDE, START, STOP = 0, 1, 2
-"""Kinds of steps: a robot begins and ends to walk with a step in which it only shifts its weight."""
+"""Kinds of steps: the first and the last step of a walk only shift the weight."""
 
 
 @dataclass
 class Gait:
-    """Where B walking robots are in their steps.
+    """Phases of B walking robots in their steps.
 
     Attributes:
         phase: fraction of the step done, (B,).
@@ -56,8 +56,8 @@ class Gait:
         left_swings: which foot is in the air, (B,) bool.
         walking: False for robots that stand, (B,) bool.
         kind: of step: `STRIDE`, `START` or `STOP`, (B,) int.
-        before, after: spread at the step's begin and end, (B, 3).
-        forward_m_s: the forward speed that the limit on its change allows from, (B,).
+        before, after: spread at the step's start and end, (B, 3).
+        forward_m_s: forward speed of the previous step, from which the next may differ by a limit, (B,).
         kicking: whether the swinging foot kicks, (B,) bool.
     """
 
@@ -73,7 +73,7 @@ class Gait:
 
     @classmethod
     def standing(cls, count: int, limits: WalkLimits) -> "Gait":
-        """Return `count` standing robots, which will swing the left foot first."""
+        """Return `count` standing robots, whose first step is the left foot's."""
         return cls(
             phase=np.zeros(count),
             duration_s=np.full(count, limits.step_s),
@@ -104,7 +104,7 @@ class StepPlanner:
     limits: WalkLimits = field(default_factory=WalkLimits)
 
     def attainable(self, command: Floats) -> Floats:
-        """Return the nearest velocities (B, 3) to `command` (B, 3), m/s, m/s, rad/s, that can be walked."""
+        """Return `command` (B, 3), m/s, m/s, rad/s, reduced to velocities that can be walked, (B, 3)."""
         limits, quality = self.limits, self.quality
         x, y, turn = command.T
         turn = np.clip(turn, -limits.turn_rad_s * quality, limits.turn_rad_s * quality)
@@ -121,9 +121,9 @@ class StepPlanner:
         return np.stack([x, y, turn], axis=1)
 
     def advance(self, gait: Gait, command: Floats, seconds: float, on_the_spot: Bools | None = None) -> Bools:
-        """Let time pass, in place; where a step ends, plan the next one by `command` (B, 3).
+        """Advance `gait` by `seconds`, in place; where a step ends, plan the next one by `command` (B, 3).
 
-        A command of zero lets robots come to rest, but for those that are to walk `on_the_spot` (B,).
+        With a command of zero robots come to rest, except those that walk `on_the_spot` (B,).
 
         Returns:
             Which robots began a step, (B,) bool.
@@ -147,7 +147,7 @@ class StepPlanner:
         x = _nearer_zero_or_up_to(gait.forward_m_s, x, limits.slow_down_m_s, limits.speed_up_m_s)
         closed = (gait.after == 0).all(axis=1)
         kind = np.where(gait.kind == STOP, START, np.where(closed & ~called, STOP, STRIDE))
-        # The first stride is to be that of the foot on the side that the robot is to go to.
+        # The first stride is that of the foot on the side that the command leads to.
         sideways = np.where(y != 0, y, turn)
         left_swings = np.where((kind == START) & (sideways != 0), sideways < 0, ~gait.left_swings)
         leads_y, leads_turn = left_swings == (y > 0), left_swings == (turn > 0)
@@ -164,8 +164,8 @@ class StepPlanner:
 
 
 def _nearer_zero_or_up_to(speed: Floats, wanted: Floats, loss: float, gain: float) -> Floats:
-    """Return `wanted` (B,), no more than `gain` away from zero or `loss` toward it from `speed` (B,)."""
+    """Return `wanted` (B,), limited to `gain` away from zero and `loss` toward it from `speed` (B,)."""
     direction = np.where(speed != 0, np.sign(speed), np.sign(wanted))
     along = np.clip(wanted * direction, np.abs(speed) - loss, np.abs(speed) + gain)
-    # On the other side of zero, speed is gained again.
+    # Beyond zero the limit of a gain holds again.
     return np.asarray(direction * np.maximum(along, -gain))

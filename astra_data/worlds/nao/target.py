@@ -1,4 +1,4 @@
-"""NAOs that follow planar velocity commands, in a maze or after a ball. They are simulated stand-ins."""
+"""NAOs, simulated stand-ins, that follow planar velocity commands in a maze or with a ball."""
 
 import json
 
@@ -21,34 +21,34 @@ Floats = NDArray[np.float64]
 SPEED_M_S = 0.25
 """Of a command of 1, along each axis: the largest forward speed of B-Human's walk."""
 TURN_GAIN_PER_S = 2.0
-"""Rate per rad at which a robot turns to where it goes."""
+"""Turning rate per rad between heading and direction of motion."""
 TURN_LIMIT_RAD_S = 1.0
 SEARCH_AFTER_S = 1.5
-"""A robot that has not seen its ball for longer looks around for it."""
+"""A robot that has not seen its ball for longer turns to search for it."""
 _STANDING = 0.05
-"""Shorter commands turn nobody."""
+"""Robots do not turn at shorter commands."""
 _FOOT_LOAD_N = 50.0
 """Scale of the pressures on the soles."""
 STATE_SIZE = NAO_STATE_SIZE
-"""Believed x, y, cos and sin of the heading, planned velocity x, y in the world, angles (11) of the legs'
+"""Estimated x, y, cos and sin of the heading, planned velocity x, y in the world, angles (11) of the legs'
 joints, gyroscope (3), tilt (2), load (2) of the feet, phase (2) of the step, planned velocity (3) in the
 body."""
 BALL_SIZE = 5
-"""What follows where there is a ball: its believed place (2) and velocity (2), since when it is unseen."""
+"""With a ball there follow its estimated position (2) and velocity (2), and the time since it was seen."""
 
 
 class NaoEnv:
     """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
 
-    Where there is a ball, a third entry above 0.5 asks for a kick, however far the ball is: the robot steps
-    on the spot, and swings forward the foot on the ball's side, or either where it lies straight ahead. A
-    control step lasts 0.192 s. The robots turn by themselves to where they go, or to their ball. They act
-    on what they believe, which is also all that their state (B, S) holds; rewards, success and failure go by
-    the truth. Success, falling, and what the task counts as failure end an episode.
+    With a ball, actions are (B, 3), and a third entry above 0.5 asks for a kick, however far the ball is: the
+    robot steps on the spot and swings forward the foot on the ball's side, or either foot if the ball is
+    straight ahead. A control step lasts 0.192 s. The robots turn by themselves to where they go, or to their
+    ball. They act on estimates, which are also all that their state (B, S) holds; rewards, success and
+    failure depend on true positions. Success, falling, and the task's own failures end an episode.
 
     Attributes:
-        goal: (B, 2) float32. failed: (B,) bool, ended badly in the last step.
-        robots: the robots themselves.
+        goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
+        robots: the robots.
     """
 
     def __init__(
@@ -69,14 +69,14 @@ class NaoEnv:
             objective: maze, goal and reward.
             num_envs: B.
             seed: of everything random.
-            ball: whether there is a ball, which abstract states then end with.
-            leg_scale: 1; a NAO's legs are as they are.
+            ball: whether there is a ball.
+            leg_scale: 1, for a NAO's legs cannot be scaled.
             start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
-            errors: of what the robots believe.
+            errors: of the estimates.
             num_threads: of the physics, by default one per core.
 
         Raises:
-            BadInputError: another leg scale.
+            BadInputError: `leg_scale` has another value.
         """
         if leg_scale != 1.0:
             raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
@@ -93,7 +93,7 @@ class NaoEnv:
 
     @property
     def state(self) -> Tensor:
-        """What the robots believe and feel, (B, S) float32."""
+        """Estimates and sensor readings of the robots, (B, S) float32."""
         pose, senses = self.localisation.pose, self.robots.senses
         cos, sin = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
         forward, left, _ = np.split(senses.planned, 3, axis=1)
@@ -120,7 +120,7 @@ class NaoEnv:
 
     @property
     def position(self) -> Tensor:
-        """Where the robots really are, and their balls if they have any, (B, 2) or (B, 4) float32 in m."""
+        """True positions of robots, then of their balls where there are any, (B, 2) or (B, 4) float32, m."""
         return self.objective.places(self.truth)
 
     @property
@@ -129,11 +129,11 @@ class NaoEnv:
         return torch.from_numpy(self.robots.touching.copy())
 
     def reseed(self, seed: int) -> None:
-        """Draw later starts, goals, headings, traits and errors from `seed`."""
+        """Restart the random numbers of starts, goals, headings, traits and errors at `seed`."""
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Stand the robots in `mask` (B,) up at new starts with random headings, by default all."""
+        """Set the robots in `mask` (B,), by default all, to new starts with random headings."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         objective, rng = self.objective, self._rng
         draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
@@ -144,7 +144,7 @@ class NaoEnv:
         return self._observe()
 
     def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
-        """Stand the robots `rows` (n,) up where `state` (n, S) believes them, and their balls likewise."""
+        """Set the robots `rows` (n,) and their balls to the estimated positions in `state` (n, S)."""
         yaw = np.arctan2(state[:, 3], state[:, 2])
         ball = state[:, STATE_SIZE : STATE_SIZE + 2] if self.has_ball else None
         self._stand(rows, np.column_stack([state[:, :2], yaw]), ball)
@@ -157,7 +157,7 @@ class NaoEnv:
         self.failed[rows] = False
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Follow the commands `action` (B, A) for 0.192 s; rows outside `active` (B,) stand frozen."""
+        """Follow the commands `action` (B, A) for 0.192 s; rows outside `active` (B,) stay."""
         moving = np.ones(self.num_envs, dtype=bool) if active is None else active.numpy()
         before = self.truth
         kick = asks_to_kick(action).squeeze(-1).numpy() if self.has_ball else None
@@ -180,10 +180,10 @@ class NaoEnv:
         )
 
     def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
-        """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3), as believed.
+        """Turn commands (B, 2) in the world frame into forward, left and turning speed (B, 3).
 
-        Robots turn to where they go. With a ball they turn to it, and walk the slower the farther it is
-        aside, or not at all while they `kick` (B,); when it is lost they look around.
+        Robots turn to where they go. With a ball they turn to it and walk more slowly the farther it is to
+        the side, and not at all while they `kick` (B,); robots that have lost it turn to search.
         """
         command = velocity.clamp(-1.0, 1.0).double().numpy()
         x, y = (SPEED_M_S * command).T
@@ -204,11 +204,11 @@ class NaoEnv:
         return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a later `load_state_dict` needs to go on from here."""
+        """Return what `load_state_dict` needs to go on from here."""
         arrays = {**self.robots.state_dict(), **self.localisation.arrays(), **self.sight.arrays()}
-        told = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        tensors = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
         drawn = json.dumps(self._rng.bit_generator.state).encode()
-        return told | {"goal": self.goal.clone(), "drawn": torch.tensor(list(drawn), dtype=torch.uint8)}
+        return tensors | {"goal": self.goal.clone(), "drawn": torch.tensor(list(drawn), dtype=torch.uint8)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Go on from `state`."""

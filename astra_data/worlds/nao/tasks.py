@@ -1,8 +1,8 @@
-"""The NAO's tasks, on simulated stand-ins: through an S-shaped maze, and a ball into a goal (Section V-C).
+"""The NAO's tasks, on simulated stand-ins: navigation in an S-shaped maze, and kicking (Section V-C).
 
-Where the paper is silent: a control step is 16 ticks of the robot's 12 ms, 0.192 s, for at 0.25 m/s a robot
-that is to go 9 to 13 m in 500 steps cannot be controlled faster than at 10 Hz; the maze, its starts, the
-field and the rewards are ours.
+What the paper leaves open: a control step is 16 ticks of the robot's 12 ms, 0.192 s, for a robot that covers
+9 to 13 m at 0.25 m/s in 500 steps cannot be controlled at more than 10 Hz; the maze, its starts, the field
+and the rewards are ours.
 """
 
 from functools import partial
@@ -24,7 +24,7 @@ from astra_data.worlds.task import Plane, Task, Varied, roles
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 _RADIUS_M = 0.1
-"""Of the disc that the robot is at walls in its simulators: as in AntMaze, and less than the robot's 0.14."""
+"""Radius of the mass at walls in the simulators: as in AntMaze, and less than the robot's 0.14 m."""
 _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
 _CONTACT: dict[str, Any] = {"kick_reach_m": 0.35, "kick_m_s": 1.0, "reach_m": 0.22, "knock_m_s": 0.7}
 """Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an
@@ -39,8 +39,8 @@ KICK_RANGES = BallVariation(
     ball_velocity_noise_m_s=(0.0, 0.02),
     contact_direction_deg=(-5.0, 5.0),
 )
-"""Of COMPASS in kicking: the paper names the ball's friction, position, velocity and direction after contact,
-and prints no ranges for them; those of the robot are taken."""
+"""Of COMPASS in kicking: the paper names the ball's friction, position, velocity and direction after contact
+without printing ranges for them; these are the robot's."""
 
 _QUANTITIES = {"position_m": (0, 1), "velocity_m_s": (2, 3)}
 _BALL_QUANTITIES = {"ball_position_m": (4, 5), "ball_velocity_m_s": (6, 7)}
@@ -49,7 +49,7 @@ Roles = tuple[tuple[str, ...], list[str], list[str], list[str], list[str]]
 
 
 def _mirrored(joint: str) -> str:
-    """Tell which joint's angle a joint's becomes in the mirror: the sides swap, and rolling turns around."""
+    """Return the joint of a joint's mirror image: sides swap, and roll angles change sign."""
     other = {"L": "R", "R": "L"}.get(joint[0], joint[0]) + joint[1:]
     return f"-{other}" if joint.endswith("Roll") else other
 
@@ -98,36 +98,36 @@ _PLANAR_ROLES: Roles = (
 
 def _columns(*, ball: bool) -> tuple[Column, ...]:
     size = STATE_SIZE + BALL_SIZE * ball
-    told = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
+    state = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
     goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
     command = roles(*(_with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES[:4]))
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
     wish = ", and above 0.5 to stand and kick" if ball else ""
     return (
-        Column(STATE, size=size, meaning=meaning, **told),
+        Column(STATE, size=size, meaning=meaning, **state),
         Column(GOAL, size=2, meaning="the middle of the goal line" if ball else "where to go", **goal),
         Column(ACTION, size=2 + ball, meaning=f"commanded planar velocity, ±1 per axis{wish}", **command),
-        Column(NEXT_STATE, size=size, meaning=f"{meaning}, one control step later", **told),
+        Column(NEXT_STATE, size=size, meaning=f"{meaning}, one control step later", **state),
     )
 
 
 def _with(known: Roles, more: Roles, count: int | None = None) -> Roles:
-    (names, *told), (further, *further_told) = known, more
+    (names, *words), (further, *further_words) = known, more
     units, frames, entries, mirror = (
-        mine + its[:count] for mine, its in zip(told, further_told, strict=True)
+        mine + its[:count] for mine, its in zip(words, further_words, strict=True)
     )
     return (*names, *further[:count]), units, frames, entries, mirror
 
 
 def _abstract(*, ball: bool) -> Column:
     names, units, frames, entries, _ = _with(_PLANAR_ROLES, _BALL_ROLES, 4) if ball else _PLANAR_ROLES
-    told = roles(names, units, frames, entries)
+    entries_of = roles(names, units, frames, entries)
     meaning = "abstract state of the target before the action"
-    return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **told)
+    return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **entries_of)
 
 
 def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
-    """Return a task of what is `own` to it and what all of the NAO's tasks share."""
+    """Return a task with the fields `own` and those that all of the NAO's tasks share."""
     return Task(
         make_target=partial(NaoEnv, ball=ball),
         beyond=nao_beyond,
@@ -154,11 +154,11 @@ NAO_TASKS = (
             spread_m=0.05,
             start_clearance_m=0.3,
             start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
-            # A touch costs as much as a metre: where it costs a third of the way, policies learn to stand.
+            # A touch costs as much as a metre; if it cost a third of the path, policies would learn to stand.
             metre_reward=4.0,
             failure_reward=-4.0,
             path_clearance_m=0.25,
-            # Without them policies without a memory, whose position is not in the latent, do not learn it.
+            # Policies without a memory, whose position is not in the latent, do not learn it without these.
             position_waves=3,
             ends_at_walls=True,
         ),

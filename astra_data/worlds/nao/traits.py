@@ -1,4 +1,4 @@
-"""What sets one robot apart from the next."""
+"""Individual differences between robots."""
 
 from dataclasses import dataclass
 
@@ -15,17 +15,17 @@ class TraitSpread:
     """Ranges that a robot's traits are drawn from; ours where no source is named."""
 
     joint_offset_deg: float = 0.35
-    """Standard deviation of each joint's zero; it makes a robot veer. With 0.7 some turn the wrong way."""
+    """Standard deviation of each joint's zero, which makes a robot veer; with 0.7 some turn the wrong way."""
     stiffness_loss: float = 0.3
     """Largest share of the servos' stiffness that is missing."""
     delay_ticks: tuple[int, int] = (2, 3)
-    """From command to servo, fewest and most."""
+    """Range of the delay from command to servo."""
     friction: tuple[float, float] = (0.4, 0.8)
-    """Of the floor, least and most."""
+    """Range of the floor's friction."""
     gyro_noise_rad_s: float = 0.05
     """Standard deviation per tick and axis: the same for all robots."""
     quality: tuple[float, float] = (0.83, 1.0)
-    """Factor on the top speeds, least and most: B-Human's limits of a worn and of a new robot."""
+    """Range of the factor on the top speeds: B-Human's limits of a worn and of a new robot."""
 
 
 IDENTICAL = TraitSpread(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))

@@ -1,9 +1,9 @@
-"""How the NAO's legs move through its planned steps: commanded velocities in, joint angles out.
+"""The NAO's walk engine: commanded velocities in, joint angles of the planned steps out.
 
 In the style of Walk2014 (Hengst, UNSW 2014): the supporting foot moves back at constant speed beneath a torso
-of constant height, the swinging foot comes forward and is lifted; the torso sways over the supporting foot as
-a linear inverted pendulum would. Angles do not depend on what the robot feels, so many ticks are planned at
-once; only the ankles are corrected by the gyroscope, as they are sent (`worlds.nao.robot`).
+of constant height, the swinging foot moves forward and is lifted; the torso sways over the supporting foot
+like a linear inverted pendulum. Angles do not depend on sensors, so many ticks are planned at once; only the
+ankles are corrected by the gyroscope when the angles are sent (`worlds.nao.bodies`).
 """
 
 from dataclasses import dataclass, fields, replace
@@ -19,41 +19,41 @@ from astra_data.worlds.nao.steps import START, STRIDE, Bools, Floats, Gait, Step
 
 @dataclass(frozen=True)
 class WalkStyle:
-    """How the feet move; ours where no source is told."""
+    """Parameters of the motion; ours where no source is named."""
 
     hip_height_m: float = 0.230
     """B-Human and HULKs."""
     lift_m: float = 0.022
-    """B-Human lifts by 13 mm, HULKs by 8; the servos here give way more."""
+    """13 mm at B-Human, 8 mm at HULKs; the servos here give way more."""
     torso_ahead_m: float = 0.012
-    """How far the torso is ahead of the middle of the ankles: B-Human."""
+    """Distance of the torso ahead of the middle of the ankles: B-Human."""
     sway_foot_m: float = 0.05
-    """Where the sway's pendulum stands, from the middle; its period follows from `pendulum_m`."""
+    """Distance of the foot of the sway's pendulum from the middle."""
     pendulum_m: float = 0.26
-    """About the height of the centre of mass."""
+    """Length of the sway's pendulum, about the height of the centre of mass."""
     step_scale: tuple[float, float, float] = (1.05, 1.3, 1.05)
-    """Factors on steps (x, y, yaw), for what servos and slip take away: fitted to reach commands."""
+    """Factors on steps (x, y, yaw) that make up for servos and slip; fitted to reach commands."""
     gyro_gain: tuple[float, float] = (0.08, 0.04)
     """Rad of ankle per rad/s of the torso, pitch and roll; 0.05 at B-Human and HULKs."""
     gyro_keep: float = 0.6
-    """Share of the filtered rate that lasts to the next tick: B-Human."""
+    """Decay of the low-pass filter on the rates per tick: B-Human."""
     lean_rad: float = 0.02
-    """A foot waits to be lifted while the torso is about to lean farther over it than this."""
+    """The lift of a foot is delayed while the torso is about to lean farther over it than this."""
     lean_ahead_s: float = 0.06
-    """How far ahead the lean is foretold: about what delay and servos take."""
+    """Prediction horizon of the lean: about the delay of commands and servos."""
     longest_wait_ticks: int = 25
     kick_reach_m: float = 0.08
-    """How far a kicking foot swings beyond its step."""
+    """Distance that a kicking foot swings beyond its step."""
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What the legs are to do in the next ticks.
+    """Targets of the legs for the next ticks.
 
     Attributes:
         angles: the eleven angles, (B, ticks, 11) in rad.
-        supports: which feet a walking robot stands on, left and right, (B, ticks, 2) bool.
-        lifts_off: which foot leaves the floor at this tick: 1 left, -1 right, 0 none, (B, ticks).
+        supports: feet that a walking robot stands on, left and right, (B, ticks, 2) bool.
+        lifts_off: foot that leaves the floor at the tick: 1 left, -1 right, 0 none, (B, ticks).
         gaits: the gait before the first tick and after each, ticks + 1.
     """
 
@@ -63,7 +63,7 @@ class Targets:
     gaits: list[Gait]
 
     def reached(self, ticks: NDArray[np.intp]) -> Gait:
-        """Return the gait of robots that came as far as `ticks` (B,)."""
+        """Return the gait of robots that followed `ticks` (B,) of them."""
         parts = {
             part.name: np.stack([getattr(gait, part.name) for gait in self.gaits])[
                 ticks, np.arange(len(ticks))
@@ -89,11 +89,11 @@ class WalkEngine:
         """Walk on for `ticks` of 12 ms, changing `gait` in place.
 
         Args:
-            gait: where the robots are in their steps.
+            gait: the robots' phases in their steps.
             command: velocities, m/s forward, m/s to the left, rad/s, (B, 3).
             ticks: how many.
-            kick: which feet, left and right, are to kick when they swing next, (B, 2), by default none. Who
-                is to kick does not stand still.
+            kick: feet, left and right, that kick when they swing next, (B, 2), by default none. Robots that
+                are to kick keep stepping.
         """
         feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
         if kick is None:
@@ -115,7 +115,7 @@ class WalkEngine:
         )
 
     def feet(self, gait: Gait) -> Floats:
-        """Return where the feet should be now, seen from the torso, (B, 2, 6): `foot_poses`."""
+        """Return the present target poses of the feet in the torso's frame, (B, 2, 6), see `foot_poses`."""
         style, phase = self.style, gait.phase[:, None]
         scale = np.array(style.step_scale) / 2
         behind, ahead = -gait.before * scale, gait.after * scale
@@ -141,9 +141,10 @@ class WalkEngine:
         return pose
 
     def _sway(self, gait: Gait) -> Floats:
-        """Return how far the torso sways to the left of a straight line between begin and end, (B,).
+        """Return the sway of the torso to the left of a straight line from start to end, (B,) in m.
 
-        It moves as a pendulum on the supporting foot that is thrown to be at either end in time.
+        It moves like an inverted pendulum on the supporting foot, with the speed that takes it from start to
+        end within the step.
         """
         rate = np.sqrt(GRAVITY / self.style.pendulum_m)
         done, left = gait.phase * gait.duration_s, (1 - gait.phase) * gait.duration_s
@@ -152,7 +153,7 @@ class WalkEngine:
         begin, end = foot + half * gait.before[:, 1], foot - half * gait.after[:, 1]
         straight = begin * (1 - gait.phase) + end * gait.phase
         swing = (begin * np.sinh(rate * left) + end * np.sinh(rate * done)) / np.sinh(rate * gait.duration_s)
-        # Before the first stride and after the last, from rest to the stride's speed and back.
+        # In the first and the last step, from rest to the stride's speed and back.
         throw = foot * rate * np.tanh(rate * gait.duration_s / 2) * gait.duration_s
         rest = throw * gait.phase * (1 - gait.phase)
         shift = rest * np.where(gait.kind == START, gait.phase, 1 - gait.phase)

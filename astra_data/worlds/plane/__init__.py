@@ -1,1 +1,1 @@
-"""Planar worlds: mazes, a point mass, a ball, and the tasks that they share with robots."""
+"""Planar worlds: mazes, a point mass, a ball, and the objectives of navigation and kicking."""

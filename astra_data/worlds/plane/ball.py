@@ -1,4 +1,4 @@
-"""A ball on a carpet: how it rolls, and how planar bodies kick it and walk into it. Batched torch."""
+"""A ball on a carpet: rolling, and contacts with bodies that kick it or walk into it. Batched torch."""
 
 import torch
 from torch import Tensor
@@ -9,16 +9,16 @@ from astra_data.worlds.plane.geometry import turned
 ROLLING_M_S2 = 0.30
 """Deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)."""
 BALL_RADIUS_M = 0.05
-"""Likewise."""
+"""Of the same ball."""
 _KICKS_ABOVE = 0.5
-"""Third entry of the commands of robots that have a ball."""
+"""A third entry of a command above this asks for a kick."""
 
 
 def asks_to_kick(command: Tensor) -> Tensor:
-    """Tell which commands (B, 3), planar velocity and a wish, ask for a kick: (B, 1) bool.
+    """Tell which commands (B, 3), a planar velocity and a kick entry, ask for a kick: (B, 1) bool.
 
     Raises:
-        BadInputError: the commands say nothing of kicks, as before there was such a wish.
+        BadInputError: the commands have no kick entry, as in datasets from before there was one.
     """
     if command.shape[-1] != 3:
         raise BadInputError(
@@ -34,9 +34,9 @@ def roll(
     """Roll balls for `period_s`, slowed by an even friction until they lie.
 
     Args:
-        position: where the balls are, (B, 2) in m.
+        position: of the balls, (B, 2) in m.
         velocity: of the balls, (B, 2) in m/s.
-        period_s: how long, (B, 1) or one for all.
+        period_s: duration, (B, 1) or one for all.
         deceleration_m_s2: of a rolling ball, (B, 1) or one for all.
 
     Returns:
@@ -60,16 +60,16 @@ def knock(
     speed_m_s: Tensor | float,
     turn_rad: Tensor | float = 0.0,
 ) -> tuple[Tensor, Tensor]:
-    """Knock away the balls that bodies walk into.
+    """Move the balls that bodies walk into.
 
     Args:
-        before: where the bodies were, (B, 2).
-        after: where they are, (B, 2).
-        ball: where the balls are, (B, 2).
-        velocity: of the balls, (B, 2).
-        reach_m: between the centres of a body and a ball that it touches.
-        speed_m_s: at which a ball leaves along the line between the centres, (B, 1) or one for all.
-        turn_rad: the ball leaves turned by this, (B,) or one for all.
+        before: positions of the bodies before the step, (B, 2) in m.
+        after: after it, (B, 2) in m.
+        ball: positions of the balls, (B, 2) in m.
+        velocity: of the balls, (B, 2) in m/s.
+        reach_m: distance between the centres below which a body touches a ball.
+        speed_m_s: of a touched ball, along the line between the centres, (B, 1) or one for all.
+        turn_rad: angle between that line and the ball's direction, (B,) or one for all.
 
     Returns:
         positions and velocities (B, 2) of the balls.
@@ -94,16 +94,16 @@ def kick_away(
     speed_m_s: Tensor | float,
     turn_rad: Tensor | float = 0.0,
 ) -> Tensor:
-    """Kick the balls that bodies are `asked` (B, 1) to and can reach.
+    """Kick balls within reach.
 
     Args:
-        body: where the bodies are, (B, 2).
-        ball: where the balls are, (B, 2).
-        velocity: of the balls, (B, 2).
-        asked: which are to kick, (B, 1) bool.
-        reach_m: between the centres of a body and a ball that it can kick.
-        speed_m_s: at which a ball leaves along the line between the centres, (B, 1) or one for all.
-        turn_rad: the ball leaves turned by this, (B,) or one for all.
+        body: positions of the bodies, (B, 2) in m.
+        ball: of the balls, (B, 2) in m.
+        velocity: of the balls, (B, 2) in m/s.
+        asked: which bodies are to kick, (B, 1) bool.
+        reach_m: distance between the centres below which a body can kick a ball.
+        speed_m_s: of a kicked ball, along the line between the centres, (B, 1) or one for all.
+        turn_rad: angle between that line and the ball's direction, (B,) or one for all.
 
     Returns:
         velocities (B, 2) of the balls.

@@ -10,20 +10,21 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.states import PlanarStates
 
 _LIES_M_S = 0.15
-"""Corrected balls that a step leaves slower lie where they lay before it: they would roll on for 4 cm, and a
-robot's estimate is never quite zero."""
+"""A corrected ball slower than this is put back to rest where it was before the step: it would roll on for at
+most 4 cm, and a robot's estimate of the speed is never quite zero."""
 
 
 class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
 
     A command is the velocity of the next step, in units of the top speed along each axis, and whether to
-    stand and kick. Walls stop the mass, not the ball. A ball within reach of the kick leaves at one speed
-    along the line between the centres, one that the mass walks into at another. Left out: legs, feet, where
-    they are and when they swing, and which way the robot looks.
+    stand and kick. Walls stop the mass, not the ball. A kicked ball within reach leaves at one speed along
+    the line between the centres, one that the mass walks into at another. Left out: the legs, the positions
+    and timing of the feet, and the robot's heading.
 
-    Corrections move a ball only where it rolled or was touched before, and to no speed below which balls lie:
-    how probably it will be touched, they would turn into a ball that creeps, and policies wait for it.
+    Corrections move only balls that rolled or were touched in the step, and leave none at less than 0.15 m/s:
+    an expected correction mixes balls that are touched with others that are not into one that creeps, and
+    policies wait for it.
 
     Attributes:
         parameters: what a dataset paired with this simulator records about it.
@@ -49,15 +50,15 @@ class BallAgent(PlanarStates):
         """Build B of them.
 
         Args:
-            maze: walls around them.
+            maze: the walls.
             num_envs: B.
             timestep_s: control period.
-            radius_m: of the mass, at walls.
+            radius_m: distance that the mass keeps from walls.
             speed_m_s: top speed along each axis.
-            reach_m: the mass touches the ball when their centres are closer.
-            knock_m_s: speed of a ball that is walked into.
-            kick_reach_m: the mass can kick the ball when their centres are closer.
-            kick_m_s: speed of a ball that is kicked.
+            reach_m: distance between the centres below which the mass touches the ball.
+            knock_m_s: speed of a ball that the mass walks into.
+            kick_reach_m: distance between the centres below which the mass can kick the ball.
+            kick_m_s: speed of a kicked ball.
             device: torch device.
         """
         super().__init__(
@@ -109,7 +110,7 @@ class BallAgent(PlanarStates):
         return self.state
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the masses as planar states do; a ball that lay untouched, or is slow, stays where it was."""
+        """Slide the masses to `landed` (B, 8); balls at rest that nothing touched, and slow ones, stay."""
         moved = super().settle(before, landed)
         still = torch.cat([before[:, 4:6], torch.zeros_like(before[:, 6:])], dim=-1)
         rolls = self._rolls & (moved[:, 6:].norm(dim=-1, keepdim=True) > _LIES_M_S)

@@ -1,4 +1,4 @@
-"""Where a point may be: an occupancy grid that positions slide along, and distances to a goal. Batched torch.
+"""Free space of a maze: an occupancy grid that stops moving points, and distances to a goal. Batched torch.
 
 Grids have square cells of the maze's `fine_m` and are indexed [y, x] from the maze's lower left corner.
 """
@@ -13,14 +13,14 @@ from torch import Tensor
 from astra_data.worlds.plane.mazes import Maze
 
 _EDGE_M = 1e-4
-"""How far from the face of a blocked cell a sliding point is stopped."""
+"""Distance from the face of a blocked cell at which a sliding point is stopped."""
 
 
 class FreeSpace:
     """The cells in which the centre of a disc may be.
 
     Attributes:
-        blocked: (height, width) bool, True where the centre may not be.
+        blocked: (height, width) bool, True where the disc would overlap a wall.
         half_extent: half of the maze's width and height in m, (2,).
         cell_m: side of a cell.
     """
@@ -30,7 +30,7 @@ class FreeSpace:
         self.half_extent = half_extent
         self.cell_m = cell_m
         depth = torch.from_numpy(distance_transform_edt(blocked.cpu().numpy()))
-        # How far a blocked cell is from the free ones, in cells; 0 in free ones.
+        # Distance of blocked cells from the nearest free one, in cells; 0 in free ones.
         self._depth = depth.float().to(blocked.device)
         self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
 
@@ -57,7 +57,7 @@ class FreeSpace:
         A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
 
         Returns:
-            where the points come to rest (B, 2), and which of them were stopped (B,).
+            the points' new positions (B, 2), and which points were stopped (B,).
         """
         here = self._cells(start)
         there = self._cells(end)
@@ -82,13 +82,13 @@ class FreeSpace:
 
 @dataclass(frozen=True)
 class GoalDistance:
-    """Length of the shortest free path to a goal, for goals near a fixed one.
+    """Length of the shortest free path to a goal near the maze's goal cell.
 
-    One distance field per point of a small lattice around the usual goal; a goal uses the nearest.
+    There is one distance field per point of a lattice around the cell's middle; a goal uses the nearest.
 
     Attributes:
         fields: (goals, height, width) in m.
-        lattice: the goals that the fields belong to, (goals, 2) in m.
+        lattice: the goal of each field, (goals, 2) in m.
         half_extent: (2,) in m.
         cell_m: side of a field's cell.
     """
@@ -123,7 +123,7 @@ class GoalDistance:
         """Return the distance in m (B,) from `position` (B, 2) to `goal` (B, 2), bilinear in position."""
         field = (goal[:, None] - self.lattice).square().sum(-1).argmin(dim=1)
         _, height, width = self.fields.shape
-        # Cell centres carry the values.
+        # Values are those at cell centres.
         grid = (position + self.half_extent) / self.cell_m - 0.5
         grid = torch.stack([grid[:, 0].clamp(0, width - 1.001), grid[:, 1].clamp(0, height - 1.001)], dim=-1)
         corner = grid.floor()

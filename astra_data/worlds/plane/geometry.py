@@ -55,7 +55,7 @@ class PlanarMap:
         return np.stack(turned, axis=-1)
 
     def of_column(self, column: Column, values: Array) -> Array:
-        """Move the values (T,) or (T, size) of `column` as its roles say; computed in float64.
+        """Move the values (T,) or (T, size) of `column` by the roles of its entries; computed in float64.
 
         Raises:
             BadInputError: the column has no roles.

@@ -1,8 +1,9 @@
-"""The kicking task: knock the ball into the goal. The same in every world, so that rewards compare.
+"""The kicking objective: get the ball into the goal.
 
-The paper prints no reward. Ours: metres by which the ball comes closer to the goal, half of those by which
-the robot comes closer to the place behind the ball, +10 for a goal, -10 for a ball that leaves the field
-elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League at small distances.
+The paper prints no reward. Ours: metres by which the ball comes closer to the goal, plus half the metres by
+which the robot comes closer to the point behind the ball, +10 for a goal, -10 for a ball that leaves the
+field elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League, at smaller
+distances.
 """
 
 from dataclasses import dataclass, replace
@@ -15,12 +16,12 @@ from torch import Tensor
 from astra_data.worlds.objective import PlanarObjective
 
 _NEAR_M = (0.18, 0.5)
-"""From the ball, where recorded episodes begin: from where a foot reaches it on."""
+"""Distances from the ball at which recorded episodes begin; a foot reaches as far as the first."""
 
 
 @dataclass(frozen=True)
 class Kicking(PlanarObjective):
-    """Knock the ball through the goal at the right end of `maze`, an empty field, within `horizon` steps.
+    """Get the ball into the goal at the right end of `maze`, an empty field, within `horizon` steps.
 
     Abstract states begin with robot position and velocity, ball position and velocity, (..., 8). The goal
     (..., 2) is the middle of the goal line. Actions (..., 3) end with whether to kick.
@@ -28,9 +29,9 @@ class Kicking(PlanarObjective):
     Attributes:
         goal_line_m: x of the goal line. goal_half_width_m: of the goal on it.
         side_line_m: |y| of the side lines. back_line_m: x of the line behind.
-        ball_x_m, ball_y_m: where balls lie at the start.
+        ball_x_m, ball_y_m: ranges of the ball's position at the start.
         distance_m: of the robot from the ball at the start.
-        behind_m: distance from the ball of the place behind it, which the shaping reward leads to.
+        behind_m: distance from the ball of the point behind it that the shaping reward leads to.
     """
 
     action_size = 3
@@ -53,7 +54,7 @@ class Kicking(PlanarObjective):
         return np.concatenate([robot, rest, ball, rest], axis=1)
 
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states (count, 8) at rest with the robot near its ball: from afar it rarely meets it."""
+        """Draw states (count, 8) at rest with the robot near its ball, which it rarely meets from afar."""
         return replace(self, distance_m=_NEAR_M).draw_starts(rng, count)
 
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -61,7 +62,7 @@ class Kicking(PlanarObjective):
         return np.tile([self.goal_line_m, 0.0], (count, 1))
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return where robot, ball and goal are, and what moves how, (..., 14)."""
+        """Return positions, velocities, and vectors to the ball, the goal and behind the ball, (..., 14)."""
         robot, velocity, ball, rolling = state.split(2, dim=-1)
         behind = self._behind(ball, goal) - robot
         places = [robot / 2, ball / 2, (goal - ball) / 2]
@@ -73,7 +74,7 @@ class Kicking(PlanarObjective):
         return ball - back
 
     def places(self, state: Tensor) -> Tensor:
-        """Return where robot and ball are in states (..., 8), (..., 4)."""
+        """Return the positions of robot and ball in states (..., 8), (..., 4)."""
         return state[..., [0, 1, 4, 5]]
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -88,7 +89,7 @@ class Kicking(PlanarObjective):
         return out & ~self.reached(state, goal)
 
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
-        """Return the reward (B,) of a step between states (B, 8), which perhaps ended badly (B,)."""
+        """Return the reward (B,) of a step between states (B, 8), a failure where `failed` (B,)."""
         gained = self._potential(after, goal) - self._potential(before, goal)
         return gained + self.success_reward * self.reached(after, goal) + self.failure_reward * failed
 

@@ -1,4 +1,4 @@
-"""Maze grids: walls, free space, distance along the corridors. Shared by target and abstract worlds.
+"""Maze grids: walls, free space, distance along the corridors; shared by targets and abstract simulators.
 
 Cells are indexed (row, column) from the top left; x grows with the column, y falls with the row, and the
 maze is centred on the origin, as in gymnasium-robotics.
@@ -25,7 +25,7 @@ class Maze:
         scale: side of a cell in m.
         start: (row, column) of the usual start cell.
         goal: (row, column) of the usual goal cell.
-        fine_m: resolution of everything that is measured on a grid; divides the scale.
+        fine_m: cell size of the fine grid for clearances and distances; divides the scale.
     """
 
     rows: tuple[str, ...]
@@ -86,9 +86,9 @@ class Maze:
     def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
-        Cells within `radius` m of a wall are not free, and the goal's must be. Paths keep `margin` m from the
-        walls where they can: closer cells cost more the closer they are. Cells that are not free take the
-        value of the nearest one that is, plus the way to it.
+        Cells within `radius` m of a wall are not free; the goal's cell must be. Paths keep `margin` m from
+        walls where they can: within it, cells cost more the closer they are to a wall. Cells that are not
+        free take the value of the nearest free one plus the distance to it.
         """
         free = self.clearance_field > radius
         numbers = np.full(free.shape, -1)
@@ -141,7 +141,7 @@ S_MAZE = Maze(
     goal=(5, 4),
     fine_m=0.05,
 )
-"""An S with corridors of 1 m on half a field of RoboCup's Standard Platform League: ours, likewise."""
+"""An S with corridors of 1 m on half a field of RoboCup's Standard Platform League. Ours too."""
 
 FIELD = Maze(
     rows=("1" * 12, *("1" + "0" * 10 + "1",) * 10, "1" * 12),

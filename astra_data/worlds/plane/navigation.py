@@ -1,7 +1,7 @@
-"""The navigation task: reach a goal in a maze. The same in every world, so that rewards compare.
+"""The navigation objective: reach a goal in a maze.
 
 The paper prints no reward. Ours: progress along the shortest free path to the goal, +10 for reaching it, and
-less for ending badly; sparse and Euclidean-dense forms are options.
+a negative reward for a failure; sparse and Euclidean rewards are options.
 """
 
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ class Navigation(PlanarObjective):
         reward_kind: "geodesic" (progress along the corridors), "euclidean" (along the straight line) or
             "sparse" (none), each plus the bonuses of success and failure.
         metre_reward: for a metre of progress.
-        path_clearance_m: distance from the walls kept by the shortest free path.
-        success_radius_m: closer to the goal than this is success and ends the episode.
-        position_waves: policies also see the sines and cosines of the position, along each axis: one wave
-            across the maze, and so many in all, each half as long as the one before.
+        path_clearance_m: clearance from walls of the shortest free path.
+        success_radius_m: distance from the goal within which the episode ends in success.
+        position_waves: number of waves of which policies see sine and cosine of the position along each
+            axis; the first is as long as the maze is wide, each other half as long as the one before.
         spread_m: standard deviation of start and goal around their cells' centres, per axis.
-        start_clearance_m: distance from the walls kept by starts drawn anywhere.
-        start_offsets_m: of the usual starts from the centre of the start's cell; each is as likely.
+        start_clearance_m: clearance from walls of starts that are drawn anywhere.
+        start_offsets_m: offsets of the usual starts from the centre of the start cell, drawn uniformly.
     """
 
     reward_kind: RewardKind = "geodesic"
@@ -55,7 +55,7 @@ class Navigation(PlanarObjective):
         return {}
 
     def _goal_distance_on(self, device: torch.device) -> GoalDistance:
-        # Kept, for the fields are too large to be moved to an accelerator in every step.
+        # Cached: the fields are too large to move to an accelerator in every step.
         if device not in self._goal_distances:
             self._goal_distances[device] = self.goal_distance.to(device)
         return self._goal_distances[device]
@@ -85,7 +85,7 @@ class Navigation(PlanarObjective):
         return np.asarray(np.array(self.maze.cell_centre(*cell)) + noise)
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return position, velocity, goal and the way to it, (..., 8), and waves of the position."""
+        """Return position, velocity, goal and the vector to it, (..., 8), and the position's waves."""
         half = torch.tensor(self.maze.half_extent, dtype=state.dtype, device=state.device)
         position, velocity = state[..., :2], state[..., 2:]
         waves = [torch.pi * 2**octave * position / half for octave in range(self.position_waves)]
@@ -93,11 +93,11 @@ class Navigation(PlanarObjective):
         return torch.cat([*seen, *map(torch.sin, waves), *map(torch.cos, waves)], dim=-1)
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which of `state` (B, 2 or more), which begin with the position, are at their `goal` (B, 2)."""
+        """Tell which states (B, 2 or more), beginning with x and y, are at the `goal` (B, 2), (B,) bool."""
         return (state[:, :2] - goal).square().sum(-1).le(self.success_radius_m**2)
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
-        """Return the metres gained toward `goal` (B, 2) from `before` to `after`, (B, 2 or more); (B,)."""
+        """Return the progress in m (B,) toward `goal` (B, 2) from `before` to `after`, (B, 2 or more)."""
         before, after = before[:, :2], after[:, :2]
         if self.reward_kind == "geodesic":
             distance = self._goal_distance_on(goal.device)

@@ -10,9 +10,9 @@ from astra_data.worlds.plane.states import PlanarStates
 class PointMass(PlanarStates):
     """B point masses [x, y, vx, vy] in a maze, in m and m/s.
 
-    A command is the velocity of the next step, in units of the top speed along each axis; walls stop it,
-    each axis by itself. The velocity in the state is the motion that really happened. Left out: everything
-    that has legs.
+    A command is the velocity of the next step, in units of the top speed along each axis; walls stop each
+    axis by itself. The velocity in the state is the displacement in the last step over its duration. Left
+    out: the legs and all their dynamics.
 
     Attributes:
         parameters: what a dataset paired with this simulator records about it.
@@ -34,7 +34,7 @@ class PointMass(PlanarStates):
         """Build B of them.
 
         Args:
-            maze: walls around them.
+            maze: the walls.
             num_envs: B.
             timestep_s: control period.
             radius_m: distance that the mass keeps from walls.

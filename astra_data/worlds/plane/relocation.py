@@ -1,4 +1,4 @@
-"""Where else in its maze a stretch of an episode could have happened, and how the task judges it there."""
+"""Candidate placements of an episode elsewhere in its maze, and its rewards and outcome there."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -25,27 +25,27 @@ from astra_data.worlds.task import Task
 Rotations = Literal["quarter", "any", "none"]
 
 _SHIFTS = 64
-"""Places that are tried for each turn."""
+"""Shifts that are tried for each rotation."""
 _ROUNDING = 1e-6
-"""How far a turned command may exceed the limit."""
+"""How far a rotated command may exceed the limit."""
 
 
 def positions(task: Task, states: Array) -> Array:
-    """Return where the robot is, (T, 2) in m, for target states `states` (T, S)."""
+    """Return the robot's position (T, 2) in m in target states `states` (T, S)."""
     group = next(group for role, group in task.abstract_state.roles if role == "position")
     return np.ascontiguousarray(task.abstraction(states)[:, group])
 
 
 @dataclass(frozen=True)
 class Relocation:
-    """How stretches of episodes may be moved within the maze of `task`.
+    """How segments of episodes may be moved within the maze of `task`.
 
     Attributes:
         rotations: by multiples of 90 degrees, by any angle, or none.
-        translations: to anywhere; otherwise a stretch starts where it did.
-        margin_m: clearance from the walls, kept by every step before and after it is moved.
-        min_steps: shortest stretch.
-        tries: turns that are drawn, with 64 places for each, before a stretch is given up.
+        translations: to anywhere; otherwise a segment starts where it did.
+        margin_m: clearance from walls that every step keeps before and after it is moved.
+        min_steps: length of the shortest segment.
+        tries: rotations that are drawn, with 64 shifts for each, before a segment is given up.
     """
 
     task: Task
@@ -56,7 +56,7 @@ class Relocation:
     tries: int
 
     def stretches(self, episode: Episode) -> list[tuple[int, int]]:
-        """Return first step and end of the stretches of `episode` that may be moved."""
+        """Return first step and end of each segment of `episode` that may be moved."""
         free = np.ones(len(episode), dtype=bool)
         for name in (STATE, NEXT_STATE):
             free &= self._is_free(positions(self.task, episode.columns[name]))
@@ -64,9 +64,9 @@ class Relocation:
         return [(int(first), int(end)) for first, end in edges if end - first >= self.min_steps]
 
     def draw(self, episode: Episode, rng: np.random.Generator) -> tuple[PlanarMap, slice] | None:
-        """Draw a stretch of `episode`, which must have one, and where to put it.
+        """Draw a segment of `episode`, which must have one, and a placement for it.
 
-        The longer a stretch, the more often it is drawn. None where no place was found.
+        Segments are drawn in proportion to their lengths. None where no placement was found.
         """
         stretches = self.stretches(episode)
         lengths = np.array([end - first for first, end in stretches])
@@ -78,7 +78,7 @@ class Relocation:
             ends = [positions(self.task, episode.columns[name][steps]) for name in (STATE, NEXT_STATE)]
             path = turn.positions(np.concatenate(ends).astype(np.float64))
             shifts = self._draw_shifts(ends[0][0], path, rng)
-            # Rounded as they are stored.
+            # Rounded to float32, as datasets store them.
             fits = self._is_free((path + shifts[:, None]).astype(np.float32)).all(axis=1)
             if fits.any():
                 x, y = shifts[fits.argmax()]
@@ -98,7 +98,7 @@ class Relocation:
         return PlanarMap(float(angle[self.rotations]))
 
     def _draw_shifts(self, start: Array, path: Array, rng: np.random.Generator) -> Array:
-        """Draw shifts (n, 2) that keep `path` (T, 2) inside the maze, as far as it fits there."""
+        """Draw shifts (n, 2) that keep `path` (T, 2) inside the maze where it fits."""
         if not self.translations:
             return np.asarray(start - path[0])[None]
         room = self.task.maze.half_extent
@@ -109,9 +109,17 @@ class Relocation:
 def outcomes(
     objective: Objective, before: Array, after: Array, goal: Array, toppled: Array
 ) -> dict[str, Array]:
-    """Judge an episode that moves from `before` to `after`, both (T, 2) in m, perhaps toppling (T,).
+    """Return rewards and ends of an episode as the task pays them.
 
-    `goal` is (2,). Returns the outcome columns up to where the task ends, (T',) with T' <= T.
+    Args:
+        objective: of the task.
+        before: positions before each step, (T, 2) in m.
+        after: after it, (T, 2) in m.
+        goal: (2,) in m.
+        toppled: whether the robot toppled in the step, (T,) bool.
+
+    Returns:
+        the outcome columns up to the step that ends the episode, (T',) with T' <= T.
     """
     start, end = torch.from_numpy(before), torch.from_numpy(after)
     goals, fallen = torch.from_numpy(goal).expand(len(start), 2), torch.from_numpy(toppled)

@@ -58,7 +58,7 @@ class PlanarStates:
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
-        # New tensors, so that those handed out earlier stay as they were.
+        # New tensors, so that callers can keep earlier ones.
         self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
         if rows is not None:
             self.blocked = self.blocked.index_fill(0, rows, False)

@@ -35,6 +35,15 @@ def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     assert turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
 
 
+def test_only_bodies_that_approach_knock_their_ball_wherever_they_are() -> None:
+    before = torch.tensor([[2.0, -1.0], [2.0, -1.0], [2.0, -1.0]])
+    after = before + torch.tensor([[0.02, 0.01], [-0.02, -0.01], [0.01, -0.02]])
+    ball = after + torch.tensor([[0.12, 0.06], [0.12, 0.06], [0.12, 0.07]])
+    _, velocity = knock(before, after, ball, torch.zeros(3, 2), reach_m=0.19, speed_m_s=0.7)
+    # Towards the ball; away from it; a little away, nearly across.
+    assert (velocity != 0).any(-1).tolist() == [True, False, False]
+
+
 @pytest.mark.parametrize(
     ("after", "ball"),
     [([0.1, 0.0], [0.4, 0.0]), ([0.1, 0.0], [-0.05, 0.0]), ([0.0, 0.0], [0.1, 0.0])],

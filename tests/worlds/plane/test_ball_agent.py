@@ -41,6 +41,14 @@ def test_it_walks_into_its_ball() -> None:
     assert state[0, 6:].abs().max() == 0
 
 
+def test_it_walks_from_wherever_it_is() -> None:
+    simulator = one()
+    here = torch.tensor([[0.6, -0.4, 0.0, 0.0, 2.0, 2.0, 0.0, 0.0]])
+    simulator.reset_to(here)
+    state = simulator.step(torch.tensor([[-0.4, 0.8, 0.0]]))
+    assert state[0].tolist() == pytest.approx([0.58, -0.36, -0.1, 0.2, 2.0, 2.0, 0.0, 0.0], abs=1e-5)
+
+
 def test_it_stands_and_kicks() -> None:
     simulator = one(2)
     simulator.reset_to(torch.cat([START, START + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0])]))

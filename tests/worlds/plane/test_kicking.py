@@ -45,7 +45,11 @@ def test_recorded_episodes_begin_near_the_ball() -> None:
         ((1.5, 0.74), True, False),
         ((1.8, 0.76), False, True),
         ((0.0, 2.01), False, True),
+        ((0.0, -2.01), False, True),
         ((-2.01, 0.0), False, True),
+        ((-1.99, 1.99), False, False),
+        ((1.6, -0.74), True, False),
+        ((1.6, -0.76), False, True),
     ],
 )
 def test_a_ball_is_in_the_goal_in_the_field_or_out(
@@ -74,6 +78,24 @@ def test_policies_are_shown_everything_that_matters() -> None:
     moved = states.clone()
     moved[..., 4] += 0.1
     assert (TASK.observe(moved, goals) != seen).any(-1).all()
+
+
+def test_they_see_it_in_these_units() -> None:
+    seen_from = torch.tensor([0.2, 0.4, 0.1, -0.1, 0.5, 0.0, 0.6, -0.2])
+    seen = TASK.observe(seen_from.expand(2, 3, 8), GOAL.expand(2, 3, 2))
+    # Half of positions and of the ball's way to the goal; four times the velocity; the ball's velocity; four
+    # times the way to the ball, and to the point 0.2 m behind it on the line from the goal.
+    expected = [0.1, 0.2, 0.25, 0.0, 0.5, 0.0, 0.4, -0.4, 0.6, -0.2, 4 * 0.3, 4 * -0.4, 4 * 0.1, 4 * -0.4]
+    torch.testing.assert_close(seen, torch.tensor(expected).expand(2, 3, 14))
+
+
+def test_the_point_behind_the_ball_attracts_the_robot() -> None:
+    none = torch.zeros(1, dtype=torch.bool)
+    # The ball at (0.5, 1) is sqrt(2) m from the goal; the point behind it 0.2 m further, up and to the left.
+    behind = (0.5 - 0.2 * 0.5**0.5, 1.0 + 0.2 * 0.5**0.5)
+    away = (behind[0] + 0.3, behind[1] + 0.4)
+    before, after = state(away, (0.5, 1.0)), state(behind, (0.5, 1.0))
+    assert TASK.reward(before, after, GOAL, none).item() == pytest.approx(0.5 * 0.5, abs=1e-5)
 
 
 def test_a_speed_limit_leaves_the_wish_to_kick_as_it_is() -> None:

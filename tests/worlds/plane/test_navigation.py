@@ -36,6 +36,31 @@ def test_success_and_toppling_are_paid_once_each() -> None:
     assert reward.tolist() == pytest.approx([10.0, 0.0, -10.0, 0.0], abs=1e-5)
 
 
+def test_policies_see_shares_of_the_mazes_half_extent_and_the_velocity() -> None:
+    # LONG_MAZE is 20 m wide and 28 m high.
+    state = torch.tensor([5.0, -7.0, 0.3, -0.4]).expand(2, 3, 4)
+    goal = torch.tensor([-5.0, 7.0]).expand(2, 3, 2)
+    seen = Navigation(LONG_MAZE, horizon=9).observe(state, goal)
+    expected = torch.tensor([0.5, -0.5, 0.3, -0.4, -0.5, 0.5, -1.0, 1.0])
+    torch.testing.assert_close(seen, expected.expand(2, 3, 8))
+
+
+def test_failure_costs_also_where_the_goal_is_reached() -> None:
+    goal = torch.tensor([[-4.0, -4.0]])
+    task = Navigation(U_MAZE, horizon=9, success_reward=3.0, failure_reward=-7.0)
+    assert float(task.reward(goal, goal, goal, torch.tensor([True]))) == pytest.approx(3.0 - 7.0)
+
+
+def test_starts_have_as_many_places_as_there_are_offsets() -> None:
+    task = Navigation(U_MAZE, horizon=9, spread_m=0.01, start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.3)))
+    starts = task.draw_starts(np.random.default_rng(0), 3000)
+    assert (starts[:, 2:] == 0).all() and starts.shape == (3000, 4)
+    offsets = starts[:, :2] - np.array(U_MAZE.cell_centre(*U_MAZE.start))
+    which = np.round(2 * offsets[:, 0]).astype(int)
+    assert np.bincount(which).tolist() == pytest.approx([1000] * 3, abs=100)
+    np.testing.assert_allclose(offsets[which == 2], np.tile([1.0, 0.3], ((which == 2).sum(), 1)), atol=0.04)
+
+
 def test_waves_tell_the_position_finely() -> None:
     goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
     state = torch.tensor([[5.0, 2.5, 0.0, 0.0], [-10.0, 10.0, 0.0, 0.0]])
