@@ -1,6 +1,7 @@
 """Exact statistics of columns in float64, with LeRobot's names and shapes."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import QUANTILES, STATISTICS, STORED_STATISTICS
+from astra_data.dataset.parquet import read_arrays
 
 BLOCK_VALUES = 2**26
 """Values held in memory at once: 256 MiB of float32."""
@@ -37,7 +39,7 @@ def episode_statistics(columns: Iterable[Array]) -> NDArray[np.float64]:
 
 
 def global_statistics(
-    columns: list[Column], frames: int, blocks: Callable[[list[str]], Iterator[dict[str, Array]]]
+    columns: Sequence[Column], frames: int, paths: Sequence[Path]
 ) -> dict[str, dict[str, list[Any]]]:
     """Return meta/stats.json over all `frames`.
 
@@ -48,7 +50,7 @@ def global_statistics(
     Args:
         columns: all stored columns.
         frames: number of rows.
-        blocks: yields the values (n,) or (n, size) of the named columns from the first row to the last.
+        paths: the data files in order.
     """
     indices = [(column, index) for column in columns for index in range(column.size)]
     parts: dict[str, list[NDArray[np.float64]]] = {column.name: [] for column in columns}
@@ -57,7 +59,8 @@ def global_statistics(
         chosen = indices[first : first + at_once]
         rows = [np.empty(frames, column.dtype) for column, _ in chosen]
         end = 0
-        for block in blocks(list(dict.fromkeys(column.name for column, _ in chosen))):
+        names = {column.name for column, _ in chosen}
+        for block in read_arrays(paths, [column for column in columns if column.name in names]):
             begin, end = end, end + len(next(iter(block.values())))
             for row, (column, index) in zip(rows, chosen, strict=True):
                 row[begin:end] = block[column.name].reshape(end - begin, -1)[:, index]

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset.columns import Array
+from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
 
 FILE_SIZE_LIMIT = DATA_FILE_SIZE_MB * 2**20
@@ -82,6 +82,14 @@ def read_blocks(
         except UNREADABLE as error:
             name = f"{path.parent.name}/{path.name}"
             raise CorruptDatasetError(f"{name} cannot be read ({first_line(error)})") from error
+
+
+def read_arrays(
+    paths: Sequence[Path], columns: Sequence[Column], wanted: NDArray[np.bool_] | None = None
+) -> Iterator[dict[str, Array]]:
+    """Yield the blocks of `read_blocks` as contiguous arrays by name, (n,) or (n, size)."""
+    for table in read_blocks(paths, [column.name for column in columns], wanted):
+        yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
 
 
 def first_line(error: Exception) -> str:

@@ -13,7 +13,7 @@ from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents
 from astra_data.dataset.description import ContentHash
 from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.parquet import read_blocks, to_numpy
+from astra_data.dataset.parquet import read_arrays
 
 
 class Dataset(Contents):
@@ -113,8 +113,7 @@ class Dataset(Contents):
             for episode in self.selected(episodes):
                 wanted[self.starts[episode] : self.starts[episode] + self.lengths[episode]] = True
         with _explained(self.root):
-            for table in read_blocks(self.paths, names, wanted):
-                yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in specs}
+            yield from read_arrays(self.paths, specs, wanted)
 
     def selected(self, episodes: Collection[int] | None) -> NDArray[np.int64]:
         """Return the episode indices `episodes`, by default all, in the dataset's order.

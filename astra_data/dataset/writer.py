@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -18,10 +18,11 @@ from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.column_statistics import episode_statistics, global_statistics
-from astra_data.dataset.columns import Array, Column, Episode, Scalar
+from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import ContentHash, complete_description, permutation
 from astra_data.dataset.episode_rows import EpisodeRows
-from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_numpy
+from astra_data.dataset.parquet import RotatingWriter, to_arrow
+from astra_data.dataset.plain import data_files
 from astra_data.dataset.reader import Dataset
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
@@ -202,7 +203,8 @@ class DatasetWriter:
         info = layout.dataset_info(self._stored, fps=self._fps, episodes=episodes, frames=self._frames)
         order = permutation(uids, self._subset_seed)
         self._write_json(layout.INFO_PATH, info)
-        self._write_json(layout.STATS_PATH, global_statistics(self._stored, self._frames, self._blocks))
+        stats = global_statistics(self._stored, self._frames, data_files(self._folder))
+        self._write_json(layout.STATS_PATH, stats)
         self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
         contents = {"content_hash": self.content_hash}
         self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
@@ -216,11 +218,6 @@ class DatasetWriter:
         faults = Dataset.open(self._folder).verify()
         if faults:
             raise CorruptDatasetError(f"{self.root} was not written: {'; '.join(faults)}. Check the disk.")
-
-    def _blocks(self, names: list[str]) -> Iterator[dict[str, Array]]:
-        columns = [column for column in self._stored if column.name in names]
-        for table in read_blocks(sorted(self._folder.glob("data/*/*.parquet")), names):
-            yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
 
     def _write_json(self, path: str, content: Mapping[str, Any]) -> None:
         target = self._folder / path

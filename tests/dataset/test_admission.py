@@ -38,7 +38,7 @@ def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("name", "frame", "value", "told"),
+    ("name", "frame", "value", "fault"),
     [
         (DONE, 3, False, "next.done: false in the last frame"),
         (DONE, 1, True, "next.done: true in frame 1, expected in the last one only"),
@@ -47,13 +47,13 @@ def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_pat
     ],
 )
 def test_only_the_last_step_ends_an_episode(
-    tmp_path: Path, name: str, frame: int, value: bool, told: str
+    tmp_path: Path, name: str, frame: int, value: bool, fault: str
 ) -> None:
     columns = fake_columns(4, seed=1)
     columns[name][frame] = value
     with writer(tmp_path / "set") as open_writer:
         open_writer.add(fake_episode(1, 4))
-        with pytest.raises(BadInputError, match=told):
+        with pytest.raises(BadInputError, match=fault):
             open_writer.add(Episode(2, columns))
 
 

@@ -7,6 +7,7 @@ import pytest
 from racing import ROUNDS, race
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.lock import held
 from astra_data.dataset.atomic import atomic_file, atomic_folder
 
 
@@ -26,6 +27,40 @@ def test_an_error_inside_is_not_swallowed_and_leaves_nothing(tmp_path: Path) -> 
     with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "set"):
         raise FileNotFoundError
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("writing", [atomic_folder, atomic_file])
+def test_nothing_is_overwritten(
+    tmp_path: Path, writing: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    target = tmp_path / "set"
+
+    def write(path: Path, text: str) -> None:
+        (path / "file" if path.is_dir() else path).write_text(text)
+
+    with writing(target) as path:
+        write(path, "first")
+        assert path.parent == tmp_path and path.name.startswith(".set.tmp-")
+        assert not target.exists()
+    with pytest.raises(BadInputError, match="exists already"), writing(target):
+        raise AssertionError("refused before anything is written")
+    other = tmp_path / "other"
+    with pytest.raises(BadInputError, match="exists already"), writing(other) as path:
+        write(path, "second")
+        other.mkdir()
+        (other / "file").write_text("third")
+    assert (other / "file").read_text() == "third"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "set"]
+
+
+def test_only_the_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
+    for name in (".set.tmp-1", ".set.tmp-2-1", ".sets.tmp-1"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").touch()
+    with held(tmp_path / ".set.tmp-2-1"), atomic_folder(tmp_path / "set"):
+        left = {path.name for path in tmp_path.iterdir()}
+    assert {".set.tmp-2-1", ".sets.tmp-1"} < left
+    assert ".set.tmp-1" not in left
 
 
 def test_racing_processes_make_each_folder_once(tmp_path: Path) -> None:

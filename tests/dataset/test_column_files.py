@@ -42,8 +42,8 @@ def test_processes_map_the_same_columns_at_once(fake: Dataset, tmp_path: Path) -
     script = Path(__file__).parents[1] / "mapped_rounds.py"
     command = [sys.executable, *map(str, (script, fake.root, tmp_path))]
     processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
-    told = [process.communicate(timeout=120)[1] for process in processes]
-    assert told == [""] * 4
+    errors = [process.communicate(timeout=120)[1] for process in processes]
+    assert errors == [""] * 4
     assert len(list(tmp_path.rglob("values.npy"))) == 2 * 40
     assert not list(tmp_path.rglob(".*"))
 

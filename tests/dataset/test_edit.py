@@ -197,8 +197,8 @@ def test_datasets_of_different_worlds_are_not_merged(tmp_path: Path, world: str)
         with writer(tmp_path / maze, description=described) as open_writer:
             open_writer.add(fake_episode(uid, 3))
         parts.append(Dataset.open(tmp_path / maze))
-    told = rf"fake@data-1\.0\.0: {world}\.id: 'antmaze-umaze', then 'antmaze-long'"
-    with pytest.raises(BadInputError, match=told):
+    fault = rf"fake@data-1\.0\.0: {world}\.id: 'antmaze-umaze', then 'antmaze-long'"
+    with pytest.raises(BadInputError, match=fault):
         merge(parts, out=tmp_path / "all")
     assert not (tmp_path / "all").exists()
 

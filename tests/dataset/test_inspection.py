@@ -48,7 +48,7 @@ def test_the_map_counts_every_position_where_it_was(inspection: Inspection) -> N
     theirs, _, _ = np.histogram2d(points[:, 1], points[:, 0], edges)
     assert np.abs(places.counts - theirs).sum() <= 4
     assert places.counts.sum() == sum(LENGTHS)
-    assert inspection.velocities is None  # no column tells one
+    assert inspection.velocities is None  # no column has that role
 
 
 def test_positions_alone_give_the_same_map(tmp_path: Path, inspection: Inspection) -> None:
@@ -100,7 +100,7 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "told",
+    "metadata",
     [
         lambda uid: {},
         lambda uid: {} if uid == 4 else {"success": False},
@@ -109,11 +109,11 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
     ],
 )
 def test_whether_episodes_succeeded_has_one_answer(
-    tmp_path: Path, told: Callable[[int], dict[str, Scalar]]
+    tmp_path: Path, metadata: Callable[[int], dict[str, Scalar]]
 ) -> None:
     with writer(tmp_path / "set") as open_writer:
         for episode in fake_episodes():
-            open_writer.add(replace(episode, metadata=told(episode.uid)))
+            open_writer.add(replace(episode, metadata=metadata(episode.uid)))
     dataset = Dataset.open(tmp_path / "set")
     assert dataset.successes() == [True, False, True, False, False]  # as next.success says
     assert inspect_dataset(dataset).success == 2

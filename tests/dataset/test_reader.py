@@ -104,6 +104,8 @@ def test_subsets_are_nested_and_follow_the_uid(fake: Dataset, tmp_path: Path) ->
     assert write_fake(tmp_path / "seeded", subset_seed=1).subset(5) != fake.subset(5)
     with pytest.raises(BadInputError, match="a subset of 6 episodes, expected 1 to 5"):
         fake.subset(6)
+    with pytest.raises(BadInputError, match="a subset of 0 episodes"):
+        fake.subset(0)
 
 
 def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:

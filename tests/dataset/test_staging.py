@@ -188,13 +188,13 @@ def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
             assert process.stdout.readline() == "begun\n"
             time.sleep(rng.uniform(0.0, 0.15))
             process.send_signal(signal.SIGKILL)
-            told = process.stdout.read().split()
+            added = process.stdout.read().split()
         if root.exists():
             assert Dataset.open(root).verify() == []
-            assert len(told) == EPISODES_OF_THE_RECORDED
+            assert len(added) == EPISODES_OF_THE_RECORDED
         else:
             staged = {path.stem for path in root.with_name(f".{root.name}.staged").glob("*.arrow")}
-            assert staged >= set(told)
+            assert staged >= set(added)
             record(root)
         assert files(root) == whole
 

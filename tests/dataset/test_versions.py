@@ -49,17 +49,17 @@ def test_a_dataset_is_found_by_folder_name_and_version(home: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("name", "fault"),
     [
         ("ent", "did you mean 'ant'"),
         ("ant@data-9.0.0", "no version data-9.0.0 in .*home; it has data-1.2.0"),
         ("some/where", "no such folder"),
     ],
 )
-def test_a_dataset_that_is_not_there_is_told(home: Path, asked: str, told: str) -> None:
+def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None:
     (home / "ant/data-1.2.0").mkdir(parents=True)
-    with pytest.raises(BadInputError, match=told):
-        locate(asked)
+    with pytest.raises(BadInputError, match=fault):
+        locate(name)
 
 
 def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:

@@ -191,11 +191,11 @@ def test_the_dataset_says_where_it_comes_from(tmp_path: Path) -> None:
     raw = write_fake(tmp_path / "raw")
     description = {"name": "fake", "version": "1.1.0", "stage": "pair", "parents": [raw.identity]}
     paired = write_fake(tmp_path / "paired", description=description)
-    said = json.loads((paired.root / "meta/astra/dataset.json").read_text())
-    assert said["parents"] == [{"name": "fake", "version": "1.0.0", "hash": raw.content_hash}]
+    description = json.loads((paired.root / "meta/astra/dataset.json").read_text())
+    assert description["parents"] == [{"name": "fake", "version": "1.0.0", "hash": raw.content_hash}]
     assert paired.reference == "fake@data-1.1.0"
-    assert {"python", "astra-data", "lerobot", "mujoco", "numpy"} <= said["packages"].keys()
-    assert "git_commit" in said
+    assert {"python", "astra-data", "lerobot", "mujoco", "numpy"} <= description["packages"].keys()
+    assert "git_commit" in description
 
 
 @pytest.mark.parametrize("make", [writer, staged_writer])

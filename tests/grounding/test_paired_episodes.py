@@ -38,7 +38,7 @@ def label(episode: int, step: int) -> float:
 SIZES = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
 
 
-def write(folder: Path, sizes: dict[str, int]) -> Path:
+def write(folder: Path, sizes: dict[str, int], held_out: tuple[int, ...] | None = None) -> Path:
     columns = [*(Column(name, size=size) for name, size in sizes.items()), *OUTCOME_COLUMNS]
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
     description |= {"environment": {"id": "toy"}, "simulator": {"id": "toy"}, "parents": []}
@@ -52,7 +52,8 @@ def write(folder: Path, sizes: dict[str, int]) -> Path:
             # The third episode succeeds, the fourth topples, the others run out of time.
             ended = last & (episode in (2, 3))
             values |= {REWARD: -steps, TERMINATED: ended, TRUNCATED: last & ~ended, DONE: last}
-            writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}))
+            metadata = {} if held_out is None else {"held_out": episode in held_out}
+            writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}, metadata))
     return folder
 
 
@@ -125,6 +126,27 @@ def test_a_split_is_by_episodes_and_by_the_seed(episodes: PairedEpisodes) -> Non
     assert torch.equal(again.target_state, training.target_state)
     assert len({tuple(episodes.split(0.4, seed)[1].target_state[:, 0, 0].tolist()) for seed in range(9)}) > 1
     assert len(episodes.split(0.0001, seed=0)[1]) == 1
+
+
+def test_a_split_is_as_the_dataset_marks_it(tmp_path: Path) -> None:
+    marked = PairedEpisodes.load(write(tmp_path / "marked", SIZES, held_out=(1, 3)))
+    assert marked.held_out is not None
+    assert marked.held_out.tolist() == [False, True, False, True, False]
+    training, held_out = marked.split(0.9, seed=0)
+    assert training.target_state[:, 0, 0].tolist() == [label(episode, 0) for episode in (0, 2, 4)]
+    assert held_out.target_state[:, 0, 0].tolist() == [label(episode, 0) for episode in (1, 3)]
+    assert training.held_out is not None and not training.held_out.any()
+    none = PairedEpisodes.load(write(tmp_path / "none", SIZES, held_out=()))
+    assert none.held_out is None
+
+
+def test_too_few_episodes_are_not_split(episodes: PairedEpisodes) -> None:
+    with pytest.raises(BadInputError, match="has 5 episodes, of which 5 would be held out"):
+        episodes.split(0.95, seed=0)
+    one = episodes.select(torch.tensor([2]))
+    assert len(one) == 1
+    with pytest.raises(BadInputError, match="expected more episodes"):
+        one.split(0.1, seed=0)
 
 
 @pytest.mark.parametrize("length", [1, 10, 100])

@@ -1,6 +1,6 @@
 """Check a LeRobot dataset, ours or another tool's, and report every fault."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset.column_statistics import global_statistics
-from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.columns import Column
 from astra_data.dataset.description import permutation
 from astra_data.dataset.doctor.check_episodes import EXACT, EpisodeChecks, is_close
 from astra_data.dataset.doctor.findings import Report
@@ -25,7 +25,6 @@ from astra_data.dataset.format import (
     TASKS_PATH,
 )
 from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
-from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import (
     MOST_FPS,
     PlainColumn,
@@ -152,13 +151,7 @@ def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -
         report.fault(STATS_PATH, f"{STATS_PATH} {stored}")
         return
     ours = [Column(column.name, column.dtype, column.size) for column in columns]
-
-    def blocks(names: list[str]) -> Iterator[dict[str, Array]]:
-        chosen = [column for column in columns if column.name in names]
-        for table in read_blocks(data_files(root), names):
-            yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in chosen}
-
-    for name, expected in global_statistics(ours, report.frames, blocks).items():
+    for name, expected in global_statistics(ours, report.frames, data_files(root)).items():
         for key, values in expected.items():
             found = stored.get(name, {}).get(key)
             if not is_close(found, values, EXACT):

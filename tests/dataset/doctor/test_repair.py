@@ -103,11 +103,11 @@ def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
     (root / "meta/stats.json").unlink()
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.episodes == 3
-    told = "\n".join(repaired.notes)
-    assert "meta/episodes was missing" in told
-    assert "left out episode 0: next.done is True in episode 0 frame 3, before the last frame 6" in told
-    assert "left out episode 3: next.reward is nan in episode 3 frame 5" in told
-    assert "2 of the 5 episodes" in told
+    notes = "\n".join(repaired.notes)
+    assert "meta/episodes was missing" in notes
+    assert "left out episode 0: next.done is True in episode 0 frame 3, before the last frame 6" in notes
+    assert "left out episode 3: next.reward is nan in episode 3 frame 5" in notes
+    assert "2 of the 5 episodes" in notes
     saved = Dataset.open(tmp_path / "saved")
     assert (saved.reference, saved.description["stage"]) == ("fake@data-1.1.0", "repair")
     assert saved.verify() == []

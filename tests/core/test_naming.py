@@ -1,0 +1,16 @@
+from astra_data.core.naming import base_method, is_plus, place, reference_of
+
+
+def test_a_row_is_a_method_or_its_plus() -> None:
+    assert [is_plus(row) for row in ("astra", "astra_plus", "plus_astra")] == [False, True, False]
+    assert [base_method(row) for row in ("astra", "astra_plus")] == ["astra", "astra"]
+
+
+def test_rows_are_tested_in_nas_if_it_is_among_them() -> None:
+    assert reference_of(["astra", "nas"]) == reference_of(["astra", "nas_plus"]) == "nas"
+    assert reference_of(["astra", "nas_golemo"]) is None
+
+
+def test_folders_of_seeds_lie_in_those_of_sizes() -> None:
+    assert place(3) == "seed_3"
+    assert place(3, 5) == "percent_005/seed_3"
