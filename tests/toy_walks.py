@@ -1,4 +1,4 @@
-"""Logs of a toy robot in the form of the NAO's: it walks as told, but late and slower."""
+"""Logs of a toy robot in the form of the NAO's: it follows commands late and too slowly."""
 
 import io
 import json
@@ -28,10 +28,10 @@ def states(
     action: NDArray[np.float64], gains: tuple[float, float, float] = GAINS, late_rows: int = LATE_ROWS
 ) -> NDArray[np.float64]:
     """Return where the toy robot is before each action and after the last, (rows + 1, 5); the ball rests."""
-    told = np.concatenate([np.zeros((late_rows, 4)), action])[: len(action)]
-    walker = PlanarWalker(len(told), timestep_s=1 / FPS)
-    walker.reset_to(torch.zeros(len(told), 8, dtype=torch.float64))
-    motion = walker.step(torch.from_numpy(told))[:, :3] * torch.tensor(gains)
+    commands = np.concatenate([np.zeros((late_rows, 4)), action])[: len(action)]
+    walker = PlanarWalker(len(commands), timestep_s=1 / FPS)
+    walker.reset_to(torch.zeros(len(commands), 8, dtype=torch.float64))
+    motion = walker.step(torch.from_numpy(commands))[:, :3] * torch.tensor(gains)
     start = torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64)
     path = torch.cat([start, composed(start, chained(motion[None])[0])]).numpy()
     return np.concatenate([path, np.tile([1.0, 1.0], (len(path), 1))], axis=1)

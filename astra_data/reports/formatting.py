@@ -2,11 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from astra_data.reports.statistics import Summary
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 
 def fill(template: str, **values: object) -> str:
@@ -15,7 +18,9 @@ def fill(template: str, **values: object) -> str:
 
 
 @cache
-def _templates() -> Environment:
+def _templates() -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     # Pages are Markdown: nothing to escape.
     templates = Environment(
         loader=PackageLoader("astra_data.reports"),

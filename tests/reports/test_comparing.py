@@ -20,6 +20,8 @@ def test_each_measure_is_summarised_over_the_seeds_that_have_it() -> None:
     assert found["success"].mean == pytest.approx(0.3)
     assert [found["distance"].mean, found["distance"].std] == pytest.approx([5.0, np.sqrt(2)])
     assert "simulated_success" not in found
+    alone = summarised(row(distance=[float("nan"), 4.0, float("nan")]), 100).summary["distance"]
+    assert (alone.mean, alone.std) == (4.0, None)
     assert "distance" not in summarised(row(distance=[float("nan")] * 3), 100).summary
 
 
