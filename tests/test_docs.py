@@ -79,6 +79,8 @@ def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = {stage: run / stage / "astra" / "seed_0" for stage in ("ground", "train", "align")}
     collected, pairs = run / "collect" / "seed_0", run / "pair" / "seed_0"
     made = {"seed": 0, "device": "cpu", "progress": silent}
+    run.mkdir(parents=True)
+    (run / "recipe.json").write_text('{"task": "antmaze-umaze"}')
     with short_task():
         collect(TASK, CollectConfig(episodes=100, max_steps=25), seed=0, out=collected, progress=silent)
         pair(TASK, PairConfig(), dataset=collected, out=pairs, progress=silent)

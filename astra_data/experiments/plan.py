@@ -10,12 +10,10 @@ once, `subset` makes each size of it, and everything from ground on is made for 
 """
 
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-
-from pydantic import JsonValue
 
 from astra_data.core.naming import base_method, place, reference_of
 from astra_data.experiments.execution import Item
@@ -23,22 +21,10 @@ from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.methods import METHODS
 from astra_data.stages.registry import STAGES, Stage
+from astra_data.stages.report import Reported
 
 ARTEFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
 """Parameters of stages that are folders of artefacts."""
-
-
-@dataclass(frozen=True)
-class Reported:
-    """What the report is about, small enough to be sent to another process."""
-
-    name: str
-    task: str
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...]
-    groundings: Mapping[str, str]
-    settings: Mapping[str, JsonValue]
-    percents: tuple[int, ...] = ()
 
 
 def plan(

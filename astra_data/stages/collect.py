@@ -275,9 +275,9 @@ def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> 
     action = behavior.act(state, goal)
     outcome = env.step(action, active)
     truncated = torch.full_like(outcome.terminated, last) & ~outcome.terminated
-    row = {
+    goals = {GOAL: goal} if goal.shape[1] else {}
+    return goals | {
         STATE: state,
-        GOAL: goal,
         ACTION: action,
         NEXT_STATE: env.state,
         REWARD: outcome.reward,
@@ -286,9 +286,6 @@ def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> 
         DONE: outcome.terminated | truncated,
         SUCCESS: outcome.success,
     }
-    if not goal.shape[1]:
-        del row[GOAL]
-    return row
 
 
 def _episode(uid: int, values: dict[str, Array], seed: int) -> Episode:

@@ -1,9 +1,9 @@
 """Report: the results of all rows and seeds of a recipe, as results.json, results.md and figures."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from pydantic import Field, JsonValue
 
@@ -49,36 +49,25 @@ class ReportConfig(Config):
 DEFAULTS = ReportConfig()
 
 
-class Reported(Protocol):
-    """What a report needs of a recipe."""
+@dataclass(frozen=True)
+class Reported:
+    """What a report needs of a recipe, small enough to be sent to another process.
 
-    @property
-    def name(self) -> str:
-        """Name of the recipe's file, without its ending."""
+    Attributes:
+        name: of the recipe's file, without its ending. task: name of a task.
+        methods: rows, in the order of the table. seeds: those to report, as far as they are finished.
+        groundings: row → the method whose grounding and alignment it uses.
+        settings: all settings of the recipe.
+        percents: dataset sizes in percent that every row is repeated on; empty if only on the whole.
+    """
 
-    @property
-    def task(self) -> str:
-        """Name of a task."""
-
-    @property
-    def methods(self) -> Iterable[str]:
-        """Rows, in the order of the table."""
-
-    @property
-    def seeds(self) -> Iterable[int]:
-        """Seeds to report, as far as they are finished."""
-
-    @property
-    def groundings(self) -> Mapping[str, str]:
-        """Row → the method whose grounding and alignment it uses, if not its own."""
-
-    @property
-    def settings(self) -> Mapping[str, JsonValue]:
-        """All settings of the recipe."""
-
-    @property
-    def percents(self) -> Sequence[int]:
-        """Dataset sizes in percent that every row is repeated on; empty if only on the whole."""
+    name: str
+    task: str
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    groundings: Mapping[str, str]
+    settings: Mapping[str, JsonValue]
+    percents: tuple[int, ...] = ()
 
 
 def report(
