@@ -11,6 +11,7 @@ from safetensors.numpy import save_file
 
 from astra_data.core.naming import place
 from astra_data.reports.schema import MethodResults, Results
+from astra_data.stages.report import Reported
 
 ROWS = ("direct_transfer", "astra", "astra_plus", "follower")
 SEEDS = (0, 1, 2)
@@ -30,7 +31,7 @@ MADE = {
 
 
 @dataclass(frozen=True)
-class FakeRecipe:
+class FakeRecipe(Reported):
     name: str = "antmaze_u"
     task: str = "antmaze-u"
     methods: tuple[str, ...] = ROWS
