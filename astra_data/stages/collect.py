@@ -82,9 +82,8 @@ class CollectConfig(Config):
     def _fits_the_behavior(self) -> Self:
         if self.behavior == "policy" and self.policy is None:
             raise ValueError('behavior "policy": expected the folder of a trained policy as policy, got none')
-        given = [
-            name for name in ("policy", "grounding", "target_encoder") if getattr(self, name) is not None
-        ]
+        artefacts = ("policy", "grounding", "target_encoder")
+        given = [name for name in artefacts if getattr(self, name) is not None]
         if self.behavior != "policy" and given:
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
         if self.hold_s[0] > self.hold_s[1]:
@@ -121,9 +120,8 @@ def collect(
         BadInputError: the task is unknown, `out` exists, or an artefact of the behaviour is missing.
     """
     world = task_named(task)
-    saved = {
-        f"{kind}_sha256": file_digest(path) for kind, path in _saved_files(config).items() if path.is_file()
-    }
+    files = _saved_files(config).items()
+    saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
     description = {
         "name": name or f"{task}-{config.behavior}-seed{seed}".replace("_", "-"),
         "version": "1.0.0",
@@ -212,11 +210,7 @@ def _behavior(
 
 
 def _saved_files(config: CollectConfig) -> dict[str, Path]:
-    folders = {
-        "policy": config.policy,
-        "grounding": config.grounding,
-        "target_encoder": config.target_encoder,
-    }
+    folders = config.model_dump(include={"policy", "grounding", "target_encoder"})
     return {kind: Path(folder) / f"{kind}.safetensors" for kind, folder in folders.items() if folder}
 
 

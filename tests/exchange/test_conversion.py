@@ -123,6 +123,10 @@ def test_next_states_and_ends_are_derived_where_they_are_left_out() -> None:
     assert list(columns) == [STATE, NEXT_STATE, TERMINATED, TRUNCATED, DONE]
     assert columns[NEXT_STATE].names == ("x",)
     assert columns[NEXT_STATE].astra == {"unit": ["m"]}
+    assert columns[NEXT_STATE].meaning == "the state, one step later"
+    ending = converter({STATE: {"fields": ("f",)}, TERMINATED: {"fields": ("f",)}})
+    ending.convert(Block({"f": np.zeros(2)}, "log"))
+    assert "where an episode terminates" in next(c.meaning for c in ending.columns if c.name == NEXT_STATE)
     whole = converter({STATE: {"fields": ("f",)}, NEXT_STATE: {"fields": ("f",)}})
     whole.convert(Block({"f": np.zeros(2)}, "log"))
     assert [column.name for column in whole.columns][:2] == [STATE, NEXT_STATE]

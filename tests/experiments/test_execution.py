@@ -59,6 +59,7 @@ def test_items_that_wait_for_each_other_are_a_bug() -> None:
 
 def prepared() -> None:
     os.write(1, b"prepared\n")
+    os.write(2, b"with care\n")
 
 
 def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
@@ -67,14 +68,19 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     work = pickled(Item("a", (), partial(touch, tmp_path / "made", ())), None)
     seconds = run_item("a", work, tmp_path / "logs/a.txt", lambda note: None)
     assert isinstance(seconds, float)
+    assert 0 < seconds < 60
     assert (tmp_path / "made").exists()
     assert not (tmp_path / "logs/a.txt").exists()
     error = run_item("b", pickled(Item("b", (), crash), prepared), tmp_path / "logs/b.txt", lambda note: None)
     log = (tmp_path / "logs/b.txt").read_text()
     assert str(error) == f"b crashed: ValueError: a bug (traceback: {tmp_path / 'logs/b.txt'})"
-    assert log == "prepared\n"
+    assert log == "prepared\nwith care\n"
     os.write(1, b"ours again\n")
-    assert "ours again\n" in capfd.readouterr().out
+    os.write(2, b"and ours\n")
+    shown = capfd.readouterr()
+    assert "ours again\n" in shown.out
+    assert "and ours\n" in shown.err
+    assert "with care" not in shown.err
 
 
 def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
