@@ -1,7 +1,14 @@
+from pathlib import Path
+
+import pytest
 import torch
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.fit import residual_rewards
+from astra_data.core.progress import silent
+from astra_data.core.seeding import derive
+from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, residual_rewards
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.worlds.registry import TASKS
 
 
@@ -17,7 +24,7 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     assert 0.1 < ahead < 2.0
     going_on, failing = torch.tensor([[3.0, 0.0, 0.0, 2.0, 0.0]]), torch.tensor([[0.0, 0.0, -9.0, 0.0, 0.0]])
     still = torch.zeros(1, 5, 2)
-    episodes = toy_episodes(
+    given = toy_episodes(
         torch.cat([before[None], still], dim=-1),
         still,
         next_state=torch.cat([after[None], still], dim=-1),
@@ -27,6 +34,89 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
         reward=going_on + failing,
         terminated=terminated[None],
     )
-    residual = residual_rewards(task, episodes).windows.reward[0]
+    residual = residual_rewards(task, given).windows.reward[0]
     torch.testing.assert_close(residual[:, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))
     torch.testing.assert_close(residual[:, 1], torch.tensor([0.0, 0.0, -9.0 - ahead, 0.0, 0.0]))
+
+
+def episodes(seed: int, count: int = 4) -> PairedEpisodes:
+    """Return episodes of 10 steps whose simulator lacks a constant and noise; the last step of one fails."""
+    generator = torch.Generator().manual_seed(seed)
+    state = torch.tensor([-4.0, 4.0, 0.0, 0.0]) + 0.1 * torch.randn(count, 11, 4, generator=generator)
+    error = 0.3 + 0.1 * torch.randn(count, 10, 4, generator=generator)
+    reward = torch.randn(count, 10, generator=generator)
+    failing = torch.zeros(count, 10)
+    failing[0, -1], reward[0, -1] = -10.0, 0.0
+    terminated = failing != 0
+    mask = torch.ones(count, 10)
+    mask[1, 6:] = 0.0
+    return toy_episodes(
+        state[:, :-1],
+        2 * torch.rand(count, 10, 2, generator=generator) - 1,
+        next_state=state[:, 1:],
+        simulated_next=state[:, 1:] - error,
+        goal=torch.zeros(count, 10, 2),
+        mask=mask,
+        parts=torch.stack([reward, failing], dim=-1),
+        reward=reward + failing,
+        terminated=terminated,
+    )
+
+
+def fit(folder: Path, name: str, **settings: object) -> tuple[GroundingModel, Fitting]:
+    (folder / name).mkdir()
+    config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8).model_copy(update=settings)
+    task = TASKS["antmaze-umaze"]
+    fitting = Fitting(task, config, None, episodes(0), episodes(1, 3), 0, "cpu", folder / name, silent)
+    return HistoryFit(latent=True, reward=True)(fitting)[0].model, fitting
+
+
+def test_scales_are_of_the_training_episodes_and_the_scatter_of_those_held_out(tmp_path: Path) -> None:
+    model, fitting = fit(tmp_path, "fit", correction_heads=2)
+    training, held_out = fitting.training, fitting.held_out
+    torch.testing.assert_close(model.state_mean, training.steps(training.windows.state).mean(0))
+    error = training.windows.next_state - training.windows.simulated_next
+    torch.testing.assert_close(model.correction_std, training.steps(error).std(0))
+    windows = held_out.windows
+    model.requires_grad_(False)
+    latent, _ = model.encode(windows)
+    predictions = model.ensemble_predictions(latent, windows.action, windows.simulated_next)
+    left = held_out.steps(windows.next_state - predictions.mean(0))
+    scatter = model.residual_factor @ model.residual_factor.T
+    torch.testing.assert_close(scatter, torch.cov(left.T), atol=1e-6, rtol=1e-3)
+    # In its own unit, the heads' usual disagreement is one.
+    assert float(held_out.steps(model.disagreement(predictions)).mean()) == pytest.approx(1.0, rel=1e-4)
+    shape = model.shape
+    assert (shape.latent_size, shape.correction_heads, shape.corrects_reward) == (8, 2, False)
+    assert (shape.position_octaves, shape.ball_index, shape.goal_size) == (4, None, 2)
+
+
+def test_the_slow_encoder_follows_at_its_rate(tmp_path: Path) -> None:
+    rates = {rate: fit(tmp_path, str(rate), ema_rate=rate)[0] for rate in (0.0, 0.5, 1.0)}
+    slow = {rate: model.target_encoder.embedding.weight for rate, model in rates.items()}
+    fast = {rate: model.encoder.embedding.weight for rate, model in rates.items()}
+    assert torch.equal(slow[1.0], fast[1.0])
+    torch.manual_seed(derive(0, "grounding"))
+    begun = GroundingModel(rates[0.0].shape)
+    assert torch.equal(slow[0.0], begun.encoder.embedding.weight)
+    assert not torch.equal(slow[0.5], slow[0.0]) and not torch.equal(slow[0.5], fast[0.5])
+
+
+def test_the_residual_reward_is_fitted_where_it_is_asked_for(tmp_path: Path) -> None:
+    whole, fitting = fit(tmp_path, "whole")
+    residual, _ = fit(tmp_path, "residual", reward="correction")
+    assert residual.shape.corrects_reward
+    for model, given in (
+        (whole, fitting.training),
+        (residual, residual_rewards(fitting.task, fitting.training)),
+    ):
+        going_on, failing = given.steps(given.windows.reward).unbind(-1)
+        assert float(model.reward_mean) == pytest.approx(float(going_on[failing == 0].mean()), abs=1e-5)
+
+
+def test_a_methods_weights_are_zero_where_it_predicts_nothing() -> None:
+    config = GroundConfig(latent_weight=0.3, reward_weight=2.0)
+    for latent in (False, True):
+        for reward in (False, True):
+            weights = HistoryFit(latent=latent, reward=reward).weights(config)
+            assert (weights.latent, weights.reward, weights.state) == (0.3 * latent, 2.0 * reward, 1.0)

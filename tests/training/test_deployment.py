@@ -62,3 +62,27 @@ def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> N
     )
     torch.testing.assert_close(actions, policy.policy(features)[0], atol=1e-5, rtol=0)
     assert torch.equal(run(deployed), actions)
+
+
+@torch.no_grad()
+def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2, memory_size=8))
+    for layer in policy.actor.parameters():
+        layer.mul_(20)  # actions of some size
+    deployed = DeployedPolicy(TASK, policy, model, command_limit_m_s=0.2)
+    actions = run(deployed)
+    assert actions.norm(dim=-1).max() <= 0.2 + 1e-6
+    abstract = STATE[..., [0, 1, 15, 16]]
+    latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
+    observation = policy_observation(TASK.objective, abstract, GOALS, latent)
+    hidden, own, outputs = policy.initial_hidden(3), torch.zeros(3, 2), []
+    for step in range(6):
+        features, hidden = policy.remember(observation[:, step], own, hidden)
+        own = policy.act(features)
+        outputs.append(own)
+    torch.testing.assert_close(
+        actions, TASK.objective.limit_command(torch.stack(outputs, dim=1), 0.2), atol=1e-4, rtol=0
+    )
+    assert torch.stack(outputs).norm(dim=-1).max() > 0.3

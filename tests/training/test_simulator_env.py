@@ -256,3 +256,41 @@ def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     assert (after[0, [8, 13]] != before[0, [8, 13]]).all()
     assert torch.equal(after[1:, 8:], before[1:, 8:])
     assert torch.equal(showing.load_state_dict(showing.state_dict()), after)
+
+
+def test_topples_are_drawn_at_the_predicted_risk_and_end_the_episode() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    last = list(model.topple_head.parameters())
+    last[-2].zero_()
+    count = 4000
+    for logit, share in ((50.0, 1 / 20), (-50.0, 0.0)):
+        last[-1].fill_(logit)
+        inner = PointMass(U_MAZE, count, timestep_s=0.05)
+        one = SimulatorWorld(TASK, GroundedSimulator(inner, model), topple=True, reward="blend")
+        # Half of them reach the goal in this step: whoever does has not toppled.
+        state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
+        goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
+        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
+        step = one.step(torch.tensor([[-1.0, 0.0]]).expand(count, 2))
+        assert step.success[1::2].all() and not step.success[::2].any()
+        assert not one.failed[1::2].any()
+        assert float(one.failed[::2].float().mean()) == pytest.approx(share, abs=0.015)
+        assert torch.equal(step.terminated, step.success | one.failed)
+        # The draw replaces the expected cost: a topple costs, its risk does not.
+        own = TASK.reward(state, one.simulator.state, goal, one.failed)
+        torch.testing.assert_close(step.reward, own)
+
+
+def test_recorded_starts_hand_over_their_history() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
+    starts = DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
+    grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
+    one = SimulatorWorld(TASK, grounded, starts=starts, data_start_share=1.0)
+    one.reset()
+    assert starts.hidden is not None
+    expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)
+    torch.testing.assert_close(grounded.hidden, expected.expand(3, 8))
+    assert torch.equal(one.goal, goal.expand(3, 2)) and torch.equal(grounded.goal, one.goal)
