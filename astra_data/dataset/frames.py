@@ -4,16 +4,19 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.column_files import cache_folder, mapped_columns, memory_bytes
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.samples import Samples, take
-from astra_data.dataset.step_windows import Padding, step_windows
+from astra_data.dataset.step_windows import every, inside, padded, rolled
 
+Padding = Literal["valid", "edge"]
 MEMORY_SHARE = 0.5
 """Columns that take more than this share of the machine's memory are memory-mapped."""
 
@@ -115,13 +118,30 @@ class Frames:
         Raises:
             BadInputError: an argument is out of range, or no episode is long enough; lists every fault.
         """
-        return step_windows(
-            *(self.columns, self.starts, self.lengths, self.device),
-            length=length,
-            stride=stride,
-            padding=padding,
-            past=past,
-        )
+        longest = int(self.lengths.max())
+        faults = [
+            f"{name} {value}, expected at least 1"
+            for name, value in (("length", length), ("stride", stride))
+            if value < 1
+        ]
+        if padding == "valid" and length > longest:
+            faults.append(
+                f"length {length}, expected at most {longest}, the longest episode's, or padding 'edge'"
+            )
+        if padding == "valid" and past:
+            faults.append(f"past {past}, expected 0 without padding 'edge'")
+        if padding == "edge" and not 0 <= past < max(length, 1):
+            faults.append(f"past {past}, expected 0 to {length - 1}")
+        if padding not in ("valid", "edge"):
+            faults.append(f"padding {padding!r}, expected 'valid' or 'edge'")
+        if faults:
+            raise BadInputError(f"Windows: {'; '.join(faults)}.")
+        if padding == "edge":
+            gather = partial(padded, self.columns, self.starts, self.starts + self.lengths, past, length)
+            return Samples(every(stride, self.starts - past, self.lengths), gather, self.device)
+        views = {name: rolled(values, length) for name, values in self.columns.items()}
+        first = every(stride, self.starts, (self.lengths - length + 1).clamp_min(0))
+        return Samples(first, partial(inside, self.columns, views, length), self.device)
 
     def transitions(self) -> Samples:
         """Return single steps; the step's outcome is in its columns `next.*`."""

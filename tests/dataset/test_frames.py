@@ -74,7 +74,7 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
     with pytest.raises(BadInputError, match="length 0, expected at least 1; stride -1, expected at least 1"):
         frames.windows(0, stride=-1)
     with pytest.raises(
-        BadInputError, match=r"length 31, expected at most the longest episode's 30, or padding"
+        BadInputError, match=r"length 31, expected at most 30, the longest episode's, or padding"
     ):
         frames.windows(31)
     with pytest.raises(BadInputError, match=r"past 6, expected 0 to 5"):

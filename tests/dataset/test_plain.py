@@ -216,3 +216,10 @@ def test_flags_end_the_last_step_only_and_agree(
     for sentence, (name, part) in zip(found, faults, strict=True):
         assert sentence.startswith(f"next.{name} is ")
         assert part in sentence
+
+
+def test_a_flag_alone_may_end_the_last_step() -> None:
+    # Plain LeRobot datasets may have next.done and no others: there is nothing to compare it with.
+    assert list(flag_faults(a_run(**{"next.done": np.array([False, False, False, True])}), 3)) == []
+    [fault] = flag_faults(a_run(**{"next.done": np.array([False, True, False, True])}), 3)
+    assert fault == "next.done is True in episode 3 frame 1, before the last frame 3"

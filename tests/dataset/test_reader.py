@@ -15,7 +15,9 @@ from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import STATE, TIMESTAMP, Episode
 
 
-def test_columns_come_back_whole(fake: Dataset) -> None:
+@pytest.mark.parametrize("block_rows", [1, 2**16])
+def test_columns_come_back_whole(fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int) -> None:
+    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
     columns = fake.columns([column.name for column in COLUMNS])
     for name, values in columns.items():
         expected = concatenated(name)
@@ -106,6 +108,19 @@ def test_subsets_are_nested_and_follow_the_uid(fake: Dataset, tmp_path: Path) ->
         fake.subset(6)
     with pytest.raises(BadInputError, match="a subset of 0 episodes"):
         fake.subset(0)
+
+
+def test_success_is_taken_from_the_metadata_or_else_from_the_column(tmp_path: Path) -> None:
+    def successes(name: str, *metadata: dict[str, bool | str]) -> list[bool | None] | None:
+        with writer(tmp_path / name) as open_writer:
+            for uid, facts in enumerate(metadata):  # in the column, those of odd uids succeed
+                open_writer.add(Episode(uid, fake_columns(3, seed=uid), facts))
+        return Dataset.open(tmp_path / name).successes()
+
+    assert successes("metadata", {"success": True}, {"success": False}) == [True, False]
+    assert successes("column", {}, {}) == [False, True]
+    assert successes("some", {"success": True}, {}) == [False, True]
+    assert successes("text", {"success": "yes"}, {"success": "no"}) == [False, True]
 
 
 def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:

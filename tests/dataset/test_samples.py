@@ -5,9 +5,8 @@ from fake_frames import assert_equal, everything
 from torch.utils.data import DataLoader
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.frames import Frames
+from astra_data.dataset.frames import Frames, Padding
 from astra_data.dataset.samples import Order
-from astra_data.dataset.step_windows import Padding
 
 
 def test_samples_come_one_by_one_too(frames: Frames) -> None:
