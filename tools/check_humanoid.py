@@ -5,9 +5,9 @@
 reads a finished run and prints
 
 1. how long a humanoid lasts whose legs are commanded to stay straight;
-2. the lean of humanoids some steps before they fall, in held-out recorded episodes and under the policies of
-   rows, and the height that NAS's simulator, if its state has one, predicts for the fall from the true history
-   and actions;
+2. the lean of humanoids some steps before they fall, in held-out recorded episodes and under the policies
+   of rows, and the height that NAS's simulator, if its state has one, predicts for the fall from the true
+   history and actions;
 3. how long a recurrent policy on φ alone lasts that was taught by Full Obs on the states that it gets into
    itself (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
 """
