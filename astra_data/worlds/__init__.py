@@ -1,1 +1,1 @@
-"""What can be stepped, and the tasks set there: target environments and abstract simulators, B at once."""
+"""Target environments and abstract simulators, stepped B at once, and the tasks that pair them."""

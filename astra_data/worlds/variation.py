@@ -179,12 +179,12 @@ class AnyVariation(BallVariation, JointVariation):
 
 
 class VariedSimulator(ABC):
-    """B of a simulator, each with parameters of its own, seen through sensors.
+    """B simulators with parameters that differ from row to row, observed through sensors.
 
     With plain parameters it is the plain simulator. Noise is drawn from torch's global generator.
 
     Attributes:
-        simulator: the simulator itself, which knows the true states.
+        simulator: the simulator itself, whose states are the true ones.
         variation: the ranges of the parameters. parameters: (B, P), in the order of its `names`.
     """
 
@@ -197,7 +197,7 @@ class VariedSimulator(ABC):
     @property
     @abstractmethod
     def state(self) -> Tensor:
-        """The states as the sensors show them, (B, X) float32."""
+        """The observed states, (B, X) float32."""
 
     @property
     def true_state(self) -> Tensor:
@@ -225,11 +225,11 @@ class VariedSimulator(ABC):
 
     @abstractmethod
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` to where `landed` is shown, both (B, X); return the shown states (B, X)."""
+        """Move from `before` to where `landed` is observed, both (B, X); return the observed states."""
 
     @abstractmethod
     def step(self, action: Tensor) -> Tensor:
-        """Apply `action` (B, A); return the shown states (B, X)."""
+        """Apply `action` (B, A); return the observed states (B, X)."""
 
 
 RANDOMIZED_ACTIONS = PlanarVariation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))

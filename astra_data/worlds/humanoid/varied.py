@@ -9,7 +9,7 @@ class VariedHumanoid(VariedSimulator):
     """B of one of the humanoid's simulators, each with the parameters of a `JointVariation`.
 
     A command gets noise, is clipped to ±1 and scaled; the simulator clips the result again. Sensors show the
-    true state, scaled: rewards and falls are judged by what is shown, for steps of the plain length.
+    true state, scaled; rewards and falls are those of the observed state and of steps of the plain length.
     """
 
     @property
@@ -18,7 +18,7 @@ class VariedHumanoid(VariedSimulator):
 
     @property
     def state(self) -> Tensor:
-        """The states as the sensors show them, (B, X) float32."""
+        """The observed states, (B, X) float32."""
         return self._scale * self.true_state
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
@@ -26,12 +26,12 @@ class VariedHumanoid(VariedSimulator):
         self.simulator.reset_to(state, rows)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` to where `landed` is shown, both (B, X); return the shown states (B, X)."""
+        """Move from `before` to where `landed` is observed, both (B, X); return the observed states."""
         self.simulator.settle(before / self._scale, landed / self._scale)
         return self.state
 
     def step(self, action: Tensor) -> Tensor:
-        """Follow the commands `action` (B, A); return the shown states (B, X)."""
+        """Follow the commands `action` (B, A); return the observed states (B, X)."""
         parameters = self.by_name()
         self.simulator.vary(parameters)
         command = noisy_command(action, parameters["action_noise"])

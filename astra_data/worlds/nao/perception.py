@@ -89,10 +89,10 @@ class Localisation:
         white = errors.white_m * rng.normal(size=(count, 2))
         motion = pose - self._true
         motion[:, 2] = wrapped(motion[:, 2])
-        believed = pose - motion * (errors.latency_s / self.step_s) + drift
-        believed[:, :2] += white
-        believed[:, 2] = wrapped(believed[:, 2])
-        self.pose = np.where(active[:, None], believed, self.pose)
+        estimated = pose - motion * (errors.latency_s / self.step_s) + drift
+        estimated[:, :2] += white
+        estimated[:, 2] = wrapped(estimated[:, 2])
+        self.pose = np.where(active[:, None], estimated, self.pose)
         self._drift = np.where(active[:, None], drift, self._drift)
         self._true = np.where(active[:, None], pose, self._true)
 
@@ -130,14 +130,14 @@ class BallSight:
         self._error[rows] = 0.0
 
     def update(
-        self, ball: Floats, pose: Floats, believed: Floats, rng: np.random.Generator, active: Bools
+        self, ball: Floats, pose: Floats, estimated: Floats, rng: np.random.Generator, active: Bools
     ) -> None:
         """Update the estimates of the robots in `active` (B,) after a step.
 
         Args:
             ball: true positions of the balls, (B, 2).
             pose: true poses of the robots, (B, 3).
-            believed: estimated poses, (B, 3).
+            estimated: estimated poses, (B, 3).
             rng: of all errors.
             active: robots whose estimates are updated, (B,).
         """
@@ -150,9 +150,9 @@ class BallSight:
         keep = np.exp(-self.step_s / errors.ball_s)
         fresh = np.sqrt(1 - keep**2) * spread[:, None] * rng.normal(size=ball.shape)
         self._error = np.where(active[:, None], keep * self._error + fresh, self._error)
-        angle = bearing + believed[:, 2]
+        angle = bearing + estimated[:, 2]
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        place = believed[:, :2] + distance[:, None] * direction + self._error
+        place = estimated[:, :2] + distance[:, None] * direction + self._error
         since = (self.unseen_s + self.step_s)[:, None]
         fast = (place - self.position) / since
         mixed = errors.ball_speed_keep * self.velocity + (1 - errors.ball_speed_keep) * fast

@@ -164,8 +164,8 @@ class NaoEnv:
         self.robots.step(self._body_command(action[:, :2], kick), moving, kick)
         self.localisation.update(self.robots.pose, self._rng, moving)
         if self.has_ball:
-            believed = self.localisation.pose
-            self.sight.update(self.robots.ball, self.robots.pose, believed, self._rng, moving)
+            estimated = self.localisation.pose
+            self.sight.update(self.robots.ball, self.robots.pose, estimated, self._rng, moving)
         after = self.truth
         success = self.objective.reached(after, self.goal)
         failed = torch.from_numpy(self.robots.fallen.copy()) | self.objective.missed(after, self.goal)

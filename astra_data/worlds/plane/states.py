@@ -1,4 +1,4 @@
-"""States among the walls of a maze, and how parameters and sensors of planar simulators vary."""
+"""States among the walls of a maze, and planar simulators whose parameters and sensors vary."""
 
 from collections.abc import Mapping
 
@@ -33,7 +33,7 @@ class PlanarStates:
         speed_m_s: float,
         device: str,
     ) -> None:
-        """Put B discs of radius `radius_m` at rest at the origin; commands of 1 stand for `speed_m_s`."""
+        """Put B discs of radius `radius_m` at rest at the origin; a command of 1 is `speed_m_s`."""
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
         self.num_envs = num_envs
@@ -78,31 +78,31 @@ class PlanarStates:
 class VariedPlanar(VariedSimulator):
     """B point masses, with balls or without, each with the parameters of a `PlanarVariation`.
 
-    Commanded velocities get noise; sensors show positions and velocities with uniform noise. A state that was
-    set, or corrected, is shown as it is.
+    Commanded velocities get Gaussian noise, observed positions and velocities uniform noise. A state is
+    observed without noise when it was set or corrected.
     """
 
     def __init__(self, simulator: VariableSimulator, variation: Variation) -> None:
         super().__init__(simulator, variation)
-        self._shown = simulator.state
+        self._observed = simulator.state
 
     @property
     def state(self) -> Tensor:
-        """The states as the sensors show them, (B, X) float32."""
-        return self._shown
+        """The observed states, (B, X) float32."""
+        return self._observed
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
         self.simulator.reset_to(state, rows)
-        self._shown = self.true_state if rows is None else self._shown.index_copy(0, rows, state)
+        self._observed = self.true_state if rows is None else self._observed.index_copy(0, rows, state)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
-        self._shown = self.simulator.settle(before, landed)
-        return self._shown
+        self._observed = self.simulator.settle(before, landed)
+        return self._observed
 
     def step(self, action: Tensor) -> Tensor:
-        """Apply commands `action` (B, A), which begin with a velocity; return the shown states (B, X)."""
+        """Apply commands `action` (B, A), which begin with a velocity; return the observed states (B, X)."""
         parameters = self.by_name()
         velocity, rest = action.tensor_split([2], dim=-1)
         command = torch.cat([noisy_command(velocity, parameters["action_noise"]), rest], dim=-1)
@@ -118,5 +118,5 @@ class VariedPlanar(VariedSimulator):
             )
             if name in parameters
         ]
-        self._shown = true + (torch.rand_like(true) * 2.0 - 1.0) * torch.cat(half_widths, dim=-1)
-        return self._shown
+        self._observed = true + (torch.rand_like(true) * 2.0 - 1.0) * torch.cat(half_widths, dim=-1)
+        return self._observed

@@ -105,3 +105,13 @@ def test_goal_distance_follows_the_goal() -> None:
     goal = torch.tensor([[-4.0, -4.0], [-3.6, -4.0]])
     position = torch.tensor([[0.0, -4.0], [0.0, -4.0]])
     assert distance(position, goal).tolist() == pytest.approx([4.0, 3.6], abs=0.1)
+
+
+def test_points_outside_of_the_maze_have_the_values_of_its_edge() -> None:
+    distance = GoalDistance.of_maze(U_MAZE, spacing_m=0.2)
+    goal = torch.tensor([U_MAZE.cell_centre(*U_MAZE.goal)]).expand(4, 2)
+    outside = torch.tensor([[-4.0, 15.0], [-4.0, -15.0], [-15.0, 4.0], [15.0, 4.0]])
+    edge = outside.clamp(-9.95, 9.95)
+    torch.testing.assert_close(distance(outside, goal), distance(edge, goal), atol=0.01, rtol=0)
+    space = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
+    assert space.blocked[space.cells(outside)].all()
