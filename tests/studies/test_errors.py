@@ -45,3 +45,16 @@ def test_intervals_resample_pieces() -> None:
     squared = np.where(piece_of == 0, 1.0, 9.0)[None, :, None, None] * np.ones((1, 200, 1, len(AXES)))
     cell = summary({"raw": squared}, piece_of, [1.0])["raw"]["1"]["forward_m"]
     assert (cell["rmse"], cell["low"], cell["high"]) == pytest.approx((5**0.5, 1.0, 3.0), abs=1e-5)
+
+
+def test_intervals_hold_95_percent_of_the_resamples() -> None:
+    """By another bootstrap; a 90 % interval would be a sixth narrower."""
+    rng = np.random.default_rng(5)
+    squared_of, starts_of = rng.uniform(0, 9, 40), rng.integers(1, 6, 40)
+    piece_of = np.repeat(np.arange(40), starts_of)
+    squared = np.repeat(squared_of, starts_of)[None, :, None, None] * np.ones((1, 1, 1, len(AXES)))
+    cell = summary({"raw": squared}, piece_of, [1.0])["raw"]["1"]["forward_m"]
+    drawn = rng.integers(40, size=(20_000, 40))
+    errors = np.sqrt((squared_of * starts_of)[drawn].sum(1) / starts_of[drawn].sum(1))
+    low, high = np.percentile(errors, [2.5, 97.5])
+    assert [cell["low"], cell["high"]] == pytest.approx([low, high], abs=0.05 * (high - low))

@@ -89,9 +89,18 @@ def test_steps_that_are_not_walking_are_not_learned_from(stretch: Stretch) -> No
     still = replace(stretch, past_motion=stretch.past_simulated.clone())
     still.past_motion[:, 1] += 0.1  # of all steps after the first one alone is walking
     once = float(model.loss(still).detach())
-    farther = replace(still, past_ball=stretch.past_ball.clone())
-    farther.past_ball[:, -1] += 3.0
-    assert float(model.loss(farther).detach()) == pytest.approx(once)
-    nearer = replace(still, past_ball=stretch.past_ball.clone())
-    nearer.past_ball[:, 1] += 3.0
-    assert float(model.loss(nearer).detach()) != pytest.approx(once)
+
+    def changes(column: str, steps: slice, *, turned: bool = False) -> bool:
+        """Return whether the loss depends on these steps of the history."""
+        values = getattr(still, column).clone()
+        values[:, steps] = -values[:, steps] if turned else values[:, steps] + 0.7
+        return float(model.loss(replace(still, **{column: values})).detach()) != pytest.approx(once, rel=1e-5)
+
+    # How much nearer the ball comes in step 1 is predicted from step 0 and the action of step 1.
+    assert changes("past_ball", slice(0, 1)) and changes("past_ball", slice(1, 2))
+    assert changes("past_action", slice(0, 1)) and changes("past_action", slice(1, 2))
+    assert not changes("past_ball", slice(2, None))
+    assert not changes("past_action", slice(2, None))
+    # A ball on the other side is as far away: of that, only step 0 is an input.
+    assert changes("past_ball", slice(0, 1), turned=True)
+    assert not changes("past_ball", slice(1, 2), turned=True)
