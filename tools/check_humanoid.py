@@ -21,12 +21,12 @@ from typing import Annotated
 
 import torch
 import typer
+from astra_data.grounding.grounding_file import load_grounding
 from timing import complain
 from torch import Tensor, nn
 
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import base_method
-from astra_data.grounding.grounding_file import load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import GroundedSimulator
 from astra_data.learning.networks.grounding import GroundingModel
