@@ -8,8 +8,10 @@ from toy_episodes import toy_episodes
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.open_loop_error import _interval, distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.worlds.registry import TASKS
+from astra_data.worlds.variation import PlanarVariation
 
 TASK = TASKS["antmaze-umaze"]
 STEPS = 60
@@ -141,3 +143,10 @@ def test_a_grounding_starts_with_the_history_before_each_replay() -> None:
     expected = torch.cat([wrong[0], wrong[1], wrong[2, :2]]).mean(0)
     for index, quantity in enumerate(TASK.quantities):
         assert report["grounded"][quantity]["mean"][0] == pytest.approx(float(expected[index]), rel=1e-3)
+
+
+def test_identified_parameters_are_replayed_without_their_noise() -> None:
+    found = PlanarVariation(friction=(0.9, 0.9), position_noise_m=(0.3, 0.3), action_noise=(0.2, 0.2))
+    report = gap_report(TASK, IdentifiedParameters(found), episodes(speed=0.9), seed=0)
+    assert report["raw"]["position_m"]["mean"][-1] > 0.1
+    assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=1e-3)
