@@ -21,14 +21,15 @@ from typing import Annotated
 
 import torch
 import typer
-from astra_data.grounding.grounding_file import load_grounding
 from timing import complain
 from torch import Tensor, nn
 
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import base_method
+from astra_data.grounding.files import load_grounding, load_history_model
+from astra_data.grounding.history import GroundedSimulator
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.simulator import GroundedSimulator
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.history import HistoryEncoder, mlp
 from astra_data.methods import method_named
@@ -69,7 +70,8 @@ def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
     trained = PolicyFile.load(run / "train" / row / f"seed_{seed}" / "policy.safetensors")
     grounds = method_named(row).grounds
     folder = run / "ground" / base_method(row) / f"seed_{seed}"
-    deployed = deploy(task, trained, load_grounding(folder / "grounding.safetensors") if grounds else None)
+    grounding = load_grounding(folder / "grounding.safetensors") if grounds else NO_GROUNDING
+    deployed = deploy(task, trained, grounding)
     deployed.start(count)
     return lambda state: deployed.act(state, no_goals(len(state)))
 
@@ -125,7 +127,7 @@ def foretold_heights(task: Task, falls: list[Walk], before: int, model: Groundin
         previous.append(earlier[-1])
     simulator = GroundedSimulator(task.simulator(len(falls)), model)
     rows = torch.arange(len(falls))
-    simulator.reset_to(
+    simulator.start(
         torch.stack(starts),
         rows,
         no_goals(len(falls)),
@@ -262,8 +264,7 @@ def check(run: Path, seed: int, rounds: int) -> None:
     task = task_named(recipe["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    model = load_grounding(run / "ground" / "nas" / f"seed_{seed}" / "grounding.safetensors")
-    assert isinstance(model, GroundingModel)
+    model = load_history_model(run / "ground" / "nas" / f"seed_{seed}" / "grounding.safetensors")
     env = task.target(HUMANOIDS, seed=seed)
     assert isinstance(env, HumanoidEnv)
     stood = [float(len(walk.state)) for walk in walks(straight, env)]

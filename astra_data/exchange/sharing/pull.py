@@ -12,6 +12,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.atomic import publish
 from astra_data.dataset.description import NAME
+from astra_data.dataset.doctor.check import check
 from astra_data.dataset.versions import Version, place
 from astra_data.exchange.sharing.address import Hub, parse_source
 from astra_data.exchange.sharing.fetch import fetch
@@ -115,7 +116,7 @@ def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any]
     """Check that the downloaded files are the complete dataset; they may have been written by anybody."""
     try:
         dataset = Dataset.open(folder)
-        faults = dataset.verify()
+        faults = check(folder).faults
         outside = [str(path) for path in dataset.paths if path.relative_to(folder).as_posix() not in sums]
         if dataset.content_hash != description.get("content_hash"):
             faults.append("its description changed during the download")

@@ -7,6 +7,7 @@ from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
+from astra_data.dataset.doctor.check import check
 from astra_data.dataset.versions import Version, open_dataset
 from astra_data.exchange.sharing.address import Hub, Url, parse_place
 from astra_data.exchange.sharing.card import write_card
@@ -57,8 +58,7 @@ def push(
         raise BadInputError(
             f"{place}: private is for the Hugging Face Hub; elsewhere, set the permissions of the storage."
         )
-    faults = local.verify()
-    if faults:
+    if faults := check(local.root).faults:
         raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
     version = Version.parse(local.description["version"])
     if isinstance(place, Url):
