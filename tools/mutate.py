@@ -2,9 +2,10 @@
 
     uv run --with cosmic-ray python tools/mutate.py learning grounding --count 40 --seed 0
 
-A mutant is run, in a copy of the checkout, against the test files that import its module, the one of the same
-name first. Left out are mutants that change nothing a test could see: type unions, defaults of settings,
-decorators. Survivors are printed as diffs: read them, for some are equivalent.
+First the tests have to pass without a change. Then each mutant is run, in a copy of the checkout, against the
+test files that import its module, the one of the same name first. Left out are mutants that change nothing a
+test could see: type unions, defaults of settings, decorators. Survivors are printed as diffs: read them, for
+some are equivalent.
 """
 
 import ast
@@ -31,7 +32,7 @@ from rich.progress import Progress
 
 ROOT = Path(__file__).parents[1]
 SKIPPED = ("BitOr", "RemoveDecorator", "VariableInserter", "VariableReplacer")
-PATIENCE_S = 240
+PATIENCE_S = 600
 """A mutant whose tests take longer counts as noticed."""
 
 
@@ -97,6 +98,17 @@ def tests_of(path: Path) -> list[str]:
     return [str(test) for test in dict.fromkeys(found)]
 
 
+def drawn_from(files: list[Path], count: int, draw: random.Random) -> list[Mutant]:
+    """Draw mutants: files by their length, then any of a file's mutants."""
+    lengths = [len((ROOT / file).read_text().splitlines()) for file in files]
+    shares = Counter(draw.choices(files, lengths, k=count))
+    found = []
+    for file, share in sorted(shares.items()):
+        every = list(mutants(file))
+        found += draw.sample(every, min(share, len(every)))
+    return found
+
+
 def is_noticed(mutant: Mutant, copy: Path, tests: list[str]) -> bool:
     """Run the tests on the mutant in a copy of the checkout."""
     target = copy / mutant.path
@@ -119,7 +131,7 @@ def main(
     jobs: Annotated[int, typer.Option(help="Mutants at a time.", min=1)] = 2,
 ) -> None:
     """Draw mutants of the rooms and count those that the tests notice."""
-    console, draw = Console(), random.Random(seed)
+    console = Console()
     files = [
         file.relative_to(ROOT)
         for room in rooms
@@ -133,8 +145,10 @@ def main(
     console.print(
         f"not run, for no test imports them: {', '.join(map(str, set(files) - set(tested))) or 'none'}"
     )
-    every = [mutant for file in sorted(tested) for mutant in mutants(file)]
-    drawn = draw.sample(every, min(count, len(every)))
+    drawn = drawn_from(sorted(tested), count, random.Random(seed))
+    sound = [
+        Mutant(file, "none", (ROOT / file).read_text()) for file in dict.fromkeys(one.path for one in drawn)
+    ]
     noticed: Counter[str] = Counter()
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -153,17 +167,19 @@ def main(
             copy = copies.get()
             seen = is_noticed(mutant, copy, tested[mutant.path])
             copies.put(copy)
-            noticed["killed" if seen else "survived"] += 1
-            if not seen:
+            if mutant in sound:
+                assert not seen, f"the tests of {mutant.path} fail without any change: mend them first"
+            elif seen:
+                noticed[mutant.path.parts[1]] += 1
+            else:
                 console.print(f"\nsurvived ({mutant.operator}):\n{mutant.diff()}", markup=False)
             bar.advance(task)
 
-        task = bar.add_task("mutants", total=len(drawn))
-        list(pool.map(run, drawn))
-    killed = noticed["killed"]
-    console.print(
-        f"{killed} of {len(drawn)} mutants noticed ({killed / len(drawn):.0%}), of {len(every)} possible"
-    )
+        task = bar.add_task("mutants", total=len(sound) + len(drawn))
+        list(pool.map(run, sound + drawn))
+    for room, of in sorted(Counter(mutant.path.parts[1] for mutant in drawn).items()):
+        console.print(f"{room}: {noticed[room]} of {of}")
+    console.print(f"{noticed.total()} of {len(drawn)} mutants noticed ({noticed.total() / len(drawn):.0%})")
 
 
 if __name__ == "__main__":
