@@ -25,9 +25,6 @@ class BallAgent(PlanarStates):
     Corrections move only balls that rolled or were touched in the step, and leave none at less than 0.15 m/s:
     an expected correction mixes balls that are touched with others that are not into one that creeps, and
     policies wait for it.
-
-    Attributes:
-        parameters: what a dataset paired with this simulator records about it.
     """
 
     state_size = 8
@@ -64,7 +61,6 @@ class BallAgent(PlanarStates):
         super().__init__(
             maze,
             num_envs,
-            self.state_size,
             timestep_s=timestep_s,
             radius_m=radius_m,
             speed_m_s=speed_m_s,
