@@ -101,11 +101,7 @@ align = _of_networks("align", "Fit the encoder of target histories to that of si
 
 
 def evaluate(
-    recipe: RecipePath,
-    method: Method = None,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    root: Root = RUNS,
+    recipe: RecipePath, method: Method = None, seeds: Seeds = None, jobs: Jobs = None, root: Root = RUNS
 ) -> None:
     """Run the policies in the target environment."""
     run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)

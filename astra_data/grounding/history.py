@@ -25,11 +25,7 @@ class GroundedSimulator(EpisodeSimulator):
     """
 
     def __init__(
-        self,
-        simulator: PlacedSimulator,
-        model: GroundingModel,
-        *,
-        scatter: Tensor | None = None,
+        self, simulator: PlacedSimulator, model: GroundingModel, *, scatter: Tensor | None = None
     ) -> None:
         """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
         super().__init__(simulator, scatter=scatter)

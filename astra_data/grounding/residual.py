@@ -24,11 +24,7 @@ class ResidualSimulator(EpisodeSimulator):
     """
 
     def __init__(
-        self,
-        simulator: PlacedSimulator,
-        model: ResidualModel,
-        *,
-        scatter: Tensor | None = None,
+        self, simulator: PlacedSimulator, model: ResidualModel, *, scatter: Tensor | None = None
     ) -> None:
         """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
         super().__init__(simulator, scatter=scatter)
