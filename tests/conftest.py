@@ -1,6 +1,7 @@
 import dataclasses
 import importlib
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import fake_stages
@@ -11,6 +12,13 @@ if TYPE_CHECKING:
 
 # Before torch and numpy are loaded: tests run side by side, a core each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of datasets that are known by name."""
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
 
 
 @pytest.fixture

@@ -95,11 +95,7 @@ def write_evaluation(
 
 
 def band(error: float) -> dict[str, list[float]]:
-    return {
-        "mean": [error, 2 * error],
-        "low": [error / 2, error],
-        "high": [2 * error, float("nan")],
-    }
+    return {"mean": [error, 2 * error], "low": [error / 2, error], "high": [2 * error, float("nan")]}
 
 
 def write_runs(parent: Path) -> Path:
@@ -126,11 +122,7 @@ def write_runs(parent: Path) -> Path:
                 write_json(
                     root / f"train/{method}/seed_{seed}/curve.json",
                     MADE
-                    | {
-                        "steps_per_second": 48000.0,
-                        "simulator_steps_per_second": 96000.0,
-                        "points": points,
-                    },
+                    | {"steps_per_second": 48000.0, "simulator_steps_per_second": 96000.0, "points": points},
                 )
     return root
 

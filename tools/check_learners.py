@@ -126,12 +126,7 @@ def ppo(seed: int, *, memory_size: int = 0) -> Returns:
 def train_by_sac(seed: int) -> tuple[Policy, dict[str, Tensor]]:
     """Train for 20 k steps, in four pendulums at once; return the actor and the early episodes."""
     env = Recorder(4, seed=seed)
-    config = SacConfig(
-        total_steps=20_000,
-        rollout_steps=200,
-        updates_per_step=env.num_envs,
-        discount=0.99,
-    )
+    config = SacConfig(total_steps=20_000, rollout_steps=200, updates_per_step=env.num_envs, discount=0.99)
     torch.manual_seed(seed)
     actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
     learner = Sac(env, actor, config, horizon=HORIZON, seed=seed)

@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from ant_velocity import AntVelocityConfig, AntVelocityEnv
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors.numpy import save_file
 from torch import nn
@@ -21,7 +22,6 @@ from astra_data.learning.networks.policy import PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.sac import Sac, SacConfig
 from astra_data.worlds.ant.body import VelocityController
-from astra_data.worlds.ant.velocity import AntVelocityConfig, AntVelocityEnv
 
 SETTLED_STEPS = 20
 """One second after a command change, tracking counts as settled."""

@@ -48,8 +48,7 @@ def augment(
         ),
     ] = None,
     margin_m: Annotated[
-        float | None,
-        typer.Option(help="Clearance from the walls, in m.", show_default="the robot's reach"),
+        float | None, typer.Option(help="Clearance from the walls, in m.", show_default="the robot's reach")
     ] = None,
     min_steps: Annotated[int | None, typer.Option(help="Fewest steps of a copy.", show_default="20")] = None,
     tries: Annotated[

@@ -1,6 +1,6 @@
 """Commands that work on recipes."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -78,48 +78,30 @@ def check(recipes: RecipePaths, root: Root = RUNS) -> None:
         raise AstraDataError("\n".join(faults))
 
 
-def ground(
-    recipe: RecipePath,
-    method: Method = None,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    device: Device = "cpu",
-    root: Root = RUNS,
-) -> None:
-    """Learn from the pairs to correct the abstract simulator."""
-    run_stage(recipe, "ground", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+def _of_networks(stage: str, summary: str) -> Callable[..., None]:
+    """Return the command of a stage that fits networks."""
+
+    def command(
+        recipe: RecipePath,
+        method: Method = None,
+        seeds: Seeds = None,
+        jobs: Jobs = None,
+        device: Device = "cpu",
+        root: Root = RUNS,
+    ) -> None:
+        run_stage(recipe, stage, method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+
+    command.__doc__ = summary
+    return command
 
 
-def train(
-    recipe: RecipePath,
-    method: Method = None,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    device: Device = "cpu",
-    root: Root = RUNS,
-) -> None:
-    """Train policies in the abstract simulator, grounded if the method grounds it."""
-    run_stage(recipe, "train", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
-
-
-def align(
-    recipe: RecipePath,
-    method: Method = None,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    device: Device = "cpu",
-    root: Root = RUNS,
-) -> None:
-    """Fit the encoder of target histories to that of simulated ones."""
-    run_stage(recipe, "align", method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+ground = _of_networks("ground", "Learn from the pairs to correct the abstract simulator.")
+train = _of_networks("train", "Train policies in the abstract simulator, grounded if the method grounds it.")
+align = _of_networks("align", "Fit the encoder of target histories to that of simulated ones.")
 
 
 def evaluate(
-    recipe: RecipePath,
-    method: Method = None,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    root: Root = RUNS,
+    recipe: RecipePath, method: Method = None, seeds: Seeds = None, jobs: Jobs = None, root: Root = RUNS
 ) -> None:
     """Run the policies in the target environment."""
     run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)

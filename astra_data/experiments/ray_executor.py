@@ -29,11 +29,7 @@ HERE = "local"
 """The address of a cluster of this machine alone, which starts and stops with the run."""
 GPU_SHARE = 0.5
 """Share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU."""
-SETTINGS = {
-    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_worker_niceness": "0",
-}
+SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
 """Otherwise Ray makes `uv run` build an environment for every worker, sends usage statistics, and runs
 its workers at a lower priority than every other process."""
 PATIENCE_S = 10

@@ -28,12 +28,7 @@ from astra_data.experiments.recipe import WHOLE
 from astra_data.experiments.run import RUNS, make
 from astra_data.reports.artefacts import EVALUATION, Artefact, Evaluation, read_json
 
-TIMED = {
-    "ground": "metrics.json",
-    "train": "curve.json",
-    "align": "metrics.json",
-    "evaluate": EVALUATION,
-}
+TIMED = {"ground": "metrics.json", "train": "curve.json", "align": "metrics.json", "evaluate": EVALUATION}
 """Stages that are run for few points at once, and the file with the time that they took."""
 
 COLUMNS = (

@@ -9,12 +9,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.worlds.protocols import PlacedSimulator
-from astra_data.worlds.task import Task
-from astra_data.worlds.variation import Variation
 
 
 class GroundedSimulator(EpisodeSimulator):
@@ -26,11 +25,7 @@ class GroundedSimulator(EpisodeSimulator):
     """
 
     def __init__(
-        self,
-        simulator: PlacedSimulator,
-        model: GroundingModel,
-        *,
-        scatter: Tensor | None = None,
+        self, simulator: PlacedSimulator, model: GroundingModel, *, scatter: Tensor | None = None
     ) -> None:
         """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
         super().__init__(simulator, scatter=scatter)
@@ -110,11 +105,10 @@ class GroundedSimulator(EpisodeSimulator):
 
 
 @dataclass(frozen=True)
-class HistoryGrounding:
+class HistoryGrounding(FittedGrounding):
     """Correct each step by a history model, whose latents policies observe."""
 
     kind: ClassVar[str] = "history"
-    start_stride: ClassVar[int] = 1
 
     model: GroundingModel
 
@@ -123,18 +117,9 @@ class HistoryGrounding:
         """The model, whose encoder is ψ^s."""
         return self.model
 
-    def simulator(
-        self,
-        task: Task,
-        num_envs: int,
-        device: str = "cpu",
-        *,
-        variation: Variation | None = None,
-        scatter: Tensor | None = None,
-    ) -> GroundedSimulator:
-        """Build `num_envs` corrected simulators; see `Grounding.simulator`."""
-        inner = abstract_simulator(task, num_envs, device, variation)
-        return GroundedSimulator(inner, self.model, scatter=scatter)
+    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> GroundedSimulator:
+        """Wrap `simulator`; see `Grounding.corrected`."""
+        return GroundedSimulator(simulator, self.model, scatter=scatter)
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
@@ -145,10 +130,6 @@ class HistoryGrounding:
     def scatter(self, episodes: PairedEpisodes) -> Tensor:
         """Return the factor (X, X) of the scatter around the correction, as fitted on held-out episodes."""
         return self.model.residual_factor
-
-    def for_replay(self) -> "HistoryGrounding":
-        """Return itself."""
-        return self
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and sizes."""

@@ -6,9 +6,10 @@ from typing import Any, ClassVar, Protocol, Self
 from torch import Tensor
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
 from astra_data.learning.networks.history import LatentEncoder
 from astra_data.learning.networks.paired_windows import PairedWindows
+from astra_data.worlds.protocols import PlacedSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
@@ -20,12 +21,16 @@ class Grounding(Protocol):
         start_stride: episodes may start from every so many-th recorded step.
     """
 
-    start_stride: ClassVar[int]
+    start_stride: ClassVar[int] = 1
 
     @property
     def encoder(self) -> LatentEncoder | None:
         """The source encoder ψ^s, whose latents policies observe; None where there are none."""
-        ...
+        return None
+
+    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> EpisodeSimulator:
+        """Wrap `simulator` in the correction; see `simulator` below for `scatter`."""
+        return EpisodeSimulator(simulator, scatter=scatter)
 
     def simulator(
         self,
@@ -45,14 +50,14 @@ class Grounding(Protocol):
             variation: ranges of the simulator's parameters, unless the grounding has its own.
             scatter: factor (X, X) of noise that is added after each step.
         """
-        ...
+        return self.corrected(abstract_simulator(task, num_envs, device, variation), scatter)
 
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
         """Return what it remembers before every so many-th step, (E, ceil(T / every), H); None if nothing.
 
         Histories begin where `windows` (E, T, ...) do.
         """
-        ...
+        return None
 
     def scatter(self, episodes: PairedEpisodes) -> Tensor:
         """Return the factor (X, X) of the target's scatter around the corrected simulator."""
@@ -60,7 +65,7 @@ class Grounding(Protocol):
 
     def for_replay(self) -> "Grounding":
         """Return the grounding to replay recorded actions with: without noise of sensors and actions."""
-        ...
+        return self
 
 
 class FittedGrounding(Grounding, Protocol):

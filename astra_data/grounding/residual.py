@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.worlds.protocols import PlacedSimulator
-from astra_data.worlds.task import Task
-from astra_data.worlds.variation import Variation
 
 
 class ResidualSimulator(EpisodeSimulator):
@@ -25,11 +24,7 @@ class ResidualSimulator(EpisodeSimulator):
     """
 
     def __init__(
-        self,
-        simulator: PlacedSimulator,
-        model: ResidualModel,
-        *,
-        scatter: Tensor | None = None,
+        self, simulator: PlacedSimulator, model: ResidualModel, *, scatter: Tensor | None = None
     ) -> None:
         """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
         super().__init__(simulator, scatter=scatter)
@@ -70,7 +65,7 @@ class ResidualSimulator(EpisodeSimulator):
 
 
 @dataclass(frozen=True)
-class ResidualGrounding:
+class ResidualGrounding(FittedGrounding):
     """Correct each step by a residual model; policies observe no latent."""
 
     kind: ClassVar[str] = "residual"
@@ -79,22 +74,9 @@ class ResidualGrounding:
 
     model: ResidualModel
 
-    @property
-    def encoder(self) -> None:
-        """There are no latents."""
-
-    def simulator(
-        self,
-        task: Task,
-        num_envs: int,
-        device: str = "cpu",
-        *,
-        variation: Variation | None = None,
-        scatter: Tensor | None = None,
-    ) -> ResidualSimulator:
-        """Build `num_envs` corrected simulators; see `Grounding.simulator`."""
-        inner = abstract_simulator(task, num_envs, device, variation)
-        return ResidualSimulator(inner, self.model, scatter=scatter)
+    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> ResidualSimulator:
+        """Wrap `simulator`; see `Grounding.corrected`."""
+        return ResidualSimulator(simulator, self.model, scatter=scatter)
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
@@ -111,10 +93,6 @@ class ResidualGrounding:
     def scatter(self, episodes: PairedEpisodes) -> Tensor:
         """Return the factor (X, X) of the scatter around the correction, as fitted on held-out episodes."""
         return self.model.residual_factor
-
-    def for_replay(self) -> "ResidualGrounding":
-        """Return itself."""
-        return self
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and sizes."""

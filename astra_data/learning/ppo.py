@@ -124,13 +124,9 @@ class Ppo(Learner):
         last, _ = policy.remember(acting.observation, acting.previous_action, acting.hidden)
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
+        parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
         advantage, target = vec_generalized_advantage_estimate(
-            self.config.discount,
-            self.config.gae_lambda,
-            *(
-                rollout[name].unsqueeze(-1) if isinstance(name, str) else name.unsqueeze(-1)
-                for name in ("value", following, "reward", "done", "terminated")
-            ),
+            self.config.discount, self.config.gae_lambda, *(part.unsqueeze(-1) for part in parts)
         )
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 

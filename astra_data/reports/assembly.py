@@ -25,14 +25,7 @@ from astra_data.reports.costs import Files, seconds, seed_cost, throughput
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
-from astra_data.reports.schema import (
-    BandMeans,
-    DatasetOrigin,
-    GapMeans,
-    Learning,
-    Origin,
-    Results,
-)
+from astra_data.reports.schema import BandMeans, DatasetOrigin, GapMeans, Learning, Origin, Results
 from astra_data.reports.seed_table import Line, row_of
 from astra_data.worlds.score import SUCCESS, Score
 

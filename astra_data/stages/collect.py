@@ -179,10 +179,7 @@ def _behavior(
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
         return RandomCommands(task.objective.action_size, (fewest, most), watch), {}
     if config.behavior.startswith("suboptimal"):
-        from astra_data.training.suboptimal import (  # noqa: PLC0415 - TorchRL is slow to import
-            suboptimal_by_ppo,
-            suboptimal_by_sac,
-        )
+        from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - TorchRL is slow to import
 
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)

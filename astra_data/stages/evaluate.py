@@ -173,19 +173,11 @@ def _start(deployed: DeployedPolicy, act: Act, goal: Tensor) -> Act:
 
 
 def _in_target(
-    task: Task,
-    begin: Begin,
-    config: EvaluateConfig,
-    seed: int,
-    num_threads: int | None,
-    progress: Progress,
+    task: Task, begin: Begin, config: EvaluateConfig, seed: int, num_threads: int | None, progress: Progress
 ) -> tuple[Outcome, Tensor, float]:
     """Return the outcome in the target, the states (T + 1, S) of the first episode, and target steps/s."""
     env = task.target(
-        config.episodes,
-        seed=derive(seed, "evaluation"),
-        leg_scale=config.leg_scale,
-        num_threads=num_threads,
+        config.episodes, seed=derive(seed, "evaluation"), leg_scale=config.leg_scale, num_threads=num_threads
     )
     env.reset()
     act = begin(env.goal)

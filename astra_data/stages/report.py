@@ -15,13 +15,7 @@ from astra_data.reports.assembly import assemble
 from astra_data.reports.command_replay import replay_commands
 from astra_data.reports.drawing import Camera, figure_of_sizes, figures_of
 from astra_data.reports.figures import dynamics_mismatch, png
-from astra_data.reports.files import (
-    Found,
-    publish_results,
-    published_figures,
-    read_published,
-    write_results,
-)
+from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
 from astra_data.reports.page import render
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes

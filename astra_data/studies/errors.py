@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.seeding import generator
-from astra_data.studies.motion import chained, wrapped
+from astra_data.studies.motion import chained
 from astra_data.studies.predictors import Predictor
 from astra_data.studies.rollouts import predict
 from astra_data.studies.walks import Stretch, Walks
-from astra_data.worlds.plane.geometry import turned
+from astra_data.worlds.plane.geometry import turned, wrapped
 
 Floats = NDArray[np.float64]
 
@@ -90,17 +90,13 @@ def summary(
         for k, horizon in enumerate(horizons_s):
             rows: dict[str, dict[str, float]] = {}
             for a, axis in enumerate(AXES):
-                rows[axis] = _interval("rmse", values[:, k, a])
-                rows[axis]["low"], rows[axis]["high"] = (
-                    rows[axis].pop("rmse_low"),
-                    rows[axis].pop("rmse_high"),
-                )
+                rows[axis] = _interval(values[:, k, a], "rmse", "low", "high")
                 for reference in references:
-                    rows[axis] |= _interval(f"less_than_{reference}", less[reference][:, k, a])
+                    rows[axis] |= _less(reference, less[reference][:, k, a])
             rows["mean"] = {}
             for reference in references:
                 body = less[reference][:, k, : len(BODY_AXES)].mean(-1)
-                rows["mean"] |= _interval(f"less_than_{reference}", body)
+                rows["mean"] |= _less(reference, body)
             found[name][f"{horizon:.3g}"] = rows
     return found
 
@@ -115,7 +111,12 @@ def _rmse(squared: Floats, number: NDArray[np.intp], weight: Floats) -> Floats:
         return np.asarray(np.sqrt(np.tensordot(weight, total, 1) / np.tensordot(weight, count, 1)))
 
 
-def _interval(name: str, values: Floats) -> dict[str, float]:
+def _less(reference: str, values: Floats) -> dict[str, float]:
+    name = f"less_than_{reference}"
+    return _interval(values, name, f"{name}_low", f"{name}_high")
+
+
+def _interval(values: Floats, *names: str) -> dict[str, float]:
+    """Return the first of `values` and the ends of the 95 % interval of the others, under three `names`."""
     low, high = np.nanquantile(values[1:], [0.025, 0.975])
-    ends = {name: values[0], f"{name}_low": low, f"{name}_high": high}
-    return {key: round(float(value), 5) for key, value in ends.items()}
+    return {name: round(float(value), 5) for name, value in zip(names, (values[0], low, high), strict=True)}

@@ -3,15 +3,10 @@
 import torch
 from torch import Tensor
 
-from astra_data.worlds.plane.geometry import turned
+from astra_data.worlds.plane.geometry import turned, wrapped
 
 MIRROR = (1.0, -1.0, -1.0)
 """Signs of forward, left and turn in the mirror image."""
-
-
-def wrapped(angle_rad: Tensor) -> Tensor:
-    """Return angles (...) in [-π, π)."""
-    return (angle_rad + torch.pi) % (2 * torch.pi) - torch.pi
 
 
 def between(before: Tensor, after: Tensor) -> Tensor:

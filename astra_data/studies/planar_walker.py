@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from astra_data.dataset.columns import Column
+from astra_data.worlds.free_states import FreeStates
 from astra_data.worlds.plane.geometry import turned
 
 FORWARD_M_S = 0.25
@@ -26,7 +27,7 @@ def walk_command(action: Tensor) -> Tensor:
     return torch.stack([ahead, left * LEFT_M_S, 0.6 * turn * TURN_RAD_S], dim=-1)
 
 
-class PlanarWalker:
+class PlanarWalker(FreeStates):
     """B bodies [x, y, heading, forward and left velocity, turn rate, ball x, ball y], in m, rad and s.
 
     Positions are in the field's frame, velocities in the body's. A command is the velocity of the next step,
@@ -49,17 +50,13 @@ class PlanarWalker:
     )
 
     def __init__(self, num_envs: int, *, timestep_s: float, device: str = "cpu") -> None:
+        super().__init__(torch.zeros(num_envs, self.abstract_state.size, device=device))
         self.timestep_s = timestep_s
-        self.state = torch.zeros(num_envs, self.abstract_state.size, device=device)
 
     @property
     def parameters(self) -> dict[str, float]:
         """Parameters recorded in datasets that are paired with this simulator."""
         return {"timestep_s": self.timestep_s}
-
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the rows in `rows` (n,), by default all, to `state` (n, 8)."""
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, 4), see `walk_command`; return the new state (B, 8)."""

@@ -129,11 +129,7 @@ def shortened(pieces: Sequence[Piece], rows: int, seed: int) -> tuple[Piece, ...
 
 
 def run_study(
-    recipe: GapRecipe,
-    data: Sequence[Recording],
-    train: Sequence[Recording],
-    folder: Path,
-    progress: Progress,
+    recipe: GapRecipe, data: Sequence[Recording], train: Sequence[Recording], folder: Path, progress: Progress
 ) -> dict[str, Any]:
     """Fit and test every model of every case, except for fits that are in `folder`; return the results.
 

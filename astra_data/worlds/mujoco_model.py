@@ -8,9 +8,10 @@ from torch import Tensor
 
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
+from astra_data.worlds.free_states import FreeStates
 
 
-class MujocoModel:
+class MujocoModel(FreeStates):
     """B copies of a MuJoCo model; state: qpos (nq) then qvel (nv), action: the motors' controls (nu).
 
     Every step starts cold, without the solver's warm start from the last one: pairs need that, for their
@@ -43,16 +44,12 @@ class MujocoModel:
         self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]
         self._rollout = Rollout(nthread=len(self._data))
         initial = np.concatenate([model.qpos0, np.zeros(model.nv)])
-        self.state = torch.from_numpy(np.tile(initial, (num_envs, 1))).float()
+        super().__init__(torch.from_numpy(np.tile(initial, (num_envs, 1))).float())
 
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
         return {"timestep_s": float(self.model.opt.timestep), "substeps": self.substeps}
-
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set `rows` (n,), by default all, to `state` (n, nq + nv)."""
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
 
     def step(self, action: Tensor) -> Tensor:
         """Apply controls `action` (B, nu), clipped by the motors; return the new state (B, nq + nv)."""

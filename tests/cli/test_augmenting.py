@@ -8,11 +8,7 @@ from astra_data.core.errors import AstraDataError
 from astra_data.dataset.versions import open_dataset
 from astra_data.stages.augment import AugmentConfig
 
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    return tmp_path / "home"
+pytestmark = pytest.mark.usefixtures("home")
 
 
 def call(*arguments: str) -> Result:

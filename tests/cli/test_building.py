@@ -9,13 +9,9 @@ from astra_data.dataset import Dataset, StagedWriter
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.versions import open_dataset
 
+pytestmark = pytest.mark.usefixtures("home")
+
 SMALL = ["--episodes", "2", "--max-steps", "3"]
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    return tmp_path / "home"
 
 
 def call(*arguments: str) -> Result:

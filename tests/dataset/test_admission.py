@@ -2,12 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import (
-    COLUMNS,
-    fake_columns,
-    fake_episode,
-    writer,
-)
+from fake_dataset import COLUMNS, fake_columns, fake_episode, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.admission import Admission

@@ -17,11 +17,7 @@ def test_a_feature_carries_what_each_index_means() -> None:
         "dtype": "float32",
         "shape": [3],
         "names": ["x", "y", "yaw"],
-        "astra": {
-            "meaning": "pose",
-            "unit": ["m", "m", "rad"],
-            "role": ["position", "position", "heading"],
-        },
+        "astra": {"meaning": "pose", "unit": ["m", "m", "rad"], "role": ["position", "position", "heading"]},
     }
 
 

@@ -10,9 +10,10 @@ from astra_data.dataset.edit import delete, merge, subset
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.lineage import lineage, tree_lines
 
+pytestmark = pytest.mark.usefixtures("home")
 
-def test_ancestors_are_found_at_home_and_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+
+def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "home/fake/data-1.0.0")
     left = Dataset.open(delete(first, [13], out=tmp_path / "left"))
     right = Dataset.open(subset(left, episodes=2, seed=4, out=tmp_path / "right"))
@@ -29,8 +30,7 @@ def test_ancestors_are_found_at_home_and_beside(tmp_path: Path, monkeypatch: pyt
     ]
 
 
-def test_an_ancestor_is_known_by_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "elsewhere/first")
     made = Dataset.open(delete(first, [13, 4], out=tmp_path / "made"))
     delete(made, [0], out=tmp_path / "home/fake/data-1.0.0")
@@ -38,8 +38,7 @@ def test_an_ancestor_is_known_by_its_hash(tmp_path: Path, monkeypatch: pytest.Mo
     assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
 
 
-def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "home/fake/data-1.0.0")
     made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
     path = first.root / DATASET_PATH
@@ -48,8 +47,7 @@ def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path, monkeypatch: 
         lineage(made)
 
 
-def test_a_malformed_ancestor_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+def test_a_malformed_ancestor_is_not_found(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "home/fake/data-1.0.0")
     made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
     (first.root / DATASET_PATH).write_text(json.dumps(first.description | {"parents": 3}))

@@ -155,10 +155,7 @@ def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(t
 
 
 def test_a_dataset_that_comes_between_does_not_cost_the_recording(tmp_path: Path) -> None:
-    with (
-        pytest.raises(BadInputError, match="exists already"),
-        staged_writer(tmp_path / "set") as writer,
-    ):
+    with pytest.raises(BadInputError, match="exists already"), staged_writer(tmp_path / "set") as writer:
         writer.add(fake_episode(1, 4))
         (tmp_path / "set").mkdir()
     assert len(list((tmp_path / ".set.staged").glob("*.arrow"))) == 1

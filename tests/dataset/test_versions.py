@@ -7,12 +7,6 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.versions import Version, locate, names_at_home, open_dataset, place, successor
 
 
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    return tmp_path / "home"
-
-
 def versions(*texts: str) -> list[Version]:
     return [Version.parse(text) for text in texts]
 

@@ -124,8 +124,7 @@ def test_jumps_are_longer_than_their_bound(block_rows: int) -> None:
 
 @BLOCKS
 @pytest.mark.parametrize(
-    ("not_finite", "expected", "points"),
-    [("drop", [[0, 3, 4]], {}), ("split", [[3, 4]], {"rejected": 1})],
+    ("not_finite", "expected", "points"), [("drop", [[0, 3, 4]], {}), ("split", [[3, 4]], {"rejected": 1})]
 )
 def test_rejected_rows(
     block_rows: int, not_finite: str, expected: list[list[int]], points: dict[str, int]

@@ -154,5 +154,6 @@ def test_scatter_is_the_models_own() -> None:
     assert torch.equal(grounding.scatter(episodes), torch.eye(4))
     assert grounding.encoder is used
     one = grounding.simulator(TASK, 2, scatter=torch.eye(4))
+    assert isinstance(one, GroundedSimulator)
     assert (one.model, one.latent_size, one.latent.shape) == (used, 8, (2, 8))
     assert one.scatter is not None

@@ -110,11 +110,7 @@ def constant_reward(*, terminated: bool) -> Experience:
 
 @pytest.mark.parametrize(
     ("terminated", "steps", "expected"),
-    [
-        (True, 1, [1.75, 1.5, 1.0]),
-        (False, 1, [2.0, 2.0, 2.0]),
-        (True, 2, [1.75, 1.5, 1.0]),
-    ],
+    [(True, 1, [1.75, 1.5, 1.0]), (False, 1, [2.0, 2.0, 2.0]), (True, 2, [1.75, 1.5, 1.0])],
 )
 def test_there_is_value_beyond_the_record_but_not_beyond_the_task(
     terminated: bool, steps: int, expected: list[float]

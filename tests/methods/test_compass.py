@@ -25,11 +25,7 @@ PLANTED = {"friction": 0.92, "action_scale": 0.05, "timestep_scale": 1.1, "headi
 QUICK = CompassConfig(
     **WIDE_RANGES.model_dump()
     # No more noise than leaves the planted gap of 3 cm to be seen.
-    | {
-        "action_noise": (0.0, 0.0),
-        "position_noise_m": (0.0, 0.002),
-        "velocity_noise_m_s": (0.0, 0.002),
-    },
+    | {"action_noise": (0.0, 0.0), "position_noise_m": (0.0, 0.002), "velocity_noise_m_s": (0.0, 0.002)},
     contexts=128,
     windows=60,
     window=15,

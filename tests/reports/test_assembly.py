@@ -77,11 +77,7 @@ def test_plus_rows_share_the_grounding_of_their_base_row(results: Results) -> No
     assert list(results.gaps()) == ["astra"]
     assert results.methods["direct_transfer"].gap is None
     assert results.throughput["ground"] == GROUND_SPEEDS
-    assert results.throughput["evaluate"]["target_steps_per_second"]["astra"] == [
-        1000.0,
-        1001.0,
-        1002.0,
-    ]
+    assert results.throughput["evaluate"]["target_steps_per_second"]["astra"] == [1000.0, 1001.0, 1002.0]
 
 
 def test_horizons_that_a_seed_lacks_are_left_out(root: Path) -> None:

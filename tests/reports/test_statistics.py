@@ -8,12 +8,7 @@ from scipy.stats import pearsonr, rankdata, spearmanr, trim_mean
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
-from astra_data.reports.statistics import (
-    Summary,
-    correlation,
-    probability_of_improvement,
-    summarise,
-)
+from astra_data.reports.statistics import Summary, correlation, probability_of_improvement, summarise
 
 Floats = NDArray[np.float64]
 

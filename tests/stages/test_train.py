@@ -17,12 +17,7 @@ from astra_data.training.policy_file import PolicyFile
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig
 from astra_data.worlds.registry import TASKS
 
-SWITCHES = {
-    "topple": True,
-    "residual_noise": 1.0,
-    "support_penalty": 0.1,
-    "data_start_share": 0.5,
-}
+SWITCHES = {"topple": True, "residual_noise": 1.0, "support_penalty": 0.1, "data_start_share": 0.5}
 RMA = RmaConfig(history_length=40, adaptation_steps=64 * 4)
 """Four iterations after the six of `TRAIN`."""
 

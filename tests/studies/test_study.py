@@ -18,13 +18,7 @@ STEPS = StepsConfig(rows=10, history=4)
 
 
 def recipe(**changes: object) -> GapRecipe:
-    usual = {
-        "mapping": "m.toml",
-        "models": ("gains",),
-        "seeds": (3, 4),
-        "horizons_s": (0.5,),
-        "steps": STEPS,
-    }
+    usual = {"mapping": "m.toml", "models": ("gains",), "seeds": (3, 4), "horizons_s": (0.5,), "steps": STEPS}
     return GapRecipe.model_validate(usual | changes)
 
 
@@ -83,19 +77,8 @@ def test_smaller_sizes_lie_inside_larger_ones() -> None:
 
 
 def test_the_raw_simulator_is_always_a_model_and_unknown_ones_are_refused() -> None:
-    assert recipe(
-        models=(
-            "astra",
-            "ridge",
-            "astra",
-        )
-    ).models == ("raw", "astra", "ridge")
-    assert recipe(
-        models=(
-            "ridge",
-            "raw",
-        )
-    ).models == ("raw", "ridge")
+    assert recipe(models=("astra", "ridge", "astra")).models == ("raw", "astra", "ridge")
+    assert recipe(models=("ridge", "raw")).models == ("raw", "ridge")
     with pytest.raises(ValidationError, match="unknown model 'rigde': did you mean 'ridge'"):
         recipe(models=("rigde",))
 

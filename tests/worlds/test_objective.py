@@ -75,10 +75,7 @@ def test_who_is_to_last_succeeds_at_the_horizon_without_a_failure() -> None:
     assert lasting.scores == (SURVIVED_STEPS, RETURN)
 
 
-PLANAR: dict[str, Any] = {
-    "navigation": Navigation(U_MAZE, horizon=9),
-    "kicking": Kicking(FIELD, horizon=9),
-}
+PLANAR: dict[str, Any] = {"navigation": Navigation(U_MAZE, horizon=9), "kicking": Kicking(FIELD, horizon=9)}
 
 
 @pytest.mark.parametrize("objective", PLANAR.values(), ids=PLANAR)

@@ -21,10 +21,7 @@ from astra_data.dataset.plain import (
     runs,
 )
 
-_STRUCTURE = {
-    *(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX),
-    *(names.TIMESTAMP, names.EPISODE_UID),
-}
+_STRUCTURE = {*(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX), *(names.TIMESTAMP, names.EPISODE_UID)}
 """Columns that locate episodes: after a fault in one, no later episode can be trusted."""
 
 

@@ -1,7 +1,7 @@
 """A dataset's card, in the format of the Hugging Face Hub."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from astra_data.exchange.sharing.loading import loading
 from astra_data.exchange.sharing.notes import Notes
 from astra_data.reports.figures.coverage import coverage
 from astra_data.reports.figures.style import png
+from astra_data.reports.formatting import table
 
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 
@@ -108,12 +109,12 @@ def _opening(dataset: Dataset) -> str:
 
 def _counts(dataset: Dataset) -> str:
     lengths = dataset.lengths
-    quartiles = np.percentile(lengths, [25, 50, 75])
+    quartiles = ", ".join(f"{length:g}" for length in np.percentile(lengths, [25, 50, 75]))
     rows = [
         ("episodes", f"{len(dataset):,}"),
         ("steps", f"{int(lengths.sum()):,}"),
         ("duration", f"{lengths.sum() / dataset.info['fps'] / 60:,.1f} min"),
-        ("episode length", f"{lengths.min()} to {lengths.max()} steps; quartiles {_listed(quartiles)}"),
+        ("episode length", f"{lengths.min()} to {lengths.max()} steps; quartiles {quartiles}"),
     ]
     metadata = dataset.metadata | {"success": dataset.successes() or []}
     facts = {key: [value for value in values if value is not None] for key, values in metadata.items()}
@@ -141,11 +142,10 @@ def _columns(dataset: Dataset) -> str:
             shape = f"({column.size},)"
             rows.append((f"`{column.name}`", column.dtype, shape, _units(column), meaning))
     plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
-    table = _table(("column", "type", "shape", "units", "meaning"), rows)
     order = [f"In {_joined(same)}, in order: {', '.join(names)}." for names, same in wide.items()]
     return "\n\n".join(
         [
-            table,
+            _table(("column", "type", "shape", "units", "meaning"), rows),
             *order,
             f"LeRobot's own columns are {', '.join(plain)}. Frames, and what turns or shifts with the world, "
             f"stand in `{layout.INFO_PATH}` under `astra`.",
@@ -187,18 +187,9 @@ def _json(content: dict[str, Any]) -> str:
     return f"`{json.dumps(content, ensure_ascii=False)}`" if content else "none"
 
 
-def _listed(values: np.ndarray[Any, Any]) -> str:
-    return ", ".join(f"{value:g}" for value in values)
-
-
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    return "\n".join(_lines(head, rows))
-
-
-def _lines(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
-    for row in (head, ("---",) * len(head), *rows):
-        cells = (" ".join(cell.split()).replace("|", "\\|") for cell in row)
-        yield f"| {' | '.join(cells)} |"
+    cells = ([" ".join(cell.split()).replace("|", "\\|") for cell in row] for row in rows)
+    return table(head, cells, words=len(head))
 
 
 def _size_category(steps: int) -> str:

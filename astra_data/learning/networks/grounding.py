@@ -73,9 +73,7 @@ class GroundingModel(nn.Module):
         self.position_features = PositionFeatures(shape.position_octaves)
         features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
         self.encoder = HistoryEncoder(
-            features + shape.goal_size + actions,
-            embedding_size=shape.embedding_size,
-            latent_size=latent,
+            features + shape.goal_size + actions, embedding_size=shape.embedding_size, latent_size=latent
         )
         heads = shape.head_sizes
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
@@ -88,11 +86,7 @@ class GroundingModel(nn.Module):
             for parameter in list(head.parameters())[-2:]:
                 nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
-        for name, size in {
-            "state": states,
-            "goal": shape.goal_size,
-            "correction": states,
-        }.items():
+        for name, size in {"state": states, "goal": shape.goal_size, "correction": states}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("reward_mean", torch.zeros(()))

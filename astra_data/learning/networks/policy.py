@@ -42,11 +42,7 @@ class PolicyShape:
 
 
 def features_of(
-    memory: HistoryEncoder | None,
-    observation: Tensor,
-    previous_action: Tensor,
-    hidden: Tensor,
-    start: Tensor,
+    memory: HistoryEncoder | None, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
 ) -> Tensor:
     """Return the features (B, T, F) of `observation` (B, T, O), (B, T, A), from `hidden` (B, M).
 

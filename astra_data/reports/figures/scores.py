@@ -126,12 +126,7 @@ def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figu
 
 
 def _bar(
-    axes: Axes,
-    place: int,
-    method: str,
-    score: Score,
-    seeds: Floats,
-    interval: tuple[float, float, float],
+    axes: Axes, place: int, method: str, score: Score, seeds: Floats, interval: tuple[float, float, float]
 ) -> None:
     iqm, low, high = interval
     hatch = "////" if is_plus(method) else None

@@ -54,10 +54,7 @@ _POINT_MASS = Column(
     size=4,
     meaning="abstract state of the target before the action",
     **roles(
-        ("x", "y", "vx", "vy"),
-        ["m"] * 2 + ["m/s"] * 2,
-        ["world"] * 4,
-        ["position"] * 2 + ["vector"] * 2,
+        ("x", "y", "vx", "vy"), ["m"] * 2 + ["m/s"] * 2, ["world"] * 4, ["position"] * 2 + ["vector"] * 2
     ),
 )
 

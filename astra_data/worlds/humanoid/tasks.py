@@ -113,19 +113,9 @@ def _task(
 
 
 HUMANOID_TASKS = (
+    _task("walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, beyond_walker2d, _WALKER_QUANTITIES),
     _task(
-        "walker2d",
-        PlanarWalking(horizon=_HORIZON),
-        HumanoidWalker2d,
-        beyond_walker2d,
-        _WALKER_QUANTITIES,
-    ),
-    _task(
-        "kinematics",
-        JointWalking(horizon=_HORIZON),
-        HumanoidKinematics,
-        beyond_kinematics,
-        _JOINT_QUANTITIES,
+        "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, beyond_kinematics, _JOINT_QUANTITIES
     ),
     _task(
         "extended",

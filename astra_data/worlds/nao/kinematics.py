@@ -26,11 +26,7 @@ from astra_data.worlds.plane.geometry import wrapped
 
 Floats = NDArray[np.float64]
 
-JOINTS = (
-    "HipYawPitch",
-    *(f"L{name}" for name in LEG_JOINTS[1:]),
-    *(f"R{name}" for name in LEG_JOINTS[1:]),
-)
+JOINTS = ("HipYawPitch", *(f"L{name}" for name in LEG_JOINTS[1:]), *(f"R{name}" for name in LEG_JOINTS[1:]))
 """The eleven angles, in order."""
 TO_MOTORS = np.array([0, 1, 2, 3, 4, 5, 0, 6, 7, 8, 9, 10])
 """Which of the eleven angles each of the model's twelve controls follows."""

@@ -101,11 +101,7 @@ class BatchedNao:
         self.reset(np.arange(num_robots), np.zeros((num_robots, 3)), rng)
 
     def reset(
-        self,
-        rows: NDArray[np.intp],
-        poses: Floats,
-        rng: np.random.Generator,
-        ball: Floats | None = None,
+        self, rows: NDArray[np.intp], poses: Floats, rng: np.random.Generator, ball: Floats | None = None
     ) -> None:
         """Set robots upright, with new traits.
 

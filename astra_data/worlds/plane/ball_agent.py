@@ -25,9 +25,6 @@ class BallAgent(PlanarStates):
     Corrections move only balls that rolled or were touched in the step, and leave none at less than 0.15 m/s:
     an expected correction mixes balls that are touched with others that are not into one that creeps, and
     policies wait for it.
-
-    Attributes:
-        parameters: what a dataset paired with this simulator records about it.
     """
 
     state_size = 8
@@ -62,13 +59,7 @@ class BallAgent(PlanarStates):
             device: torch device.
         """
         super().__init__(
-            maze,
-            num_envs,
-            self.state_size,
-            timestep_s=timestep_s,
-            radius_m=radius_m,
-            speed_m_s=speed_m_s,
-            device=device,
+            maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device
         )
         self.parameters |= {
             "reach_m": reach_m,
@@ -96,13 +87,7 @@ class BallAgent(PlanarStates):
             position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"], turn_rad=turn
         )
         velocity = kick_away(
-            moved,
-            ball,
-            velocity,
-            kicks,
-            reach_m=of["kick_reach_m"],
-            speed_m_s=of["kick_m_s"],
-            turn_rad=turn,
+            moved, ball, velocity, kicks, reach_m=of["kick_reach_m"], speed_m_s=of["kick_m_s"], turn_rad=turn
         )
         self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
         ball, velocity = roll(ball, velocity, self.period_s, self._deceleration_m_s2)

@@ -16,9 +16,9 @@ from astra_data.dataset.columns import Array, Column
 Floats = NDArray[np.float64]
 
 
-def wrapped(angle: Floats) -> Floats:
+def wrapped[Angle: (Floats, Tensor)](angle: Angle) -> Angle:
     """Return `angle` in rad, any shape, in [-π, π)."""
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 @dataclass(frozen=True)

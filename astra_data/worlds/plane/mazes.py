@@ -127,10 +127,7 @@ U_MAZE = Maze(rows=("11111", "10001", "11101", "10001", "11111"), scale=4.0, sta
 """gymnasium-robotics' U_MAZE at its own scale."""
 
 LONG_MAZE = Maze(
-    rows=("11111", "10001", "11101", "10001", "10111", "10001", "11111"),
-    scale=4.0,
-    start=(1, 1),
-    goal=(5, 3),
+    rows=("11111", "10001", "11101", "10001", "10111", "10001", "11111"), scale=4.0, start=(1, 1), goal=(5, 3)
 )
 """Two U's in a row, four right-angle turns, 40 m along the centre line: ours, the paper prints no layout."""
 

@@ -16,28 +16,39 @@ class PlanarStates:
     """B planar states (B, X) that begin with x, y, vx, vy of a disc among the walls of a maze, in m and m/s.
 
     Attributes:
+        parameters: what a dataset paired with this simulator records about it.
         state: (B, X) float32.
         free: where the disc's centre may be.
         blocked: (B,) bool, a wall stopped the disc in the last step, or in its correction.
         period_s: control period, one for all or (B, 1).
     """
 
+    state_size: int
+
     def __init__(
         self,
         maze: Maze,
         num_envs: int,
-        state_size: int,
         *,
         timestep_s: float,
-        radius_m: float,
-        speed_m_s: float,
-        device: str,
+        radius_m: float = 0.1,
+        speed_m_s: float = 1.0,
+        device: str = "cpu",
     ) -> None:
-        """Put B discs of radius `radius_m` at rest at the origin; a command of 1 is `speed_m_s`."""
+        """Put B of them at rest at the origin.
+
+        Args:
+            maze: the walls.
+            num_envs: B.
+            timestep_s: control period.
+            radius_m: distance that the disc's centre keeps from walls.
+            speed_m_s: top speed along each axis.
+            device: torch device.
+        """
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
         self.num_envs = num_envs
-        self.state = torch.zeros(num_envs, state_size, device=device)
+        self.state = torch.zeros(num_envs, self.state_size, device=device)
         self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.period_s: Tensor | float = timestep_s
         self._gain: Tensor | None = None

@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import (
-    ACTION,
-    GOAL,
-    REWARD,
-    STATE,
-    TERMINATED,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, TERMINATED, Episode
 from astra_data.exchange.exporters import export
 
 

@@ -4,14 +4,7 @@ import h5py
 import numpy as np
 
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import (
-    ACTION,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    TERMINATED,
-)
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED
 from astra_data.exchange.exporters import export
 
 

@@ -11,12 +11,7 @@ from typer.testing import CliRunner
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import (
-    ACTION,
-    REWARD,
-    TERMINATED,
-    TRUNCATED,
-)
+from astra_data.dataset.columns import ACTION, REWARD, TERMINATED, TRUNCATED
 from astra_data.exchange.exporters import EXPORTERS, export
 from astra_data.exchange.importing import import_dataset
 

@@ -7,16 +7,7 @@ from fake_transitions import NEXT, write_transitions
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import (
-    ACTION,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    TERMINATED,
-    TRUNCATED,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Episode
 from astra_data.exchange.exporters import export
 
 

@@ -1,5 +1,4 @@
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from fake_dataset import write_fake
@@ -18,12 +17,6 @@ def fake(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def quick_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no figures: it is what takes longest."""
     monkeypatch.setattr("astra_data.exchange.sharing.card.png", lambda figure: b"\x89PNG")
-
-
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    return tmp_path / "home"
 
 
 @pytest.fixture

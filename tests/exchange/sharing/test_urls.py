@@ -231,8 +231,7 @@ def test_a_server_that_does_not_answer_is_told(s3: str, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("url", "module", "extra"),
-    [("s3://b/x", "s3fs", "s3"), ("gs://b/x", "gcsfs", "gcs")],
+    ("url", "module", "extra"), [("s3://b/x", "s3fs", "s3"), ("gs://b/x", "gcsfs", "gcs")]
 )
 def test_a_missing_back_end_is_told(
     url: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch

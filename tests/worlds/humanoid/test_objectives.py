@@ -50,8 +50,7 @@ def test_to_last_is_to_succeed(kind: type[Walking]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "bias", "scatter", "early"),
-    [(PlanarWalking, 0.1, 0.8, 0.0), (MassWalking, 0.03, 0.05, 4.0)],
+    ("kind", "bias", "scatter", "early"), [(PlanarWalking, 0.1, 0.8, 0.0), (MassWalking, 0.03, 0.05, 4.0)]
 )
 def test_pay_and_falls_are_the_targets_but_for_costs(
     kind: type[Walking], bias: float, scatter: float, early: float

@@ -8,7 +8,10 @@ HERE = torch.tensor([[-4.0, 5.85, 0.0, 0.0, 7.0]]).expand(3, 5)
 
 
 def planar(count: int, size: int) -> PlanarStates:
-    return PlanarStates(U_MAZE, count, size, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0, device="cpu")
+    class Planar(PlanarStates):
+        state_size = size
+
+    return Planar(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
 
 
 class Resting(PlanarStates):
@@ -20,7 +23,10 @@ class Resting(PlanarStates):
 
 
 def resting(count: int, size: int, variation: PlanarVariation) -> tuple[Resting, VariedPlanar]:
-    inner = Resting(U_MAZE, count, size, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0, device="cpu")
+    class Sized(Resting):
+        state_size = size
+
+    inner = Sized(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
     return inner, VariedPlanar(inner, variation)
 
 

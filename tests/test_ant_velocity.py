@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import torch
+from ant_velocity import AntVelocityConfig, AntVelocityEnv
 
 from astra_data.worlds.ant.body import VelocityController, canonical_view, torques_to_body
-from astra_data.worlds.ant.velocity import AntVelocityConfig, AntVelocityEnv
 
 
 def make(num_envs: int = 4, seed: int = 0) -> AntVelocityEnv:
