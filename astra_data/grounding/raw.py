@@ -15,7 +15,7 @@ from astra_data.worlds.variation import Variation
 
 @dataclass(frozen=True)
 class NoGrounding:
-    """Leave the simulator as it is, but for varied parameters and scatter where they are asked for."""
+    """Leave the simulator as it is, except for varied parameters and scatter if given."""
 
     start_stride: ClassVar[int] = 1
 

@@ -94,7 +94,7 @@ class HumanoidEnv:
         self.failed[rows] = False
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
+        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
         physics = self.bodies.physics
         return {
             "physics": torch.from_numpy(physics.state.copy()),
@@ -102,7 +102,7 @@ class HumanoidEnv:
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self.bodies.physics.state[:] = state["physics"].numpy()
         self.bodies.physics.measured[:] = state["measured"].numpy()
 
