@@ -69,14 +69,14 @@ class Objective(ABC):
 
     @abstractmethod
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
+        """Return in which states (B, X) the goals (B, G) are reached, (B,) bool."""
 
     def places(self, state: Tensor) -> Tensor:
         """Return x and y in m of the K bodies that move in the plane, (..., 2 K); by default K = 0."""
         return state[..., :0]
 
     def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
-        """Tell which episodes (B,) succeed in their `step`, counted from 1.
+        """Return which episodes (B,) succeed in their `step`, counted from 1.
 
         Args:
             reached: whether the goal was reached in it, (B,) bool.
@@ -86,7 +86,7 @@ class Objective(ABC):
         return ~failed if self.is_lasting and step >= self.horizon else reached
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
+        """Return in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
         return torch.zeros(len(state), dtype=torch.bool, device=state.device)
 
     @abstractmethod

@@ -104,7 +104,7 @@ class Task:
     target_id: str | None = None
 
     def shares_target(self, other: "Task") -> bool:
-        """Tell whether both tasks have the same target and differ only in the simulator."""
+        """Return whether both tasks have the same target and differ only in the simulator."""
         return self.target_id is not None and self.target_id == other.target_id
 
     @property

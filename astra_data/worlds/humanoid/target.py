@@ -83,7 +83,7 @@ class HumanoidEnv:
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Stand the humanoids in `mask` (B,) up, almost upright and at rest, by default all."""
+        """Set the humanoids in `mask` (B,), by default all, almost upright and at rest."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         self.reset_to(rows, self.locomotion.draw_starts(self._rng, len(rows)))
         return self._observe()

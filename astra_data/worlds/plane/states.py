@@ -33,7 +33,7 @@ class PlanarStates:
         speed_m_s: float,
         device: str,
     ) -> None:
-        """Put B discs of radius `radius_m` at rest at the origin; a command of 1 is `speed_m_s`."""
+        """Build B discs of radius `radius_m` at rest at the origin; a command of 1 is `speed_m_s`."""
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
         self.num_envs = num_envs
