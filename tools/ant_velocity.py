@@ -93,7 +93,7 @@ class AntVelocityEnv:
         )
 
     def fallen(self) -> Bools:
-        """Tell which ants (B,) have toppled or left plausible heights."""
+        """Return which ants (B,) have toppled or left plausible heights."""
         height = self.physics.qpos[:, 2]
         toppled = up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE
         return np.asarray(toppled | (height < 0.2) | (height > 1.5))

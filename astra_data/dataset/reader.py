@@ -48,7 +48,7 @@ class Dataset(Contents):
 
     @property
     def schema(self) -> list[Column]:
-        """The columns that were handed to the writer."""
+        """The columns given to the writer."""
         return self.specs([name for name in self.features if name not in RESERVED])
 
     @property

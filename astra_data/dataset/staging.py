@@ -185,7 +185,7 @@ class StagedWriter:
     def _left(self) -> str:
         """Describe what can be resumed."""
         waiting = len(list(self.folder.glob("*.arrow")))
-        return f"{waiting} episodes" if waiting else "what it had begun"
+        return f"{waiting} episodes" if waiting else "an unfinished recording"
 
     def _refuse_root(self) -> None:
         """Refuse an existing `root`; if it is this recording, finished, remove the staged episodes."""

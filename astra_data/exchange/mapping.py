@@ -80,7 +80,7 @@ class Jump(Config):
 
 
 class Split(Config):
-    """What begins a new episode, besides the episodes that a format knows itself."""
+    """Conditions that begin a new episode, in addition to the episodes that a format itself has."""
 
     files: bool = True
     """Each file; if false, the files of a folder or archive continue one another."""

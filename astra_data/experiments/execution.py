@@ -87,14 +87,14 @@ def pickled(item: Item, prepare: Callable[[], object] | None) -> bytes:
     return pickle.dumps((prepare, item.call))
 
 
-def run_item(key: str, work: bytes, log: Path, tell: Callable[[Note], object]) -> float | AstraDataError:
+def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -> float | AstraDataError:
     """Run an item in this process; return its wall-clock time in s, or the error with which it failed.
 
     Args:
         key: of the item.
         work: of `pickled`.
         log: file for what the item prints; removed if that is nothing.
-        tell: sends a note, at most ten times a second.
+        send: sends a note, at most ten times a second.
     """
     began = time.perf_counter()
     with _printing_to(log):
@@ -102,7 +102,7 @@ def run_item(key: str, work: bytes, log: Path, tell: Callable[[Note], object]) -
             prepare, call = pickle.loads(work)
             if prepare:
                 prepare()
-            call(progress=Reporter(tell))
+            call(progress=Reporter(send))
         except AstraDataError as error:
             return type(error)(f"{key}: {error}")
         except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is

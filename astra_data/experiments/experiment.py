@@ -1,10 +1,10 @@
-"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if it is on any.
+"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if any.
 
     based_on = "antmaze_umaze"
 
-A recipe with this line says only what differs from the recipe of that name beside it. Stages that nothing
-differs for are not run again: links in its folder lead to the other recipe's artefacts. It may have another
-task if that has the same target; then it shares the collected episodes.
+A recipe with this line lists only the differences from the recipe of that name beside it. Stages without a
+difference are not run again: links in its folder lead to the other recipe's artefacts. It may have another
+task with the same target; then it shares the collected episodes.
 """
 
 import json
@@ -28,11 +28,10 @@ from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import TASKS
 
 ALWAYS_NEW = {"report"}
-"""Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
-
+"""Made by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
 
 _SIMULATOR = "simulator"
-"""What differs between two tasks that have the same target."""
+"""Stands for the difference between two tasks with the same target."""
 _ROWS_TABLES = tables().keys() | {"plus"}
 """Tables of a recipe that only some rows read."""
 
@@ -67,21 +66,21 @@ class Experiment:
         return self.base if self.base and stage in self.borrowed else self
 
     def place(self, key: str) -> Path:
-        """Return where the artefact `key` is made."""
+        """Return the folder of the artefact `key`."""
         return self.maker(key.partition("/")[0]).folder / key
 
     def has(self, key: str) -> bool:
-        """Tell whether the artefact `key` is finished."""
+        """Return whether the artefact `key` is finished."""
         stage = key.partition("/")[0]
         return self.place(key).is_dir() and not self.maker(stage)._is_link(stage)
 
     def _is_link(self, stage: str) -> bool:
-        """Tell whether a stage's folder is a link to another recipe's, from this run or an earlier one."""
+        """Return whether a stage's folder is a link to another recipe's, from this run or an earlier one."""
         link = self.folder / stage
         return link.is_symlink() and link.readlink().parent.parent == Path("..")
 
     def link_borrowed(self) -> None:
-        """Let links in the folder lead to what is borrowed.
+        """Link the folders of borrowed stages to the base's.
 
         Raises:
             RecipeError: there are artefacts where a link belongs.
@@ -101,10 +100,10 @@ class Experiment:
             link.symlink_to(Path("..") / source.name / stage)
 
     def check_unchanged(self) -> None:
-        """Refuse settings that differ from those that made what is already there, finished or begun.
+        """Refuse settings that differ from those of existing artefacts, finished or not.
 
         Raises:
-            RecipeError: they do, here or in the base.
+            RecipeError: they differ, here or in the base.
         """
         if self.base:
             self.base.check_unchanged()
@@ -132,11 +131,11 @@ class Experiment:
 
     @property
     def published_in(self) -> Path:
-        """The file of published results that hold its points: the base's, where its evaluations are those."""
+        """The file of published results with its points: the base's, if it borrows the evaluations."""
         return self.results / f"{self.maker('evaluate').path.stem}.json"
 
     def published(self) -> set[RunPoint]:
-        """Return the points that its published results have.
+        """Return the points in its published results.
 
         Raises:
             BadInputError: there are no such results.
@@ -187,7 +186,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
 
 
 def _reads(row: str, table: str) -> bool:
-    """Tell whether a row, or the one whose policy it goes on from, has its settings from `table`."""
+    """Return whether a row, or the row that it is initialised from, has its settings from `table`."""
     if table == "plus":
         return is_plus(row)
     base = base_method(row)
@@ -215,7 +214,7 @@ def _stale_stages(changed: set[str]) -> set[str]:
 def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     """Return the settings of `recipe` that differ from those recorded `before`.
 
-    What was not known then has its default, which is what was done.
+    Settings that did not exist then have their defaults, as they took effect.
     """
     with suppress(RecipeError):
         before = validated(before, type(recipe), "recipe.json").settings
@@ -231,7 +230,7 @@ def _share_target(task: str, other: str) -> bool:
 
 
 def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:
-    """Replace `sweep` by the largest size: artefacts of the others depend on nothing else of it."""
+    """Replace `sweep` by the largest size, the only part of it that artefacts depend on."""
     percents = settings.get("sweep", {}).get("percent", ())
     return settings | {"sweep": max(percents, default=WHOLE)}
 

@@ -43,7 +43,7 @@ def plan(
         recipe: what to make.
         path: the recipe's file.
         folder: where it is made, such as `runs/antmaze_long`; an item's artefact is at `folder / key`.
-        selection: what to make and to report of it; by default all.
+        selection: the points to make and to report; by default all.
         device: torch device of the networks.
         publish: a folder that the report copies its results to, if any.
         add_to: a file of results that the report adds to, if any.
@@ -84,7 +84,7 @@ def grounded_as(base: str) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What there is to make of a recipe, but for its report."""
+    """The artefacts of a recipe, except its report."""
 
     recipe: Recipe
     folder: Path
@@ -93,7 +93,7 @@ class _Plan:
 
     @cached_property
     def _names(self) -> dict[str, tuple[str, ...]]:
-        """What stages make one artefact each of, per dataset: methods or rows."""
+        """The methods or rows for which stages make one artefact each, per dataset."""
         rows = self.selection.methods
         bases = tuple(dict.fromkeys(map(base_method, rows)))
         reference = reference_of(self.recipe.methods)
@@ -122,7 +122,7 @@ class _Plan:
                         yield self._item(stage, seed, percent, name)
 
     def _has(self, stage: Stage) -> bool:
-        """Tell whether the recipe has a stage that makes datasets."""
+        """Return whether the recipe has a stage that makes datasets."""
         if stage.each == "size":
             return bool(self.selection.percents)
         return not stage.is_optional or getattr(self.recipe, stage.name) is not None
@@ -160,7 +160,7 @@ class _Plan:
         )
 
     def _artefacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
-        """Return the keys of what an artefact may be made from, by the parameters of stages."""
+        """Return the keys of the artefacts that a stage may read, by its parameters."""
         datasets = [read for read in map(STAGES.get, stage.reads) if read and read.makes_dataset]
         last = next((read for read in reversed(datasets) if self._has(read)), None)
         size = percent if last and last.each == "size" else None

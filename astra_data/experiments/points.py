@@ -11,7 +11,7 @@ from astra_data.experiments.recipe import Recipe
 
 @dataclass(frozen=True)
 class RunPoint:
-    """A row on the dataset of one seed, or on one size of it: what is trained and evaluated as one."""
+    """A row on the dataset of one seed, or on one size of it: the unit of training and evaluation."""
 
     method: str
     seed: int

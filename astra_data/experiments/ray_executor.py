@@ -178,9 +178,9 @@ def _work(
     # A worker runs one task after another, so some may be in its search path already.
     sys.path.extend(place for place in modules if place not in sys.path)
 
-    def tell(note: Note | None) -> None:
+    def send(note: Note | None) -> None:
         # Waits, so that every note has arrived when the task ends.
         ray.get(mailbox.put.remote(key, note))
 
-    tell(None)
-    return run_item(key, work, log, tell)
+    send(None)
+    return run_item(key, work, log, send)

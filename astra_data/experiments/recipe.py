@@ -1,4 +1,4 @@
-"""What a recipe may say: task, rows, seeds and sizes, and a table of settings per stage and method."""
+"""The model of recipes: task, rows, seeds and sizes, and a table of settings per stage and method."""
 
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -29,7 +29,7 @@ WHOLE = 100
 
 
 class SweepConfig(Config):
-    """Over which sizes of the dataset the rows are repeated."""
+    """The sizes of the dataset on which the rows are repeated."""
 
     percent: tuple[Count, ...] = ()
     """In per cent of `collect.episodes`; smaller ones lie inside larger ones. By default the whole."""
@@ -55,18 +55,18 @@ class Recipe(Config):
 
     @property
     def settings(self) -> dict[str, JsonValue]:
-        """All that it says, with the defaults, as JSON values."""
+        """All settings, including defaults, as JSON values."""
         return self.model_dump(mode="json")
 
     @property
     def headline(self) -> Score:
-        """What its rows are compared by above all."""
+        """The score by which its rows are compared first."""
         return TASKS[self.task].objective.scores[0]
 
     def settings_of(self, row: str, stage: str) -> Config | None:
         """Return the settings of a row's method, if it has any and `stage` takes them.
 
-        Of ranges to train in they are those that the task's simulator has.
+        Ranges to train in are reduced to the parameters that the task's simulator has.
         """
         method = METHODS[base_method(row)]
         if method.table is None or method.configures != stage:
@@ -133,8 +133,8 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_rewards_to_learn_from(self) -> Self:
-        begun = [METHODS[base_method(row)].initial for row in self.methods]
-        for row in (*self.methods, *filter(None, begun)):
+        initial = [METHODS[base_method(row)].initial for row in self.methods]
+        for row in (*self.methods, *filter(None, initial)):
             table = "plus" if is_plus(row) else "train"
             if not METHODS[base_method(row)].learns_from(getattr(self, table).reward):
                 raise ValueError(
@@ -198,10 +198,10 @@ class Recipe(Config):
 
 
 def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[Table]) -> type[Recipe]:
-    """Return the model of recipes that have the tables of `stages` and those that `methods` read.
+    """Return the model of recipes with the tables of `stages` and those that `methods` read.
 
-    And `based_on`, the recipe from which all that is not given here, and every artefact it leaves unchanged,
-    is taken; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
+    Further keys: `based_on`, the recipe that provides the settings not given here and the artefacts that do
+    not change; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
     """
     fields: dict[str, Any] = {stage.name: _stage_field(stage) for stage in stages if stage.config}
     fields["based_on"] = (str | None, None)

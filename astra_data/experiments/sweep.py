@@ -104,10 +104,10 @@ def _left(
 
 
 class PointTable:
-    """The finished points of a recipe: `sweep.csv`, and a table of those asked for in the terminal.
+    """The finished points of a recipe: `sweep.csv`, and a table of the selected ones in the terminal.
 
     Attributes:
-        shown: the points asked for.
+        shown: the selected points.
         means: score of each finished point, the mean over its episodes.
     """
 

@@ -1,4 +1,4 @@
-"""Load what a run has trained, ready to be deployed."""
+"""Load a policy that a run has trained, ready to act."""
 
 import json
 from pathlib import Path

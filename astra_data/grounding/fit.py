@@ -1,4 +1,4 @@
-"""Fit a grounding: what a method is given to fit it to, and how history models are fitted."""
+"""Fit a grounding: the inputs of a method's fit, and the fit of history models."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -71,7 +71,7 @@ class Fitting:
         settings: the method's own table of the recipe, if it has one.
         training: paired episodes to fit. held_out: paired episodes to measure on.
         seed: of all randomness. device: of the networks.
-        folder: for checkpoints and further files; what is left in it becomes part of the artefact.
+        folder: for checkpoints and further files; files left in it become part of the artefact.
         progress: called with the share done and a note.
     """
 

@@ -95,11 +95,11 @@ class GroundedSimulator(EpisodeSimulator):
         return self.model.target_reward(*self._last, own)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         return super().state_dict() | {"goal": self.goal, "hidden": self.hidden}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         super().load_state_dict(state)
         self.goal, self.hidden = state["goal"].clone(), state["hidden"].clone()
 
@@ -123,7 +123,7 @@ class HistoryGrounding(FittedGrounding):
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
-        """Return the encoder's hidden states before every so many-th step, (E, ceil(T / every), Z)."""
+        """Return the encoder's hidden states before each `every`-th step, (E, ceil(T / every), Z)."""
         _, after = self.model.encode(windows)
         return functional.pad(after[:, :-1], (0, 0, 1, 0))[:, ::every]
 

@@ -14,7 +14,7 @@ from astra_data.worlds.variation import Variation
 
 @dataclass(frozen=True)
 class IdentifiedParameters(NoGrounding):
-    """Draw the simulator's parameters from the ranges of `variation`, anew for each episode."""
+    """Draw the simulator's parameters from the ranges of `variation` for each episode."""
 
     kind: ClassVar[str] = "variation"
 

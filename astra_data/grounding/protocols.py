@@ -1,4 +1,4 @@
-"""What a grounding is: what a method learned about a simulator, and how it changes that simulator."""
+"""The interface of groundings: corrections of a simulator that a method has learned."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol, Self
@@ -18,7 +18,7 @@ class Grounding(Protocol):
     """How an abstract simulator is corrected, if it is.
 
     Attributes:
-        start_stride: episodes may start from every so many-th recorded step.
+        start_stride: recorded steps between those that episodes may start from.
     """
 
     start_stride: ClassVar[int] = 1
@@ -53,7 +53,7 @@ class Grounding(Protocol):
         return self.corrected(abstract_simulator(task, num_envs, device, variation), scatter)
 
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
-        """Return what it remembers before every so many-th step, (E, ceil(T / every), H); None if nothing.
+        """Return its memory before each `every`-th step, (E, ceil(T / every), H); None if it has none.
 
         Histories begin where `windows` (E, T, ...) do.
         """

@@ -11,7 +11,7 @@ from astra_data.grounding.protocols import Grounding
 
 @dataclass(frozen=True)
 class NoGrounding(Grounding):
-    """Leave the simulator as it is, but for varied parameters and scatter where they are asked for."""
+    """Leave the simulator as it is, except for varied parameters and scatter if given."""
 
     def scatter(self, episodes: PairedEpisodes) -> Tensor:
         """Return the factor (X, X) of the target's scatter around the raw simulator in `episodes`."""

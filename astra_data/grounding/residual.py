@@ -55,11 +55,11 @@ class ResidualSimulator(EpisodeSimulator):
         return self._settle(before, sequence.squeeze(1))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         return super().state_dict() | {"hidden": self.hidden}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         super().load_state_dict(state)
         self.hidden = state["hidden"].clone()
 
@@ -80,7 +80,7 @@ class ResidualGrounding(FittedGrounding):
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
-        """Return the LSTM's memory before every so many-th step, (E, ceil(T / every), M)."""
+        """Return the LSTM's memory before each `every`-th step, (E, ceil(T / every), M)."""
         memory, before = self.model.initial_memory(len(windows.state)), []
         for first in range(0, windows.state.shape[1], every):
             before.append(memory)

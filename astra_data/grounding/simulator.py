@@ -12,8 +12,8 @@ class EpisodeSimulator:
     """B abstract simulators. As it is, steps are the simulator's own; subclasses correct where they land.
 
     Attributes:
-        simulator: the abstract simulator that is stepped; the parameters of a `VariedSimulator` are drawn
-            anew for each episode.
+        simulator: the abstract simulator that is stepped; the parameters of a `VariedSimulator` are redrawn
+            for each episode.
         scatter: factor (X, X) of Gaussian noise that is added after each step; None for no noise.
         latent_size: Z, of the latents that policies observe; 0 where there are none.
     """
@@ -100,7 +100,7 @@ class EpisodeSimulator:
         return None
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         state = {"state": self.state}
         if self._varied is not None:
             state |= {"true": self._varied.true_state, "parameters": self._varied.parameters}
@@ -109,7 +109,7 @@ class EpisodeSimulator:
         return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self.simulator.reset_to(state["state"])
         if self._varied is not None:
             self._varied.true_state = state["true"].clone()

@@ -1,4 +1,4 @@
-"""Act in a batched environment: what is carried from step to step, restarts at the horizon, and figures."""
+"""Act in a batched environment: the policy's memory, restarts at the horizon, and figures."""
 
 import math
 import time
@@ -16,10 +16,10 @@ class Taken:
     """A step that was taken.
 
     Attributes:
-        step: what it led to.
-        action: what was done, (B, A) in ±1.
-        expired: whose time ran out, (B,) bool.
-        done: whose episodes are over, expired or terminated, (B,) bool.
+        step: its outcome.
+        action: as applied, (B, A) in ±1.
+        expired: episodes that reached the horizon, (B,) bool.
+        done: episodes that ended, expired or terminated, (B,) bool.
     """
 
     step: Step
@@ -34,7 +34,7 @@ class Acting:
     Attributes:
         observation: (B, O), to act on next.
         previous_action: (B, A) in ±1. hidden: the policy's memory, (B, H). Both are zero at the start.
-        first: where an episode begins, (B,) bool.
+        first: whether an episode begins with it, (B,) bool.
         world_seconds: the time that the environment's steps took, since the start or since resuming.
     """
 
@@ -44,8 +44,8 @@ class Acting:
         Args:
             env: the environment.
             hidden: the policy's memory at the start, (B, H).
-            horizon: rows are restarted after so many steps, without ending the task.
-            is_staggered: begin at random ages, so that not all restarts by the horizon come at once.
+            horizon: steps after which an episode is truncated and its row restarted.
+            is_staggered: begin at random ages, so that rows do not all reach the horizon at once.
         """
         self.env, self.horizon = env, horizon
         self.world_seconds = 0.0
@@ -62,7 +62,7 @@ class Acting:
         self._steps = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
 
     def take(self, action: Tensor, hidden: Tensor) -> Taken:
-        """Apply `action` (B, A), cut off at ±1, and remember `hidden` (B, H); start anew what is over."""
+        """Apply `action` (B, A), clipped to ±1, keep `hidden` (B, H), and reset the rows that are done."""
         began = time.perf_counter()
         step = self.env.step(action)
         self.world_seconds += time.perf_counter() - began
@@ -81,20 +81,20 @@ class Acting:
         return Taken(step, executed, expired, done)
 
     def figures(self) -> dict[str, float]:
-        """Return what happened since the last call.
+        """Return figures on the steps since the last call.
 
         Returns:
-            "success" of the "episodes" that ended, wherever in the task they began, and their mean
-            "episode_steps", NaN where none did; the mean "reward" of a step.
+            the share of "success" among the "episodes" that ended, wherever in the task they began, and their
+            mean "episode_steps", NaN if none ended; the mean "reward" of a step.
         """
-        told = {
+        figures = {
             "success": self._succeeded / self._finished if self._finished else math.nan,
             "episode_steps": self._survived / self._finished if self._finished else math.nan,
             "episodes": self._finished,
             "reward": self._rewarded / self._steps,
         }
         self._forget()
-        return told
+        return figures
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state, after `figures`; see `load_state_dict`."""
@@ -107,7 +107,7 @@ class Acting:
         }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        """Continue from `state`, once the environment is restored and returned `observation` (B, O)."""
         device = observation.device
         self.observation = observation
         self.previous_action, self.hidden = state["previous_action"].to(device), state["hidden"].to(device)

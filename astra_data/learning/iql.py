@@ -1,9 +1,9 @@
 """Implicit Q-learning (Kostrikov et al. 2022) from recorded episodes, with TorchRL's losses.
 
 As in their Algorithm 1 the critics come first, from single transitions, for they do not depend on the policy;
-then the policy is extracted by advantage-weighted regression, from windows of whole stretches, so that one
-with a memory learns with it. The critics see no history: the random commands in the records are held for a
-while, and critics that know the last command learn little about any other.
+then the policy is extracted by advantage-weighted regression, from windows of consecutive steps, so that a
+recurrent policy learns with its memory. The critics see no history: the recorded random commands are held for
+a while, and critics that know the last command learn little about any other.
 
 Every update seeds torch from (seed, update): a run that resumes from a checkpoint repeats what an
 uninterrupted run would have done.
@@ -43,18 +43,18 @@ class IqlConfig(Config):
     target_rate: Share = 0.005
     """Share by which the slow action values follow, per update."""
     expectile: Share = 0.9
-    """Of the action values that the state value is; as the method's authors have it for AntMaze."""
+    """Expectile of action values that the state value estimates; that of the method's authors for AntMaze."""
     discount: Share = 0.99
-    """Of the reward, per step."""
+    """Discount factor per step."""
     return_steps: Count = 10
-    """Rewards of so many recorded steps are summed before the state value takes over. 1 is the method as
-    printed: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the critics'
+    """Length of n-step returns, which sum recorded rewards and the state value after them. 1 is the method as
+    printed: at 20 steps/s a single command hardly moves the robot, and its advantage is lost in the critics'
     errors."""
     reward_scale: Positive = 1.0
     """Factor on the recorded reward, before the shift."""
     reward_shift: float = 0.0
-    """Added to each step's reward; by default nothing, as progress is paid step by step. The -1 that is usual
-    for sparse rewards makes falling over pay where that ends the task."""
+    """Added to each step's reward; 0 by default, as progress is rewarded in every step. The -1 that is usual
+    for sparse rewards rewards falling over where that ends the task."""
     policy_updates: Count = 600
     """Gradient updates of the policy."""
     batch_windows: Count = 24
@@ -66,8 +66,8 @@ class IqlConfig(Config):
     learning_rate: Positive = 1e-3
     """Of the policy at the start; falls to zero along a half cosine."""
     temperature: NotNegative = 10.0
-    """Inverse temperature of the advantage weights, which are clipped at 100; as the method's authors have
-    it for AntMaze."""
+    """Inverse temperature of the advantage weights, which are clipped at 100; that of the method's
+    authors for AntMaze."""
     gradient_norm: Positive = 1.0
     """The policy's gradients are clipped to this norm."""
 
@@ -79,7 +79,7 @@ class IqlConfig(Config):
 
 
 FINE_TUNING = IqlConfig(learning_rate=1e-4, policy_updates=100)
-"""For a policy that has learned already: gentle, for otherwise it unlearns more than it learns."""
+"""For fine-tuning: small steps, since a trained policy otherwise unlearns more than it learns."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Experience(Recorded):
 
     Attributes:
         reward: (E, T). next_observation: as `observation`, (E, T, O).
-        terminated: (E, T) bool, the task ended: no value beyond it. Running out of time ends nothing.
+        terminated: (E, T) bool, the task ended there: no bootstrapping. Not set by time-outs.
     """
 
     reward: Tensor
@@ -178,7 +178,7 @@ class Iql:
             return torch.as_tensor(self._loss.value_network(batch)["state_value"].squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that a later `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         return {
             "networks": self._loss.state_dict(),
             "critic_optimizer": self._critic_optimizer.state_dict(),
@@ -187,7 +187,7 @@ class Iql:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self._loss.load_state_dict(state["networks"])
         self._critic_optimizer.load_state_dict(state["critic_optimizer"])
         self._optimizer.load_state_dict(state["optimizer"])

@@ -1,4 +1,4 @@
-"""What every learner that acts in an environment does: stretches of steps, seeded each, and resumable."""
+"""The base of learners that act in an environment: seeded iterations, and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ class Part(Protocol):
     """A part of a training that is kept in checkpoints, such as a network or an optimiser."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that `load_state_dict` needs."""
+        """Return all that `load_state_dict` needs."""
         ...
 
     def load_state_dict(self, state: dict[str, Any], /) -> object:
-        """Go on from `state`."""
+        """Continue from `state`."""
         ...
 
 
@@ -30,7 +30,7 @@ class Learner(ABC):
     an uninterrupted one would have done.
 
     Attributes:
-        env: the world. acting: how a policy acts in it.
+        env: the environment. acting: how a policy acts in it.
         total_steps: environment steps in all. steps: those done.
         rollout_steps: batched steps per iteration.
     """
@@ -41,8 +41,8 @@ class Learner(ABC):
         """Prepare to learn.
 
         Args:
-            acting: the world, in which a policy is about to act.
-            parts: what changes while learning, beside it.
+            acting: the environment and the policy's memory.
+            parts: all else that learning changes, by name.
             total_steps: environment steps in all.
             rollout_steps: batched steps per iteration.
             seed: of all randomness.
@@ -62,16 +62,16 @@ class Learner(ABC):
         return 1.0 - self.steps / self.total_steps
 
     def iterate(self) -> dict[str, float]:
-        """Take a stretch of steps and learn.
+        """Take `rollout_steps` batched steps and learn.
 
         Returns:
             the figures of `Acting`, and the learner's own.
         """
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
-        told = self._iterate()
+        figures = self._iterate()
         self.steps += self.env.num_envs * self.rollout_steps
         self._iteration += 1
-        return self.acting.figures() | told
+        return self.acting.figures() | figures
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
@@ -79,11 +79,11 @@ class Learner(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state; see `load_state_dict`."""
-        told = {"steps": self.steps, "iteration": self._iteration, "acting": self.acting.state_dict()}
-        return {name: part.state_dict() for name, part in self._parts.items()} | told
+        progress = {"steps": self.steps, "iteration": self._iteration, "acting": self.acting.state_dict()}
+        return {name: part.state_dict() for name, part in self._parts.items()} | progress
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        """Continue from `state`, once the environment is restored and returned `observation` (B, O)."""
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.steps, self._iteration = state["steps"], state["iteration"]

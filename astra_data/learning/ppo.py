@@ -32,17 +32,17 @@ class PpoConfig(Config):
     minibatches: Count = 4
     """Updates per pass; each takes whole stretches of a share of the environments."""
     learning_rate: Positive = 5e-4
-    """At the start; falls linearly to zero."""
+    """Learning rate at the start; falls linearly to zero."""
     discount: Share = 0.99
-    """Of the reward, per step."""
+    """Discount factor per step."""
     gae_lambda: Share = 0.95
-    """Decay of the advantage's n-step mixture, per step."""
+    """λ of generalised advantage estimation."""
     clip: Positive = 0.2
-    """Largest change of an action's probability ratio that still earns."""
+    """Range of an action's probability ratio around 1 within which the objective is not clipped."""
     entropy_weight: NotNegative = 0.003
-    """Of the policy's entropy in the loss."""
+    """Weight of the policy's entropy in the loss."""
     value_weight: NotNegative = 0.5
-    """Of the critic's squared error in the loss."""
+    """Weight of the critic's squared error in the loss."""
     gradient_norm: Positive = 0.5
     """Gradients are clipped to this norm."""
     reward_scale: Positive = 0.1
@@ -62,10 +62,10 @@ class Ppo(Learner):
         """Prepare to train `policy` in `env`.
 
         Args:
-            env: the world.
+            env: the environment.
             policy: the networks.
             config: settings.
-            horizon: rows are restarted after so many steps, without ending the task.
+            horizon: steps after which episodes are truncated.
             seed: of all randomness.
         """
         self.policy, self.config = policy, config

@@ -21,11 +21,11 @@ class Recorded:
     lengths: Tensor
 
     def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
-        """Draw windows of `length` steps by torch's global generator.
+        """Draw windows of `length` steps from torch's global generator.
 
         Returns:
             the columns by name, (count, length, ...), and which steps to learn from, (count, length) bool:
-            all but the first `burn_in` of a window that begins in the midst of its episode.
+            all but the first `burn_in` of a window that begins within its episode.
         """
         episodes, steps, learned = draw_steps(self.lengths, count, length)
         learned &= steps < self.lengths[episodes]

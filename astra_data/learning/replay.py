@@ -58,11 +58,11 @@ class Replay:
         return drawn, ~drawn["expired"][:, :-1] & (filled | has_begun)
 
     def state_dict(self) -> dict[str, Tensor | int]:
-        """Return what is kept."""
+        """Return the kept steps."""
         return {"added": self._added} | {name: column[: len(self)] for name, column in self._columns.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor | int]) -> None:
-        """Go on with what `state_dict` returned."""
+        """Continue with the steps in `state`."""
         self._added = int(state["added"])
         for name, column in self._columns.items():
             column[: len(self)] = torch.as_tensor(state[name], device=column.device)

@@ -1,7 +1,7 @@
 """Rapid motor adaptation, phase 2: a student learns to estimate its teacher's extrinsics while it acts.
 
-After Kumar et al. 2021. The student's own actions decide what it learns from, so that it knows the
-histories that its mistakes lead to.
+After Kumar et al. 2021. The student acts itself, so that it learns from the histories that its own mistakes
+lead to.
 """
 
 import math
@@ -30,7 +30,7 @@ class RmaConfig(Config):
     adaptation_steps: Count = 500_000
     """Environment steps of phase 2 in all."""
     adaptation_learning_rate: Positive = 1e-3
-    """Of phase 2, at the start; falls linearly to zero."""
+    """Learning rate of phase 2 at the start; falls linearly to zero."""
 
 
 class Adaptation(Learner):
@@ -53,11 +53,11 @@ class Adaptation(Learner):
         """Prepare to train a student of `teacher` in `env`.
 
         Args:
-            env: the world that the teacher was trained in.
-            teacher: trained.
+            env: the environment that the teacher was trained in.
+            teacher: the trained teacher.
             config: settings.
             rollout_steps: steps of every environment per iteration.
-            horizon: rows are restarted after so many steps, without ending the task.
+            horizon: steps after which episodes are truncated.
             seed: of all randomness.
         """
         self.teacher, self.config = teacher, config
@@ -75,11 +75,11 @@ class Adaptation(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Act and learn for one stretch of steps.
+        """Take `rollout_steps` batched steps, learning after each.
 
         Returns:
             "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
-            the start of episodes, when nothing has been seen; NaN where nothing varies.
+            the start of episodes, without a history; NaN where nothing varies.
         """
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.adaptation_learning_rate * self.share_left
@@ -95,7 +95,7 @@ class Adaptation(Learner):
         return {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
 
     def _learn(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Take in the current observations and update.
+        """Process the current observations and make one update.
 
         Returns:
             the true extrinsics (B, E), the features (B, F), and the next hidden (B, H).

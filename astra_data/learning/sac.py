@@ -1,9 +1,9 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
 
 Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
-whose first steps only fill the memories; otherwise they learn from single steps. The policy's memory begins a
-window as it was when it acted, for it goes on through whole episodes when it acts again (Kapturowski et al.
-2019); that of the critics, which judge nothing but windows, begins empty.
+whose first steps only fill the memories; otherwise they learn from single steps. At the start of a
+window the policy's memory is the one stored while acting, since there it spans whole episodes (Kapturowski et
+al. 2019); that of the critics, which see only windows, is empty.
 """
 
 import copy
@@ -46,22 +46,22 @@ class SacConfig(Config):
     burn_in: Number = 8
     """Steps at the start of a window that only fill the memory, until an episode begins."""
     buffer_size: Count = 1_000_000
-    """The most recent steps that are kept."""
+    """Steps kept for replay, the most recent ones."""
     learning_rate: Positive = 1e-3
-    """Of actor, critics and temperature; over the second half of the training it falls to nothing. Without
-    that it is chance how good the policy is that the training happens to end with."""
+    """Learning rate of actor, critics and temperature; falls to zero over the second half of the training.
+    Without that, the quality of the final policy is left to chance."""
     discount: Share = 0.97
-    """Of the reward, per step."""
+    """Discount factor per step."""
     reward_scale: Positive = 1.0
     """Factor on the reward that the critics learn from."""
     initial_temperature: Positive = 0.2
-    """Of the entropy in the reward, at the start."""
+    """Weight of the entropy in the reward, at the start."""
     target_rate: Share = 0.005
     """Share by which the target critics follow, per update."""
     imitation_weight: NotNegative = 0.0
-    """Of the mean squared distance from recorded actions in what the actor minimises, times the size of the
-    mean action value, entropy included. 0.4 is what Fujimoto and Gu (2021) take, of the mean size. Without
-    effect in the target: upper bounds learn from no data."""
+    """Weight of the mean squared distance from recorded actions in the actor's loss, relative to the size of
+    the mean action value, entropy included. 0.4 is that of Fujimoto and Gu (2021), who take the mean of
+    sizes. Without effect in the target: upper bounds use no recorded data."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:
@@ -92,12 +92,12 @@ class Sac(Learner):
         """Prepare to train `policy` in `env`.
 
         Args:
-            env: the world.
+            env: the environment.
             policy: the actor.
             config: settings.
-            horizon: rows are restarted after so many steps, without ending the task.
+            horizon: steps after which episodes are truncated.
             seed: of all randomness.
-            recorded: to imitate.
+            recorded: episodes to imitate, if any.
 
         Raises:
             BadInputError: the buffer would hold no window.
@@ -139,7 +139,7 @@ class Sac(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Act for a stretch of steps, and learn after each; return the "temperature" of the entropy."""
+        """Take `rollout_steps` batched steps, learning after each; return the entropy's "temperature"."""
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * min(1.0, 2.0 * self.share_left)
         for _ in range(self.rollout_steps):
@@ -151,7 +151,7 @@ class Sac(Learner):
 
     @torch.no_grad()
     def _act(self) -> None:
-        """Take one step and keep it."""
+        """Take one step and add it to the buffer."""
         acting = self.acting
         seen = {
             "observation": acting.observation,
@@ -199,11 +199,11 @@ class Sac(Learner):
         }
         batch = TensorDict(table, batch_size=[int(learned.sum())])
         wrong, _ = self._loss.qvalue_v2_loss(batch)
-        # The actor is not to make the critics' memory forget what is bad.
-        costs, told = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
-        total = wrong + costs + self._loss.alpha_loss(told["log_prob"]).mean()
+        # Detached: the actor must not change the critics' memory to raise its own values.
+        costs, metadata = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
+        total = wrong + costs + self._loss.alpha_loss(metadata["log_prob"]).mean()
         if self._recorded is not None:
-            size = costs.detach().abs()  # hardly anything but action values
+            size = costs.detach().abs()  # almost entirely action values
             total = total + config.imitation_weight * size * self._distance(self._recorded)
         self._optimizer.zero_grad()
         total.backward()

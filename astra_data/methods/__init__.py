@@ -1,4 +1,4 @@
-"""All methods by name; each file holds one method, or a family, and only what is particular to it."""
+"""All methods by name; each file defines one method, or a family of them."""
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method

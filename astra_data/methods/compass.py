@@ -1,9 +1,9 @@
-"""COMPASS: identify the simulator's parameters through a causal model of the trajectory gap; and its ranges.
+"""COMPASS: identify the simulator's parameters with a causal model of the trajectory gap.
 
 After Huang et al., "What Went Wrong? Closing the Sim-to-Real Gap via Differentiable Causal Discovery" (CoRL
-2023). Where they drive the target anew in every iteration, the recorded episodes are all that there is here,
-and simulators are set back to the target's state at the beginning of short windows: replays of whole episodes
-drift too far apart to tell anything.
+2023). They collect from the target in every iteration; here there are only the recorded episodes, and
+simulators are reset to the target's state at the start of short windows: replays of whole episodes drift too
+far apart to be informative.
 """
 
 from collections.abc import Iterable, Mapping
@@ -34,10 +34,10 @@ the distance between the simulator and the target in each of the task's quantiti
 
 
 class CompassConfig(AnyVariation, CausalConfig):
-    """Ranges of the parameters, and how they are identified, of which the paper prints nothing.
+    """Ranges of the parameters, and how they are identified; the paper prints nothing of the latter.
 
-    Only what steers is identified (see `Variation`). The rest keeps its ranges, and is drawn from them while
-    the policy is trained.
+    Only the parameters in `Variation.steering` are identified. The others keep their ranges, and are drawn
+    from them in policy training.
     """
 
     iterations: Count = 5
@@ -49,9 +49,9 @@ class CompassConfig(AnyVariation, CausalConfig):
     window: Count = 25
     """Steps per window."""
     outlier_share: Annotated[float, Field(ge=0, le=0.5)] = 0.05
-    """Share of the windows left out, those with the largest gaps; as the authors have it."""
+    """Share of the windows left out, those with the largest gaps; as in the authors' code."""
     shrink: Annotated[float, Field(gt=0, lt=1)] = 0.6
-    """Factor on the ranges of what moved, after each iteration."""
+    """Factor on the ranges of the parameters that moved, after each iteration."""
     policy_at: Literal["point", "around"] = "point"
     """Train the policy at the point that was found, as the authors do, where what was not identified is as in
     the plain simulator; or around it, with parameters from the last ranges, which are still the whole ranges
@@ -65,11 +65,11 @@ def parameters_at(point: Mapping[str, float], kind: type[Variation]) -> Tensor:
 
 @dataclass
 class Search:
-    """How far the identification is.
+    """The state of the identification.
 
     Attributes:
-        box: where the parameters are sought. point: the best so far, of what steers.
-        found: what each finished iteration tells. spent: the time that they took; None before the first.
+        box: ranges in which the parameters are searched. point: the best steering parameters so far.
+        found: results of each finished iteration. spent: their time; None before the first.
     """
 
     box: Variation
@@ -79,20 +79,25 @@ class Search:
 
     @classmethod
     def begin(cls, ranges: Variation, checkpoint: Path) -> "Search":
-        """Go on from `checkpoint`; without one, begin at the plain simulator, as far as it is in `ranges`."""
+        """Resume from `checkpoint`; without one, start at the plain simulator, clipped to `ranges`."""
         if checkpoint.exists():
-            with resumed(checkpoint) as (_, told):
-                return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
+            with resumed(checkpoint) as (_, metadata):
+                return cls(
+                    Variation.of_json(metadata["box"]),
+                    metadata["point"],
+                    metadata["found"],
+                    metadata["spent"],
+                )
         plain = type(ranges)()
         point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in ranges.steering}
         return cls(ranges, point, [], None)
 
     def save(self, checkpoint: Path) -> None:
-        """Write what `begin` goes on from."""
+        """Write the checkpoint that `begin` resumes from."""
         save_tensors(checkpoint, {"box": self.box.ranges()}, vars(self) | {"box": self.box.model_dump()})
 
     def narrow(self, names: Iterable[str], shrink: float) -> None:
-        """Draw the box in around the point, for the parameters in `names` by the factor `shrink`."""
+        """Shrink the box around the point by the factor `shrink`, along the parameters in `names`."""
         box = self.box.model_dump()
         for name in names:
             reach = shrink * (box[name][1] - box[name][0]) / 2
@@ -109,14 +114,14 @@ def identify(fitting: Fitting) -> tuple[IdentifiedParameters, dict[str, Any]]:
     """Find the parameters with which replays come closest to the recorded episodes.
 
     Every iteration replays windows with parameters from a box, fits a causal model to the gaps, moves the
-    parameters that matter to where that expects the smallest, and draws the box in around them.
+    parameters that matter to the predicted minimum, and shrinks the box around them.
 
     Returns:
         the parameters, and: the mask in the whole ranges, the point, the mean gaps of held-out windows in the
         plain simulator and at the point (without noise), and the same of every iteration.
 
     Raises:
-        BadInputError: no episode is as long as a window, or nothing that steers has a range.
+        BadInputError: no episode is as long as a window, or no steering parameter has a range.
     """
     config, wide = fitting.settings, fitting.task.varied.wide
     if not isinstance(config, CompassConfig):
@@ -163,7 +168,7 @@ def _varied(box: Variation) -> list[str]:
 
 
 def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str) -> Mask:
-    """Move `search` on by one iteration; return the parameters' mask."""
+    """Do one iteration of `search`; return the parameters' mask."""
     device, box = fitting.device, search.box
     torch.manual_seed(derive(fitting.seed, f"{name} windows"))
     episode, first = beginnings(fitting.training, config.window)
@@ -173,7 +178,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     gaps = trajectory_gaps(fitting.task, recorded, contexts, noise)
     of_window = gaps.mean(0)
     usual = (of_window <= of_window.quantile(1.0 - config.outlier_share, dim=0)).all(-1)
-    # Windows differ far more in their gaps than parameters make a difference: learn that difference alone.
+    # Gaps vary far more between windows than with parameters: learn the difference within a window.
     difference = (gaps - of_window)[:, usual]
     scale = difference.std((0, 1)).clamp_min(1e-9)
     varied = _varied(box)
@@ -200,7 +205,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     points = (search.point, search.point | moved)
     both = torch.stack([parameters_at(point, kind) for point in points]).to(device)
     before, after = (trajectory_gaps(fitting.task, recorded, both, noise)[:, usual] / scale).mean((1, 2))
-    # The model is smooth where the gap has its edge: the simulator has the last word.
+    # The model smooths over edges of the gap, so the step is accepted only if replays confirm it.
     if after < before:
         search.point |= moved
     search.narrow(moved, config.shrink)

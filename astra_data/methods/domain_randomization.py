@@ -1,6 +1,6 @@
 """Domain randomization: noise and scaling of the actions (Section V-A, "DR uses action noise … and scaling").
 
-The paper's N(0, 0.05) is read as a standard deviation of 0.05, of commands of ±1; δ is drawn anew for every
+The paper's N(0, 0.05) is read as a standard deviation of 0.05, of commands of ±1; δ is redrawn for every
 episode. The task has the ranges.
 """
 

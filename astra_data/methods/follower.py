@@ -29,10 +29,10 @@ def careful(task: Task, goal: Tensor) -> Act:
 
 @dataclass(frozen=True)
 class CarefulFollower:
-    """Steer down the distance to the goal, along paths away from the walls, a little below full speed.
+    """Descend the distance to the goal, along paths away from the walls, a little below full speed.
 
     Attributes:
-        maze: where. margin: distance from the walls that paths keep where they can, in cells of the maze.
+        maze: the maze. margin: distance from the walls that paths keep where they can, in cells of the maze.
         speed: of the faster axis, in units of commands.
     """
 
@@ -68,13 +68,13 @@ class CarefulFollower:
 
 @dataclass(frozen=True)
 class CarefulKicker:
-    """Walk to the place behind the ball, around the ball where it is near, from there up to it, and kick.
+    """Walk to the point behind the ball, around the ball if near, then up to it, and kick.
 
     Attributes:
         clear_m: distance from the ball on the way around it.
-        cone_rad: it walks up to the ball where the way to it and on to the goal bends by less than this.
-        kick_m: from how near it kicks. brake_m: how far before that it begins to slow down.
-        rolls_m_s: balls that seem slower than this are taken to lie still.
+        cone_rad: it walks up to the ball if the turn from there to the goal is less than this.
+        kick_m: distance from which it kicks. brake_m: distance before that over which it slows down.
+        rolls_m_s: balls that seem slower than this count as resting.
         speed: of the faster axis, in units of commands.
     """
 
@@ -89,7 +89,7 @@ class CarefulKicker:
         """Return commands (B, 3) at abstract states (B, 8) for goals (B, 2)."""
         robot, _, ball, rolling = state.split(2, dim=-1)
         rolls = rolling.norm(dim=-1, keepdim=True) > self.rolls_m_s
-        ball = ball + rolls * rolling  # Where it will be in a second.
+        ball = ball + rolls * rolling  # its position in a second
         to_goal = torch.nn.functional.normalize(goal - ball, dim=-1)
         distance = (robot - ball).norm(dim=-1, keepdim=True).clamp_min(1e-6)
         outward = (robot - ball) / distance

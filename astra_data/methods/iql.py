@@ -1,10 +1,10 @@
 """IQL on the target's own episodes, and direct transfer fine-tuned by it (Section V, "IQL" and "DT+IQL").
 
-And what IQL is without its critics: behavior cloning, against which the imitation in `[plus]` is to be held.
+And behavior cloning, IQL without its critics: the baseline for the imitation in `[plus]`.
 The paper does not say whether the fine-tuning interacts with the target: ours learns from the same recorded
-episodes as every other row. On the Long Maze, after 1500 updates of the critics, the command that they value
-most has a mean cosine with the careful follower's of 0.35; of 0.50 with returns of ten steps; of 0.65 with
-sines and cosines of the position as well; but of 0.41 without those where the critics know the last command.
+episodes as every other row. On the Long Maze, after 1500 updates of the critics, the mean cosine between the
+command that they value most and the careful follower's is 0.35; 0.50 with returns of ten steps; 0.65 with
+sines and cosines of the position as well; but 0.41 without those if the critics know the last command.
 """
 
 import copy
@@ -36,10 +36,10 @@ def _position_features(task: Task) -> PositionFeatures:
 
 
 def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
-    """Learn by IQL from the target's side of the paired episodes, in no simulator.
+    """Learn by IQL from the target's side of the paired episodes, without a simulator.
 
     Returns:
-        the policy, which begins as `training.initial` where there is one, and the losses every few updates.
+        the policy, which starts from `training.initial` if there is one, and the losses every few updates.
     """
     config, episodes = _config(training), training.episodes
     experience = experience_of(training.task, episodes)
@@ -59,7 +59,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
 
 
 def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
-    """Imitate every recorded action alike, which is IQL at temperature 0; return what it returns."""
+    """Imitate all recorded actions equally, as IQL does at temperature 0; see `learn_from_episodes`."""
     cloning = _config(training).model_copy(update={"temperature": 0.0, "critic_updates": 1})
     return learn_from_episodes(replace(training, settings=cloning))
 
@@ -99,11 +99,11 @@ def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
     while not iql.done:
         losses = iql.iterate()
         if iql.updates % 10 == 0 or iql.done:
-            said = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
-            note = f"{iql.updates / stopwatch.seconds:,.0f} updates/s  {said}"
+            shown = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
+            note = f"{iql.updates / stopwatch.seconds:,.0f} updates/s  {shown}"
             training.progress(iql.updates / iql.total_updates, note)
         if iql.updates % _CHECKPOINT_EVERY == 0 or iql.done:
-            # Nobody acts while learning from records, so there is no success to tell.
+            # No policy acts while learning from recorded episodes, so there is no success rate.
             points.append({"steps": iql.updates, "success": None, **losses})
             logbook.keep(iql.state_dict())
     return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}

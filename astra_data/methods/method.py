@@ -1,4 +1,4 @@
-"""What a method is: which parts of the pipeline it uses, its settings, and how it is shown."""
+"""The descriptor of methods: the parts of the pipeline that they use, their settings, how they are shown."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,8 +12,8 @@ from astra_data.training.train_in_target import InTarget
 IN_RAW_SIMULATOR = InSimulator()
 
 Role = Literal["floor", "ceiling", "trained there"]
-"""What the other rows are compared with: no grounding at all; a hand-written controller; a policy trained in
-the target itself, to which the same number of steps need not teach as much."""
+"""Rows for comparison: no grounding at all; a hand-written controller; a policy trained in the target itself,
+which may learn less from the same number of steps."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Method:
-    """One row of the results, and all that is particular to it.
+    """A method, which is one row of the results.
 
     Attributes:
         name: in recipes and folders. title: in tables and figures.
         colour: in figures, as "#rrggbb"; one of the spare colours where empty.
-        role: what the row is to the others, if it is not one among them.
+        role: set for rows that the others are compared with.
         fit: what it learns about the simulator from pairs; None where the simulator stays raw.
         learn: how it learns its policy; None where there is none to learn.
         aligns: whether a target encoder is fitted for deployment.
@@ -86,6 +86,6 @@ class Method:
         return isinstance(self.learn, InTarget)
 
     def learns_from(self, reward: RewardSource | None) -> bool:
-        """Tell whether it can be trained with `reward`: "predicted" needs a grounding that predicts it."""
+        """Return whether it can be trained with `reward`: "predicted" needs a grounding that predicts it."""
         predicts = isinstance(self.fit, HistoryFit) and self.fit.reward
         return reward != "predicted" or predicts or not self.in_simulator

@@ -36,7 +36,7 @@ from astra_data.worlds.score import SUCCESS, Score
 Floats = NDArray[np.float64]
 
 _TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
-"""When pictures of an episode are taken, besides its end."""
+"""Times at which pictures of an episode are taken, in addition to its end."""
 
 
 @dataclass(frozen=True)

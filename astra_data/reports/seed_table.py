@@ -64,6 +64,8 @@ def lines_of(results: Results) -> list[Line]:
 def row_of(lines: Sequence[Line], gaps: Mapping[str, GapMeans]) -> MethodResults:
     """Return the row of `lines`, at least one, all of one method; what a seed lacks, the row lacks.
 
+    Costs are the exception: that of a stage is the mean over the seeds that have it.
+
     Args:
         lines: in the order of the row's seeds.
         gaps: of each grounding.
@@ -78,7 +80,10 @@ def row_of(lines: Sequence[Line], gaps: Mapping[str, GapMeans]) -> MethodResults
         **values | {"learning": values["learning"] or []},
         grounding=grounding,
         gap=None if grounding is None else gaps[grounding],
-        cost={stage: _mean(spent) for stage, spent in _over([line.cost for line in lines]).items()},
+        cost={
+            stage: _mean([line.cost[stage] for line in lines if stage in line.cost])
+            for stage in dict.fromkeys(stage for line in lines for stage in line.cost)
+        },
     )
 
 

@@ -30,7 +30,7 @@ class AlignConfig(DescentConfig):
     updates: Count = 600
     """Gradient updates in all."""
     batch_windows: Count = 32
-    """PairedWindows per update."""
+    """Windows per update."""
     window: Count = 100
     """Steps per window, in backpropagation through time."""
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)

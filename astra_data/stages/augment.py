@@ -6,7 +6,7 @@ robot could have recorded, with three exceptions:
 * Walls. A robot that was stopped by a wall would not be stopped elsewhere. So only stretches of an episode
   that keep clear of the walls are copied, and the copies keep clear of them too.
 * The goal belongs to the maze and is not moved: every copy gets a goal of its own, drawn as the task draws
-  it. The task computes the copy's rewards and ends anew; a copy ends where it reaches its goal.
+  it. The task computes the copy's rewards and ends; a copy ends where it reaches its goal.
 * Commands. Where commands are clipped to ±1 m/s along each axis, a command that is rotated out of that square
   is no longer what the robot did; such rotations are drawn again.
 
@@ -68,7 +68,7 @@ class AugmentConfig(Config):
     keep_originals: bool = True
     """Whether the training episodes themselves are part of the new dataset; held-out ones always are."""
     margin_m: NotNegative | None = None
-    """Clearance from the walls kept by copies and by what is copied; by default the robot's reach. With less,
+    """Clearance from the walls kept by copies and their originals; by default the robot's reach. With less,
     copies are longer and some of their steps false: stopped by walls that are not there, or walking through
     walls that are (with 0.6 m 8 % of the steps on the U-Maze, with the ant's reach none)."""
     min_steps: Count = 20
@@ -189,7 +189,9 @@ def augment(
 def _task_of(source: Dataset, task: str | None) -> Task:
     collected_for = source.description["environment"].get("id")
     if task is None and collected_for is None:
-        raise BadInputError(f"{source.reference} does not say what task it was collected for: give --task")
+        raise BadInputError(
+            f"{source.reference} does not name the task that it was collected for: give --task"
+        )
     if task is not None and collected_for in TASKS and task != collected_for:
         raise BadInputError(f"{source.reference} was collected for {collected_for}, not for {task}")
     return task_named(task or str(collected_for))

@@ -70,7 +70,7 @@ class CollectConfig(Config):
     sac_steps: Count = 300_000
     """Environment steps after which its training by SAC is stopped at the latest."""
     sac_episode_steps: Count = 500
-    """Training by SAC is stopped as soon as trials of the policy last so many steps on average."""
+    """Training by SAC is stopped as soon as trials of the policy last this many steps on average."""
     policy: str | None = None
     """Folder of the saved policy, as the stage `train` writes it."""
     grounding: str | None = None

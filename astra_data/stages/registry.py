@@ -24,8 +24,8 @@ class Stage:
     Attributes:
         name: in recipes, folders and on the command line.
         run: makes one artefact. `experiments.plan` gives it what its parameters name.
-        each: what there is one artefact of: a seed; a size of a seed's dataset; a grounding, a policy, an
-            aligned grounding or a row, each per dataset; or the recipe.
+        each: the unit that it makes one artefact for: a seed; a size of a seed's dataset; a grounding, a
+            policy, an aligned grounding or a row, each per dataset; or the recipe.
         reads: the stages whose artefacts it may read.
         config: the type of its table in a recipe; None where it has no settings.
         is_optional: whether recipes without its table leave the stage out.

@@ -43,7 +43,7 @@ def train(
         settings: the method's own table of the recipe, if it has one.
         dataset: paired.
         grounding: what `ground` made for this method, if it grounds.
-        initial: what `train` made for the method that this one goes on from, if it does.
+        initial: what `train` made for the method whose policy this one starts from, if any.
         seed: of all randomness.
         out: the folder to write.
         device: torch device.
@@ -67,7 +67,7 @@ def train(
     if base.grounds and grounding is None:
         raise BadInputError(f"method '{method}' trains in a grounded simulator: run the stage `ground` first")
     if base.initial and initial is None:
-        raise BadInputError(f"method '{method}' goes on from the policy of {base.initial}: train that first")
+        raise BadInputError(f"method '{method}' starts from the policy of {base.initial}: train that first")
     if not base.learns_from(config.reward):
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()

@@ -1,1 +1,1 @@
-"""Environments for policies, and policies at work."""
+"""Environments to train policies in, and trained policies in action."""

@@ -37,13 +37,13 @@ class WorldConfig(Config):
     model_config = ConfigDict(serialize_by_alias=True)
 
     reward: RewardSource | None = None
-    """Where the reward comes from: "abstract", "predicted" or "blend"; by default as the method says."""
+    """Where the reward comes from: "abstract", "predicted" or "blend"; by default that of the method."""
     topple: bool = False
     """Draw topples from the topple head: they end the episode, and with the task's own reward they cost."""
     risk_weight: NotNegative = 1.0
     """How many topples a predicted one counts for in "blend": it costs the rest of the episode as well."""
     residual_noise: NotNegative = 0.0
-    """Scatter the state after each step by so many times the target's scatter around the simulator."""
+    """Scatter the state after each step; in units of the target's scatter around the simulator."""
     support_penalty: NotNegative = 0.0
     """Subtracted from the reward of a step to where there is no data; less of it where there is little."""
     support_density: Positive = 0.3
@@ -59,8 +59,8 @@ class WorldConfig(Config):
     data_start_share: Share = 0.0
     """Share of the episodes that start from the middle of a recorded one."""
     episode_steps: Count | None = None
-    """Cut simulated episodes off after so many steps, bootstrapping their values; by default after as many as
-    in the task. Short ones from recorded moments leave errors no time to grow (Janner et al. 2019)."""
+    """Steps after which simulated episodes are truncated, bootstrapping their values; by default the task's
+    horizon. Short ones from recorded moments leave errors no time to grow (Janner et al. 2019)."""
 
     @model_validator(mode="before")
     @classmethod

@@ -57,7 +57,7 @@ class SeededSimulatorWorld(SimulatorWorld):
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Start the rows in `mask` (B,) anew, by default all; return observations (B, 8)."""
+        """Reset the rows in `mask` (B,), by default all; return observations (B, 8)."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(self._rng.integers(2**62)))
             return super().reset(mask)

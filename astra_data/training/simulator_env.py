@@ -114,7 +114,7 @@ class SimulatorWorld:
         self.latent_size = simulator.latent_size
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Start the rows in `mask` (B,) anew, by default all; return observations (B, O)."""
+        """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
         rows = torch.arange(self.num_envs, device=self.device) if mask is None else mask.nonzero().squeeze(1)
         if len(rows):
             from_data = torch.rand(len(rows), device=self.device) < self.data_start_share
@@ -186,11 +186,11 @@ class SimulatorWorld:
         return self.simulator.parameters if self._shows_parameters else None
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         return {"goal": self.goal} | self.simulator.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
-        """Go on from `state`; return the observations (B, O)."""
+        """Continue from `state`; return the observations (B, O)."""
         self.goal = state["goal"].clone()
         self.simulator.load_state_dict(state)
         return self._observe()

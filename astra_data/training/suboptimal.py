@@ -43,7 +43,7 @@ def suboptimal_by_ppo(
 ) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
 
-    A checkpoint in `folder` lets the same call go on after an interruption.
+    A checkpoint in `folder` lets the same call resume after an interruption.
 
     Returns:
         the policy, and how it was trained.
@@ -74,7 +74,7 @@ def suboptimal_by_sac(
     """Train a policy without memory by SAC in the target, on its full state.
 
     Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest. A checkpoint in
-    `folder` lets the same call go on after an interruption.
+    `folder` lets the same call resume after an interruption.
 
     Returns:
         the policy, and how it was trained.

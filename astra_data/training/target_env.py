@@ -72,7 +72,7 @@ class TargetWorld:
         self.observation_size = self._observe().shape[1]
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Start the rows in `mask` (B,) anew, by default all; return observations (B, O)."""
+        """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
         anew = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask.cpu()
         from_data = anew & (torch.rand(self.num_envs) < self._data_start_share)
         self._env.reseed(int(torch.randint(2**62, ())))
@@ -97,10 +97,10 @@ class TargetWorld:
         return target_observation(self._task, env.state, env.goal, None, self._observed).to(self._device)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         return self._env.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
-        """Go on from `state`; return the observations (B, O)."""
+        """Continue from `state`; return the observations (B, O)."""
         self._env.load_state_dict({name: values.cpu() for name, values in state.items()})
         return self._observe()

@@ -1,4 +1,4 @@
-"""Train a policy: what a method is given to do it, and how most methods do it.
+"""Train a policy: the inputs of a method's training, and the training of most methods.
 
 Most train by PPO, or by SAC, in the abstract simulator: raw, varied, or corrected by the method's grounding
 (Algorithm 2).
@@ -96,7 +96,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
         seed: int,
         recorded: Recorded | None,
     ) -> Sac:
-        """Build the learner and a new policy of `shape`, which imitates what was `recorded`."""
+        """Build the learner and a new policy of `shape`, which imitates the `recorded` actions."""
         return Sac(env, SoftActor(shape).to(device), self, horizon=horizon, seed=seed, recorded=recorded)
 
     @model_validator(mode="after")
@@ -128,9 +128,9 @@ class Training:
         task: the task. config: the recipe's `[train]`, or `[plus]`.
         settings: the method's own table of the recipe, if it has one.
         episodes: paired episodes. grounding: of the method; `NO_GROUNDING` where it fits none.
-        initial: the policy that the method goes on from, if it names one.
+        initial: the policy that the training starts from, if the method names one.
         seed: of all randomness. device: of the networks.
-        folder: for checkpoints; what is left in it becomes part of the artefact.
+        folder: for checkpoints; files left in it become part of the artefact.
         progress: called with the share done and a note.
         num_threads: of the target's physics, for methods that train in the target; None is one per core.
     """
@@ -167,11 +167,11 @@ class ResumableEnv(BatchedEnv, Protocol):
     penalty_scale: float
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that `load_state_dict` needs to go on from here."""
+        """Return all that `load_state_dict` needs to continue from here."""
         ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
-        """Go on from `state`; return the observations (B, O)."""
+        """Continue from `state`; return the observations (B, O)."""
         ...
 
 
@@ -231,8 +231,8 @@ def train_in(
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`; return it and its learning curve.
 
-    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps. What was `recorded`
-    is imitated, if the learner does that.
+    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps. Actions that were
+    `recorded` are imitated, if the learner does that.
     """
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
@@ -264,7 +264,7 @@ def optimise(
     while not learner.done:
         env.penalty_scale = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
         metrics = learner.iterate()
-        # JSON has no NaN: what is undefined, such as the success rate of no episodes, is null.
+        # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
         if is_lasting:
             # Success is to last to the horizon, which is not an end here: all ends are failures.

@@ -91,9 +91,9 @@ class TargetEnv(BatchedEnv, Protocol):
         ...
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
+        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
         ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         ...

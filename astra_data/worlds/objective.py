@@ -1,4 +1,4 @@
-"""What a task asks for, on abstract states: the same in target and simulator, so that rewards compare."""
+"""Objectives of tasks, on abstract states: the same in target and simulator, so that rewards compare."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS, Score
 
 @dataclass(frozen=True)
 class Objective(ABC):
-    """Starts, goals, what a policy is shown, and how steps are judged; states are abstract ones, (..., X).
+    """Starts, goals, observations, rewards and ends of a task; states are abstract ones, (..., X).
 
     Attributes:
         horizon: steps until an episode is cut off.
@@ -48,7 +48,7 @@ class Objective(ABC):
 
     @property
     def scores(self) -> tuple[Score, ...]:
-        """What rows are compared by, as in the paper, the headline first."""
+        """The scores by which rows are compared, as in the paper, the headline first."""
         return (SURVIVED_STEPS, RETURN) if self.is_lasting else (SUCCESS,)
 
     @abstractmethod
@@ -61,7 +61,7 @@ class Objective(ABC):
 
     @abstractmethod
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Assemble what a policy sees of states (..., X) and goals (..., G), each part scaled to about 1."""
+        """Assemble the observation of states (..., X) and goals (..., G), each part scaled to about 1."""
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
         """Clip actions (..., A) to ±1; `limit`, in m/s, has no effect on actions that are no velocities."""
@@ -69,14 +69,14 @@ class Objective(ABC):
 
     @abstractmethod
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell in which states (B, X) the goals (B, G) are reached, (B,) bool."""
+        """Return in which states (B, X) the goals (B, G) are reached, (B,) bool."""
 
     def places(self, state: Tensor) -> Tensor:
         """Return x and y in m of the K bodies that move in the plane, (..., 2 K); by default K = 0."""
         return state[..., :0]
 
     def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
-        """Tell which episodes (B,) succeed in their `step`, counted from 1.
+        """Return which episodes (B,) succeed in their `step`, counted from 1.
 
         Args:
             reached: whether the goal was reached in it, (B,) bool.
@@ -86,7 +86,7 @@ class Objective(ABC):
         return ~failed if self.is_lasting and step >= self.horizon else reached
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
+        """Return in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
         return torch.zeros(len(state), dtype=torch.bool, device=state.device)
 
     @abstractmethod

@@ -1,6 +1,6 @@
-"""What the toolkit needs of an abstract simulator.
+"""The interfaces of abstract simulators.
 
-A class of your own is an `Simulator`; `astra-data pair --simulator cart.py:Cart` pairs a dataset with it:
+A class of your own is a `Simulator`; `astra-data pair --simulator cart.py:Cart` pairs a dataset with it:
 
     class Cart:
         abstract_state = Column("abstract.state", size=2, names=("x", "v"))
@@ -121,4 +121,4 @@ class RememberingSimulator(Protocol):
     """A simulator whose next steps depend on more than its states."""
 
     memory: Tensor
-    """The rest of what they depend on, (B, M); `reset_to` and `settle` start it anew."""
+    """The memory that they depend on besides states, (B, M); `reset_to` and `settle` reset it."""

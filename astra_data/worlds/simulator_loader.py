@@ -42,7 +42,7 @@ class Pairing:
 def pairing_named(name: str) -> Pairing:
     """Return the simulator of the task `name`, or the class `path.py:MySim` of a user's file.
 
-    The class is an `Simulator` of `astra_data.worlds.protocols`.
+    The class is a `Simulator` of `astra_data.worlds.protocols`.
 
     Raises:
         BadInputError: there is no such task, file or class, or the class lacks an attribute.
@@ -60,8 +60,8 @@ def pairing_named(name: str) -> Pairing:
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]
     if missing:
         raise BadInputError(
-            f"{name} has no {', '.join(missing)}: expected what astra_data.worlds.protocols asks of an "
-            "Simulator"
+            f"{name} has no {', '.join(missing)}: expected what a Simulator has, see "
+            "astra_data.worlds.protocols"
         )
     column = made.abstract_state
     if not isinstance(column, Column):

@@ -43,7 +43,7 @@ class Varied:
 
 @dataclass(frozen=True)
 class Plane:
-    """What tasks in a maze have besides.
+    """Properties that only tasks in a maze have.
 
     Attributes:
         wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
@@ -70,7 +70,7 @@ class Task:
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets.
         varied: the same simulator with parameters that vary.
-        plane: what only a task in a maze has; None for others.
+        plane: properties of a task in a maze; None for others.
         photograph: renders target states (K, S) as pictures (K, height, width, 3); None where reports show
             none.
         target_id: name of a target that several tasks share, so that episodes of one serve all.
@@ -104,12 +104,12 @@ class Task:
     target_id: str | None = None
 
     def shares_target(self, other: "Task") -> bool:
-        """Tell whether both tasks have the same target and differ only in the simulator."""
+        """Return whether both tasks have the same target and differ only in the simulator."""
         return self.target_id is not None and self.target_id == other.target_id
 
     @property
     def planar(self) -> Plane:
-        """What only a task in a maze has.
+        """The properties of a task in a maze.
 
         Raises:
             BadInputError: the task has no maze.

@@ -142,14 +142,17 @@ def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(t
         (writer.folder / "training.safetensors").write_text("half")
         raise RuntimeError
     with (
-        pytest.raises(BadInputError, match="left what it had begun; resume it"),
+        pytest.raises(BadInputError, match="left an unfinished recording; resume it"),
         staged_writer(tmp_path / "set"),
     ):
         pass
     write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
     (tmp_path / "other").rename(tmp_path / "set")
     again = staged_writer(tmp_path / "set", resume=True)
-    with pytest.raises(BadInputError, match=r"another dataset .* which left what it had begun in"), again:
+    with (
+        pytest.raises(BadInputError, match=r"another dataset .* which left an unfinished recording in"),
+        again,
+    ):
         pass
     assert (tmp_path / ".set.staged" / "training.safetensors").read_text() == "half"
 

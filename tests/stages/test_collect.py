@@ -204,7 +204,7 @@ def test_after_interruptions_the_policy_is_not_trained_again(
         return sum("training" in note for note in notes)
 
     assert notes_until("training", 3) == 3
-    with pytest.raises(BadInputError, match="left what it had begun; resume it"):
+    with pytest.raises(BadInputError, match="left an unfinished recording; resume it"):
         collect(name, config, seed=0, out=out, progress=silent, resume=False)
     assert notes_until("target steps/s", 1) == 1
     assert notes_until("target steps/s", 1) == 0

@@ -246,7 +246,7 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
         make(task, "follower", paired, None, tmp_path / "out")
     with pytest.raises(BadInputError, match="run the stage `ground` first"):
         make(task, "astra", paired, None, tmp_path / "out")
-    with pytest.raises(BadInputError, match="goes on from the policy of direct_transfer: train that first"):
+    with pytest.raises(BadInputError, match="starts from the policy of direct_transfer: train that first"):
         make(task, "direct_transfer_iql", paired, None, tmp_path / "out")
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")

@@ -1,1 +1,1 @@
-"""Finds what is wrong with a LeRobot dataset, and mends what can be mended."""
+"""Checks and repairs LeRobot datasets."""

@@ -90,7 +90,7 @@ def method_colour(method: str) -> str:
 
 
 def score_axis(axes: Axes, score: Score) -> None:
-    """Let the vertical axis begin at no score, and end at the limit if there is one."""
+    """Start the vertical axis at a score of zero, and end it at the limit if there is one."""
     if score.limit is None:
         axes.set_ylim(bottom=0)
     else:

@@ -112,11 +112,11 @@ class AntMazeEnv:
         self.failed[rows] = False
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
+        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
         return {"physics": torch.from_numpy(self.physics.state.copy()), "goal": self.goal.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self.physics.state[:] = state["physics"].numpy()
         self.goal = state["goal"].clone()
 

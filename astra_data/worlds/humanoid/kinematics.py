@@ -146,7 +146,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         follow_s: float = 0.3,
         device: str = "cpu",
     ) -> None:
-        """Stand B humanoids up.
+        """Build B standing humanoids.
 
         Args:
             num_envs: B.

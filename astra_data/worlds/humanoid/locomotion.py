@@ -40,7 +40,7 @@ class Locomotion:
         return state
 
     def healthy(self, height: Floats) -> Bools:
-        """Tell which torso heights (B,) in m are healthy."""
+        """Return which torso heights (B,) in m are healthy."""
         low, high = self.healthy_m
         return np.asarray((height > low) & (height < high))
 

@@ -114,7 +114,7 @@ class PlanarWalking(Walking):
         return humanoid_to_walker2d(state)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
+        """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
         low, high = self.locomotion.healthy_m
         return ~((state[:, 0] > low) & (state[:, 0] < high))
 
@@ -168,7 +168,7 @@ class MassWalking(Walking):
         return humanoid_to_extended_kinematics(state)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which centres of mass of states (B, 46) are too low, (B,) bool."""
+        """Return which centres of mass of states (B, 46) are too low, (B,) bool."""
         return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:

@@ -83,7 +83,7 @@ class HumanoidEnv:
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Stand the humanoids in `mask` (B,) up, almost upright and at rest, by default all."""
+        """Set the humanoids in `mask` (B,), by default all, almost upright and at rest."""
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         self.reset_to(rows, self.locomotion.draw_starts(self._rng, len(rows)))
         return self._observe()
@@ -94,7 +94,7 @@ class HumanoidEnv:
         self.failed[rows] = False
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to go on from here; later random draws may differ."""
+        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
         physics = self.bodies.physics
         return {
             "physics": torch.from_numpy(physics.state.copy()),
@@ -102,7 +102,7 @@ class HumanoidEnv:
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self.bodies.physics.state[:] = state["physics"].numpy()
         self.bodies.physics.measured[:] = state["measured"].numpy()
 

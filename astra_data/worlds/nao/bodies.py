@@ -84,7 +84,7 @@ class BatchedBodies:
         self._pool = ThreadPoolExecutor(len(self._models))
 
     def reset(self, rows: NDArray[np.intp], qpos: Floats, angles: Floats) -> None:
-        """Put the bodies `rows` (n,) at rest at `qpos` (n, nq), their servos holding `angles` (n, 12)."""
+        """Set the bodies `rows` (n,) at rest at `qpos` (n, nq), their servos holding `angles` (n, 12)."""
         data = self._data[0]
         for row, position in zip(rows, qpos, strict=True):
             mujoco.mj_resetData(self.model, data)
@@ -179,7 +179,7 @@ class BatchedBodies:
         return followed
 
     def _touches(self, data: mujoco.MjData) -> bool:
-        """Tell whether the robot, not the ball, touches a wall."""
+        """Return whether the robot, not the ball, touches a wall."""
         first, last = self._walls or (0, -1)
         geoms = data.contact.geom
         walls = (geoms >= first) & (geoms <= last)

@@ -220,11 +220,11 @@ class BatchedNao:
         return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of what `load_state_dict` needs to go on exactly from here."""
+        """Return copies of what `load_state_dict` needs to continue exactly from here."""
         return {name: value.copy() for name, value in self._arrays().items()} | {"steps": self._steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state` of robots that were built with the same arguments."""
+        """Continue from `state` of robots that were built with the same arguments."""
         for name, value in self._arrays().items():
             value[:] = state[name]
         self._steps = int(state["steps"])

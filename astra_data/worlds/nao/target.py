@@ -204,14 +204,14 @@ class NaoEnv:
         return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to go on from here."""
+        """Return what `load_state_dict` needs to continue from here."""
         arrays = {**self.robots.state_dict(), **self.localisation.arrays(), **self.sight.arrays()}
         tensors = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
         drawn = json.dumps(self._rng.bit_generator.state).encode()
         return tensors | {"goal": self.goal.clone(), "drawn": torch.tensor(list(drawn), dtype=torch.uint8)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         arrays = {name: values.numpy() for name, values in state.items()}
         self.robots.load_state_dict(arrays)
         self.localisation.restore(arrays)

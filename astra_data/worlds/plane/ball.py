@@ -15,7 +15,7 @@ _KICKS_ABOVE = 0.5
 
 
 def asks_to_kick(command: Tensor) -> Tensor:
-    """Tell which commands (B, 3), a planar velocity and a kick entry, ask for a kick: (B, 1) bool.
+    """Return which commands (B, 3), a planar velocity and a kick entry, ask for a kick: (B, 1) bool.
 
     Raises:
         BadInputError: the commands have no kick entry, as in datasets from before there was one.

@@ -78,12 +78,12 @@ class Kicking(PlanarObjective):
         return state[..., [0, 1, 4, 5]]
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which balls (B,) of states (B, 8) are in the goal."""
+        """Return which balls (B,) of states (B, 8) are in the goal."""
         ball = state[:, 4:6]
         return (ball[:, 0] >= self.goal_line_m) & (ball[:, 1].abs() <= self.goal_half_width_m)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which balls (B,) of states (B, 8) left the field beside the goal."""
+        """Return which balls (B,) of states (B, 8) left the field beside the goal."""
         x, y = state[:, 4:6].unbind(-1)
         out = (x >= self.goal_line_m) | (x < self.back_line_m) | (y.abs() > self.side_line_m)
         return out & ~self.reached(state, goal)

@@ -93,7 +93,7 @@ class Navigation(PlanarObjective):
         return torch.cat([*seen, *map(torch.sin, waves), *map(torch.cos, waves)], dim=-1)
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Tell which states (B, 2 or more), beginning with x and y, are at the `goal` (B, 2), (B,) bool."""
+        """Return which states (B, 2 or more), beginning with x and y, are at the `goal` (B, 2), (B,) bool."""
         return (state[:, :2] - goal).square().sum(-1).le(self.success_radius_m**2)
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
