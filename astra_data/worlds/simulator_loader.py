@@ -60,7 +60,7 @@ def pairing_named(name: str) -> Pairing:
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]
     if missing:
         raise BadInputError(
-            f"{name} has no {', '.join(missing)}: expected what astra_data.worlds.protocols asks of an "
+            f"{name} has no {', '.join(missing)}: expected what astra_data.worlds.protocols asks of a "
             "Simulator"
         )
     column = made.abstract_state
