@@ -91,7 +91,9 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
         return [Source(recording, None, recording)]
     sources = [source for source in sources if str(source).endswith(tuple(suffixes))]
     if not sources:
-        raise BadInputError(f"{recording}: expected files that end with {' or '.join(suffixes)}, found none")
+        endings = " or ".join(filter(None, suffixes))
+        expected = f"files that end with {endings}" if endings else "files"
+        raise BadInputError(f"{recording}: expected {expected}, found none")
     return sorted(sources, key=lambda source: natural(f"{source.path}/{source}"))
 
 

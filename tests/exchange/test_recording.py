@@ -89,3 +89,6 @@ def test_what_is_not_there_is_told(tmp_path: Path) -> None:
         find_sources(tmp_path / "none", [".csv"])
     with pytest.raises(BadInputError, match=r"files that end with \.csv or \.tsv, found none"):
         find_sources(tmp_path, [".csv", ".tsv"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BadInputError, match="empty: expected files, found none"):
+        find_sources(tmp_path / "empty", [""])

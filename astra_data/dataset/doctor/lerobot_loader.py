@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from astra_data.core.optional import optional
 from astra_data.dataset.columns import ACTION, EPISODE_INDEX, Array
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.format import INFO_PATH
@@ -28,8 +29,12 @@ def compare_with_lerobot(root: Path, report: Report) -> None:
     Args:
         root: the dataset's folder, without faults.
         report: of `check`; differences are added to it.
+
+    Raises:
+        BadInputError: lerobot is not installed.
     """
     os.environ["HF_HUB_OFFLINE"] = "1"
+    optional("lerobot", "lerobot")
     import datasets.config  # noqa: PLC0415 - slow, and only after the environment is set
     from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415
 

@@ -63,9 +63,10 @@ def _numbers(texts: pa.StringArray, where: str) -> Array:
         try:
             numbers = pc.cast(texts, kind)
         except pa.ArrowInvalid as error:
-            fault = str(error)
+            if kind == pa.float64():
+                not_a_number = str(error)
             continue
         if kind == pa.int64():
             return np.from_dlpack(numbers)
         return np.from_dlpack(numbers.cast(pa.float64()).fill_null(np.nan))
-    raise BadInputError(f"{where} and below: expected numbers, or true and false ({fault})")
+    raise BadInputError(f"{where} and below: expected numbers, or true and false ({not_a_number})")

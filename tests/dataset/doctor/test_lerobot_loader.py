@@ -1,9 +1,11 @@
+import sys
 from pathlib import Path
 
 import pytest
 from damaged import EPISODES, alter, drop
 from fake_dataset import write_fake
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
 
@@ -45,3 +47,9 @@ def test_what_lerobot_cannot_open_is_a_fault(tmp_path: Path) -> None:
     drop("meta/tasks.parquet")(root)
     [fault] = compared(root)
     assert fault.startswith("lerobot cannot open it: ")
+
+
+def test_without_lerobot_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lerobot", None)
+    with pytest.raises(BadInputError, match=r"lerobot is needed and not installed: uv sync --extra lerobot"):
+        compared(write_fake(tmp_path / "set").root)

@@ -73,3 +73,9 @@ def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("True", "perhaps"))
     with pytest.raises(BadInputError, match=r"log.csv row 0: field 'fell' and below: expected numbers"):
         imported(tmp_path, path)
+
+
+def test_the_text_among_numbers_is_quoted(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.csv", rows() | {"x": np.array(["0.5", "abc"] + ["1.5"] * 18)})
+    with pytest.raises(BadInputError, match=r"field 'x' and below: expected numbers.*'abc'"):
+        imported(tmp_path, path)
