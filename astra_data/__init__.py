@@ -76,7 +76,7 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever is named
     except ModuleNotFoundError as error:
         if (reported := explained(error)) is None:
             raise
-        raise reported from error
+        raise reported from None
     globals()[name] = value = getattr(module, name)
     return value
 

@@ -161,4 +161,4 @@ def pair(
 
 
 def _given(**options: Any) -> dict[str, Any]:  # noqa: ANN401 - of any type
-    return {key: value for key, value in options.items() if value not in (None, False)}
+    return {key: value for key, value in options.items() if value is not None and value is not False}

@@ -31,6 +31,12 @@ def test_a_dataset_is_collected_and_paired_without_a_recipe(home: Path) -> None:
     assert newest.description["parents"] == [dataset.identity]
 
 
+def test_an_option_of_0_is_given(home: Path) -> None:
+    call("collect", "antmaze-umaze", *SMALL, "--name", "walks")
+    call("pair", "walks", "--simulator", "antmaze-umaze", "--reset-tolerance", "0")
+    assert open_dataset("walks").description["config"]["reset_tolerance"] == 0.0
+
+
 def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
     assert (
         call("collect", "antmaze-long", *SMALL, "--out", str(tmp_path / "a"), "--name", "walks").exit_code
