@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.config import load_recipe
+from astra_data.core.errors import RecipeError
 from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.renamed import with_current_keys
 
@@ -39,6 +40,14 @@ def test_current_keys_are_taken_without_a_word(capsys: pytest.CaptureFixture[str
     tables = {"train": {"disagreement_penalty": 0.5}, "plus": {}}
     assert with_current_keys(tables, Path("new.toml")) == tables
     assert not capsys.readouterr().err
+
+
+def test_both_names_in_one_table_are_refused() -> None:
+    tables = {"plus": {"disagreement_penalty": 0.5, "doubt_penalty": 0.5}}
+    with pytest.raises(
+        RecipeError, match=r"^both\.toml: plus has both doubt_penalty and disagreement_penalty,"
+    ):
+        with_current_keys(tables, Path("both.toml"))
 
 
 @pytest.mark.parametrize("train", ["doubt_penalty", "disagreement_penalty"])
