@@ -147,7 +147,8 @@ def test_around_the_point_is_within_the_ranges(
 ) -> None:
     fixed = {"friction": (1.0, 1.0), "heading_bias_deg": (0.0, 0.0)}
     settings = QUICK.model_copy(update={"policy_at": "around", "contexts": 32, "iterations": 1, **fixed})
-    variation, metrics = identify(fitting(tmp_path, settings))
+    grounding, metrics = identify(fitting(tmp_path, settings))
+    variation = grounding.variation
     assert isinstance(variation, PlanarVariation)
     low, high = variation.timestep_scale
     assert 0.75 <= low < metrics["point"]["timestep_scale"] < high <= 1.25
