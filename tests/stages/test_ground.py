@@ -193,7 +193,7 @@ def test_methods_without_a_grounding_and_raw_datasets_are_refused(
     with pytest.raises(BadInputError, match="expected a dataset that was paired") as caught:
         make(task, collected, tmp_path / "out")
     assert "\n" not in str(caught.value)
-    with pytest.raises(BadInputError, match="no dataset there"):
+    with pytest.raises(BadInputError, match="no such folder; expected a folder, name or name@data-"):
         make(task, tmp_path / "nowhere", tmp_path / "out")
 
 
