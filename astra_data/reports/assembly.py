@@ -8,6 +8,7 @@ from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
+from astra_data.methods import ROLES, method_title
 from astra_data.reports.artefacts import (
     EVALUATION,
     TRAJECTORIES,
@@ -22,7 +23,6 @@ from astra_data.reports.artefacts import (
 )
 from astra_data.reports.comparing import SHARED_WORLDS
 from astra_data.reports.costs import Files, row_cost, seconds, throughput
-from astra_data.reports.figures import ROLES, method_title
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.errors import BadInputError
+from astra_data.methods import method_title
 from astra_data.reports.comparing import improvement, summarised, validity
-from astra_data.reports.figures import method_title
 from astra_data.reports.origins import Named, dataset_uses, merged_origins
 from astra_data.reports.schema import Cost, Dataset, GapMeans, MethodResults, Results
 

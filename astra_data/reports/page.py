@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from astra_data.core.naming import is_plus, reference_of
+from astra_data.methods import ROLES, method_title
 from astra_data.reports.cost_and_origin import cost, machine, origin
-from astra_data.reports.figures import ROLES, method_title
 from astra_data.reports.formatting import duration, interval, mean_std, spread, table
 from astra_data.reports.schema import BandMeans, Results
 from astra_data.worlds.score import SUCCESS

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from pydantic import Field, JsonValue
 
@@ -13,8 +13,6 @@ from astra_data.core.progress import Progress
 from astra_data.methods import method_named
 from astra_data.reports.assembly import assemble
 from astra_data.reports.command_replay import replay_commands
-from astra_data.reports.drawing import Camera, figure_of_sizes, figures_of
-from astra_data.reports.figures import dynamics_mismatch, png
 from astra_data.reports.files import (
     Found,
     publish_results,
@@ -28,6 +26,9 @@ from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_
 from astra_data.reports.statistics import REPLICATES
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
+
+if TYPE_CHECKING:
+    from astra_data.reports.drawing import Camera
 
 
 class ReportConfig(Config):
@@ -107,6 +108,9 @@ def report(
             seeds only.
         BadInputError: an artefact is malformed, or rows were evaluated or made of data differently.
     """
+    from astra_data.reports.drawing import figure_of_sizes, figures_of
+    from astra_data.reports.figures import dynamics_mismatch, png
+
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
     known = {} if add_to is None else by_size(read_published(add_to))
@@ -161,7 +165,9 @@ def report(
     progress(1.0, _headline(sizes[-1]))
 
 
-def _camera(task: Task) -> Camera | None:
+def _camera(task: Task) -> "Camera | None":
+    from astra_data.reports.drawing import Camera
+
     if task.photograph is None:
         return None
     return Camera(task.photograph, task.timestep_s, task.objective.horizon * task.timestep_s)

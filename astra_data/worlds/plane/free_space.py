@@ -6,8 +6,8 @@ Grids have square cells of the maze's `fine_m` and are indexed [y, x] from the m
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
 from astra_data.worlds.plane.mazes import Maze
@@ -29,7 +29,7 @@ class FreeSpace:
         self.blocked = blocked
         self.half_extent = half_extent
         self.cell_m = cell_m
-        depth = torch.from_numpy(distance_transform_edt(blocked.cpu().numpy()))
+        depth = torch.from_numpy(scipy.ndimage.distance_transform_edt(blocked.cpu().numpy()))
         # How far a blocked cell is from the free ones, in cells; 0 in free ones.
         self._depth = depth.float().to(blocked.device)
         self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
@@ -39,7 +39,7 @@ class FreeSpace:
         """Return the free space of a disc of `radius_m`, a multiple of the grid's cell."""
         reach = round(radius_m / maze.fine_m)
         square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-        blocked = binary_dilation(maze.fine_walls, square, border_value=1)
+        blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
         return cls(
             torch.from_numpy(blocked).to(device),
             torch.tensor(maze.half_extent, dtype=torch.float32, device=device),
