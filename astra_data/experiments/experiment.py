@@ -1,10 +1,10 @@
-"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if it is on any.
+"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if any.
 
     based_on = "antmaze_umaze"
 
-A recipe with this line says only what differs from the recipe of that name beside it. Stages that nothing
-differs for are not run again: links in its folder lead to the other recipe's artefacts. It may have another
-task if that has the same target; then it shares the collected episodes.
+A recipe with this line contains only what differs from the recipe of that name in the same folder. Stages
+that are not affected are not run again: links in its folder lead to the other recipe's artefacts. It may have
+another task with the same target; then it shares the collected episodes.
 """
 
 import json
@@ -27,11 +27,11 @@ from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import TASKS
 
 ALWAYS_NEW = {"report"}
-"""Made anew by every run: it is cheap, and shows whichever rows and seeds the recipe has now."""
+"""Made again by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
 
 
 _SIMULATOR = "simulator"
-"""What differs between two tasks that have the same target."""
+"""Stands for the change between two tasks with the same target."""
 _ROWS_TABLES = tables().keys() | {"plus"}
 """Tables of a recipe that only some rows read."""
 
@@ -41,9 +41,9 @@ class Experiment:
     """A recipe and where its artefacts are.
 
     Attributes:
-        recipe: with everything that it takes from the one that it is based on.
+        recipe: with what it takes from its base.
         path: the recipe's file. folder: of its artefacts.
-        base: the experiment that it is based on, if any.
+        base: the experiment that this one is based on, if any.
     """
 
     recipe: Recipe
@@ -53,7 +53,7 @@ class Experiment:
 
     @cached_property
     def borrowed(self) -> set[str]:
-        """The stages whose artefacts are the base's."""
+        """The stages whose artefacts are taken from the base."""
         if self.base is None:
             return set()
         changed = _differences(self.base.recipe.settings, self.recipe)
@@ -66,7 +66,7 @@ class Experiment:
         return self.base if self.base and stage in self.borrowed else self
 
     def place(self, key: str) -> Path:
-        """Return where the artefact `key` is made."""
+        """Return the folder of the artefact `key`."""
         return self.maker(key.partition("/")[0]).folder / key
 
     def has(self, key: str) -> bool:
@@ -80,10 +80,10 @@ class Experiment:
         return link.is_symlink() and link.readlink().parent.parent == Path("..")
 
     def link_borrowed(self) -> None:
-        """Let links in the folder lead to what is borrowed.
+        """Link the borrowed stages into the folder.
 
         Raises:
-            RecipeError: there are artefacts where a link belongs.
+            RecipeError: a link would replace artefacts.
         """
         for stage in STAGES:
             link = self.folder / stage
@@ -100,10 +100,10 @@ class Experiment:
             link.symlink_to(Path("..") / source.name / stage)
 
     def check_unchanged(self) -> None:
-        """Refuse settings that differ from those that made what is already there, finished or begun.
+        """Check that the settings are those of the artefacts that are there, finished or not.
 
         Raises:
-            RecipeError: they do, here or in the base.
+            RecipeError: some differ, here or in the base.
         """
         if self.base:
             self.base.check_unchanged()
@@ -126,16 +126,16 @@ class Experiment:
 
     @property
     def results(self) -> Path:
-        """The folder that its results are published in."""
+        """The folder of published results."""
         return self.path.parent / "results"
 
     @property
     def published_in(self) -> Path:
-        """The file of published results that hold its points: the base's, where its evaluations are those."""
+        """The file with its published results: the base's if the evaluations are the base's."""
         return self.results / f"{self.maker('evaluate').path.stem}.json"
 
     def published(self) -> set[RunPoint]:
-        """Return the points that its published results have.
+        """Return the points that are in its published results.
 
         Raises:
             BadInputError: there are no such results.
@@ -186,7 +186,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
 
 
 def _reads(row: str, table: str) -> bool:
-    """Tell whether a row, or the one whose policy it goes on from, has its settings from `table`."""
+    """Tell whether a row, or the one whose policy it starts from, takes its settings from `table`."""
     if table == "plus":
         return is_plus(row)
     base = base_method(row)
@@ -198,7 +198,7 @@ def _reads(row: str, table: str) -> bool:
 
 
 def _stale_stages(changed: set[str]) -> set[str]:
-    """Return the stages that a change of the keys `changed` of a recipe reaches."""
+    """Return the stages that are affected when the keys `changed` of a recipe change."""
     stale: set[str] = set()
     for stage in STAGES:
         sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
@@ -214,7 +214,7 @@ def _stale_stages(changed: set[str]) -> set[str]:
 def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     """Return the settings of `recipe` that differ from those recorded `before`.
 
-    What was not known then has its default, which is what was done.
+    Settings that did not exist then have their defaults, which is what the code did then.
     """
     with suppress(RecipeError):
         before = validated(before, type(recipe), "recipe.json").settings

@@ -30,7 +30,7 @@ ARTEFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "i
 
 @dataclass(frozen=True)
 class Reported:
-    """What the report is about, small enough to be sent to another process."""
+    """What the report needs to know of a recipe; can be sent to another process."""
 
     name: str
     task: str
@@ -57,7 +57,7 @@ def plan(
         recipe: what to make.
         path: the recipe's file.
         folder: where it is made, such as `runs/antmaze_long`; an item's artefact is at `folder / key`.
-        selection: what to make and to report of it; by default all.
+        selection: the rows, seeds and sizes to make and report; by default all.
         device: torch device of the networks.
         publish: a folder that the report copies its results to, if any.
         add_to: a file of results that the report adds to, if any.
@@ -98,7 +98,7 @@ def grounded_as(base: str) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What there is to make of a recipe, but for its report."""
+    """The artefacts of a recipe except its report."""
 
     recipe: Recipe
     folder: Path

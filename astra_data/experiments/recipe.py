@@ -1,4 +1,4 @@
-"""What a recipe may say: task, rows, seeds and sizes, and a table of settings per stage and method."""
+"""The model of recipes: task, rows, seeds and sizes, and a table of settings per stage and method."""
 
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -25,11 +25,11 @@ from astra_data.worlds.registry import TASKS
 from astra_data.worlds.score import Score
 
 WHOLE = 100
-"""Per cent of a dataset that is not swept over."""
+"""Per cent: the size of a dataset that is not swept over."""
 
 
 class SweepConfig(Config):
-    """Over which sizes of the dataset the rows are repeated."""
+    """The sizes of the dataset on which the rows are repeated."""
 
     percent: tuple[Count, ...] = ()
     """In per cent of `collect.episodes`; smaller ones lie inside larger ones. By default the whole."""
@@ -55,12 +55,12 @@ class Recipe(Config):
 
     @property
     def settings(self) -> dict[str, JsonValue]:
-        """All that it says, with the defaults, as JSON values."""
+        """All settings, including defaults, as JSON values."""
         return self.model_dump(mode="json")
 
     @property
     def headline(self) -> Score:
-        """What its rows are compared by above all."""
+        """The score by which its rows are mainly compared."""
         return TASKS[self.task].objective.scores[0]
 
     def settings_of(self, row: str, stage: str) -> Config | None:

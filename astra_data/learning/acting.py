@@ -1,4 +1,4 @@
-"""Act in a batched environment: what is carried from step to step, restarts at the horizon, and figures."""
+"""Rollouts in a batched environment: what is carried between steps, restarts at the horizon, metrics."""
 
 import math
 import time
@@ -13,13 +13,13 @@ from astra_data.worlds.batched import BatchedEnv, Step
 
 @dataclass(frozen=True)
 class Taken:
-    """A step that was taken.
+    """The outcome of one step of all rows.
 
     Attributes:
-        step: what it led to.
-        action: what was done, (B, A) in ±1.
-        expired: whose time ran out, (B,) bool.
-        done: whose episodes are over, expired or terminated, (B,) bool.
+        step: what the environment returned.
+        action: the executed actions, (B, A) in ±1.
+        expired: episodes that reached the horizon without terminating, (B,) bool.
+        done: episodes that are over, expired or terminated, (B,) bool.
     """
 
     step: Step
@@ -35,7 +35,7 @@ class Acting:
         observation: (B, O), to act on next.
         previous_action: (B, A) in ±1. hidden: the policy's memory, (B, H). Both are zero at the start.
         first: where an episode begins, (B,) bool.
-        world_seconds: the time that the environment's steps took, since the start or since resuming.
+        world_seconds: wall time of the environment's steps, since the start or since resuming.
     """
 
     def __init__(self, env: BatchedEnv, hidden: Tensor, *, horizon: int, is_staggered: bool) -> None:
@@ -44,8 +44,8 @@ class Acting:
         Args:
             env: the environment.
             hidden: the policy's memory at the start, (B, H).
-            horizon: rows are restarted after so many steps, without ending the task.
-            is_staggered: begin at random ages, so that not all restarts by the horizon come at once.
+            horizon: episodes are truncated after this many steps.
+            is_staggered: start episodes at random ages, so that they do not all reach the horizon at once.
         """
         self.env, self.horizon = env, horizon
         self.world_seconds = 0.0
@@ -62,7 +62,7 @@ class Acting:
         self._steps = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
 
     def take(self, action: Tensor, hidden: Tensor) -> Taken:
-        """Apply `action` (B, A), cut off at ±1, and remember `hidden` (B, H); start anew what is over."""
+        """Step with `action` (B, A), clipped to ±1, and keep `hidden` (B, H); reset rows that are done."""
         began = time.perf_counter()
         step = self.env.step(action)
         self.world_seconds += time.perf_counter() - began
@@ -81,20 +81,20 @@ class Acting:
         return Taken(step, executed, expired, done)
 
     def figures(self) -> dict[str, float]:
-        """Return what happened since the last call.
+        """Return metrics of the steps since the last call.
 
         Returns:
-            "success" of the "episodes" that ended, wherever in the task they began, and their mean
-            "episode_steps", NaN where none did; the mean "reward" of a step.
+            the "success" rate of the "episodes" that ended, wherever in the task they started, and their mean
+            "episode_steps", both NaN where none ended; the mean "reward" of a step.
         """
-        told = {
+        metrics = {
             "success": self._succeeded / self._finished if self._finished else math.nan,
             "episode_steps": self._survived / self._finished if self._finished else math.nan,
             "episodes": self._finished,
             "reward": self._rewarded / self._steps,
         }
         self._forget()
-        return told
+        return metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state, after `figures`; see `load_state_dict`."""
@@ -107,7 +107,7 @@ class Acting:
         }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        """Restore `state`; the environment is restored already and shows `observation` (B, O)."""
         device = observation.device
         self.observation = observation
         self.previous_action, self.hidden = state["previous_action"].to(device), state["hidden"].to(device)

@@ -1,4 +1,4 @@
-"""Descent: fit a model by gradients, at a rate that falls to nothing; go on after an interruption."""
+"""Fit a model by gradient descent, with a cosine schedule down to zero; resumable."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from astra_data.core.logbook import Logbook
 
 
 class DescentConfig(Config):
-    """How a model is fitted by gradients. The paper prints none of it, nor of what stages add."""
+    """How a model is fitted by gradient descent. The paper prints none of these, nor what stages add."""
 
     updates: Count = 1500
     """Gradient updates in all."""
@@ -22,13 +22,13 @@ class DescentConfig(Config):
 
 
 class Descent:
-    """A fit in progress, by AdamW.
+    """A fit by AdamW in progress.
 
     Attributes:
-        parameters: those that are fitted.
+        parameters: those being fitted.
         done: updates so far.
-        points: what was measured on the way.
-        stopwatch: runs from the beginning, on top of what was spent before an interruption.
+        points: metrics measured so far.
+        stopwatch: time spent, including before an interruption.
     """
 
     def __init__(
@@ -39,12 +39,12 @@ class Descent:
         checkpoint: Path | None = None,
         weight_decay: float = 0.0,
     ) -> None:
-        """Begin, or go on from the `checkpoint` if it is there.
+        """Start, or resume from the `checkpoint` if there is one.
 
         Args:
-            model: what is fitted: its parameters that require gradients.
+            model: its parameters that require gradients are fitted.
             config: settings.
-            checkpoint: the file that `keep` writes; None to write none.
+            checkpoint: the file that `keep` writes; None for none.
             weight_decay: of AdamW.
 
         Raises:
@@ -71,7 +71,7 @@ class Descent:
 
     @property
     def share(self) -> float:
-        """The share of the updates that is done."""
+        """Share of the updates that are done."""
         return self.done / self._config.updates
 
     def update(self, loss: Tensor) -> None:
@@ -84,7 +84,7 @@ class Descent:
         self.done += 1
 
     def keep(self, **measured: float | None) -> None:
-        """Add what was `measured` after this many updates to the points, and write the checkpoint."""
+        """Record metrics `measured` after this many updates, and write the checkpoint."""
         self.points.append({"step": self.done, **measured})
         self._logbook.keep(
             {

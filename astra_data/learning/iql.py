@@ -1,12 +1,12 @@
 """Implicit Q-learning (Kostrikov et al. 2022) from recorded episodes, with TorchRL's losses.
 
-As in their Algorithm 1 the critics come first, from single transitions, for they do not depend on the policy;
-then the policy is extracted by advantage-weighted regression, from windows of whole stretches, so that one
-with a memory learns with it. The critics see no history: the random commands in the records are held for a
-while, and critics that know the last command learn little about any other.
+As in their Algorithm 1, the critics are fitted first, on single transitions, since they do not depend on the
+policy. The policy is then extracted by advantage-weighted regression on windows of consecutive steps, so that
+a recurrent policy learns with its memory. The critics see no history: the random commands in the data are
+held for several steps, and critics that know the previous command learn little about any other.
 
-Every update seeds torch from (seed, update): a run that resumes from a checkpoint repeats what an
-uninterrupted run would have done.
+Every update seeds torch from (seed, update), so a run resumed from a checkpoint gives the same result as an
+uninterrupted one.
 """
 
 import math
@@ -41,20 +41,19 @@ class IqlConfig(Config):
     critic_learning_rate: Positive = 1e-3
     """Of the critics."""
     target_rate: Share = 0.005
-    """Share by which the slow action values follow, per update."""
+    """Polyak rate of the target action values, per update."""
     expectile: Share = 0.9
-    """Of the action values that the state value is; as the method's authors have it for AntMaze."""
+    """Of the action values, which the state value estimates; the authors' value for AntMaze."""
     discount: Share = 0.99
     """Of the reward, per step."""
     return_steps: Count = 10
-    """Rewards of so many recorded steps are summed before the state value takes over. 1 is the method as
-    printed: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the critics'
-    errors."""
+    """Steps of the n-step return. 1 is the method as printed: at 20 steps/s a single command hardly moves the
+    robot, and its advantage is lost in the critics' errors."""
     reward_scale: Positive = 1.0
     """Factor on the recorded reward, before the shift."""
     reward_shift: float = 0.0
-    """Added to each step's reward; by default nothing, as progress is paid step by step. The -1 that is usual
-    for sparse rewards makes falling over pay where that ends the task."""
+    """Added to each step's reward; 0 by default, as rewards are dense. The usual -1 for sparse rewards would
+    reward falling over where that ends the task."""
     policy_updates: Count = 600
     """Gradient updates of the policy."""
     batch_windows: Count = 24
@@ -62,12 +61,12 @@ class IqlConfig(Config):
     window: Count = 100
     """Steps per window, in backpropagation through time."""
     burn_in: Number = 20
-    """Steps at the start of a window that only fill the memory; none where the episode begins there."""
+    """Steps at the start of a window that only warm up the memory; none where the episode starts there."""
     learning_rate: Positive = 1e-3
     """Of the policy at the start; falls to zero along a half cosine."""
     temperature: NotNegative = 10.0
-    """Inverse temperature of the advantage weights, which are clipped at 100; as the method's authors have
-    it for AntMaze."""
+    """Inverse temperature of the advantage weights, which are clipped at 100; the authors' value for
+    AntMaze."""
     gradient_norm: Positive = 1.0
     """The policy's gradients are clipped to this norm."""
 
@@ -79,7 +78,7 @@ class IqlConfig(Config):
 
 
 FINE_TUNING = IqlConfig(learning_rate=1e-4, policy_updates=100)
-"""For a policy that has learned already: gentle, for otherwise it unlearns more than it learns."""
+"""For a policy that is trained already: gentle, since it otherwise unlearns more than it learns."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Experience(Recorded):
 
     Attributes:
         reward: (E, T). next_observation: as `observation`, (E, T, O).
-        terminated: (E, T) bool, the task ended: no value beyond it. Running out of time ends nothing.
+        terminated: (E, T) bool, the task ended, so there is no bootstrapping. False at time limits.
     """
 
     reward: Tensor
@@ -178,7 +177,7 @@ class Iql:
             return torch.as_tensor(self._loss.value_network(batch)["state_value"].squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that a later `load_state_dict` needs to go on from here."""
+        """Return everything that `load_state_dict` needs."""
         return {
             "networks": self._loss.state_dict(),
             "critic_optimizer": self._critic_optimizer.state_dict(),
@@ -187,7 +186,7 @@ class Iql:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Restore `state`."""
         self._loss.load_state_dict(state["networks"])
         self._critic_optimizer.load_state_dict(state["critic_optimizer"])
         self._optimizer.load_state_dict(state["optimizer"])
@@ -195,12 +194,13 @@ class Iql:
 
 
 def transitions(experience: Experience, config: IqlConfig) -> "TensorDict":
-    """Return steps of `experience` with the return of `config.return_steps` steps and what comes then, (N,).
+    """Return the transitions (N,) of `experience` with n-step returns and the observation n steps later.
 
-    Steps whose return the end of the record cuts short are left out; the end of the task does not cut it.
+    n is `config.return_steps`. Steps with fewer recorded steps after them are left out, unless the task ended
+    there.
 
     Raises:
-        BadInputError: no step is left.
+        BadInputError: there are none.
     """
     from tensordict import TensorDict
 

@@ -1,4 +1,4 @@
-"""What every learner that acts in an environment does: stretches of steps, seeded each, and resumable."""
+"""Learners that act in an environment: they iterate over rollouts, each seeded, and can be resumed."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -11,15 +11,15 @@ from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
 
 
-class Part(Protocol):
-    """A part of a training that is kept in checkpoints, such as a network or an optimiser."""
+class Resumable(Protocol):
+    """What checkpoints of a training hold, such as a network or an optimiser."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that `load_state_dict` needs."""
         ...
 
     def load_state_dict(self, state: dict[str, Any], /) -> object:
-        """Go on from `state`."""
+        """Restore `state`."""
         ...
 
 
@@ -30,19 +30,25 @@ class Learner(ABC):
     an uninterrupted one would have done.
 
     Attributes:
-        env: the world. acting: how a policy acts in it.
+        env: the environment. acting: the policy's rollouts in it.
         total_steps: environment steps in all. steps: those done.
         rollout_steps: batched steps per iteration.
     """
 
     def __init__(
-        self, acting: Acting, parts: Mapping[str, Part], *, total_steps: int, rollout_steps: int, seed: int
+        self,
+        acting: Acting,
+        parts: Mapping[str, Resumable],
+        *,
+        total_steps: int,
+        rollout_steps: int,
+        seed: int,
     ) -> None:
         """Prepare to learn.
 
         Args:
-            acting: the world, in which a policy is about to act.
-            parts: what changes while learning, beside it.
+            acting: a policy's rollouts in an environment.
+            parts: everything else that a checkpoint holds, by name: networks, optimisers, buffers.
             total_steps: environment steps in all.
             rollout_steps: batched steps per iteration.
             seed: of all randomness.
@@ -62,28 +68,32 @@ class Learner(ABC):
         return 1.0 - self.steps / self.total_steps
 
     def iterate(self) -> dict[str, float]:
-        """Take a stretch of steps and learn.
+        """Take `rollout_steps` batched steps and learn from them.
 
         Returns:
-            the figures of `Acting`, and the learner's own.
+            the metrics of `Acting`, and the learner's own.
         """
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
-        told = self._iterate()
+        metrics = self._iterate()
         self.steps += self.env.num_envs * self.rollout_steps
         self._iteration += 1
-        return self.acting.figures() | told
+        return self.acting.figures() | metrics
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
-        """Take `rollout_steps` batched steps and learn; return figures."""
+        """Take `rollout_steps` batched steps and learn; return metrics."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state; see `load_state_dict`."""
-        told = {"steps": self.steps, "iteration": self._iteration, "acting": self.acting.state_dict()}
-        return {name: part.state_dict() for name, part in self._parts.items()} | told
+        parts = {name: part.state_dict() for name, part in self._parts.items()}
+        return parts | {
+            "steps": self.steps,
+            "iteration": self._iteration,
+            "acting": self.acting.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Go on from `state`, with the environment already set back and showing `observation` (B, O)."""
+        """Restore `state`; the environment is restored already and shows `observation` (B, O)."""
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.steps, self._iteration = state["steps"], state["iteration"]

@@ -1,7 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
 
-One iteration collects a stretch of steps from every environment and makes a few passes over it. Whole
-stretches are kept together, so the same code trains policies with and without memory.
+One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
+rollouts of some environments, so the same code trains policies with and without memory.
 """
 
 from typing import TYPE_CHECKING
@@ -30,15 +30,15 @@ class PpoConfig(Config):
     epochs: Count = 5
     """Passes over the collected steps per iteration."""
     minibatches: Count = 4
-    """Updates per pass; each takes whole stretches of a share of the environments."""
+    """Updates per pass; each takes the whole rollouts of a share of the environments."""
     learning_rate: Positive = 5e-4
     """At the start; falls linearly to zero."""
     discount: Share = 0.99
     """Of the reward, per step."""
     gae_lambda: Share = 0.95
-    """Decay of the advantage's n-step mixture, per step."""
+    """λ of generalised advantage estimation."""
     clip: Positive = 0.2
-    """Largest change of an action's probability ratio that still earns."""
+    """Clip range of the probability ratio."""
     entropy_weight: NotNegative = 0.003
     """Of the policy's entropy in the loss."""
     value_weight: NotNegative = 0.5
@@ -62,10 +62,10 @@ class Ppo(Learner):
         """Prepare to train `policy` in `env`.
 
         Args:
-            env: the world.
+            env: the environment.
             policy: the networks.
             config: settings.
-            horizon: rows are restarted after so many steps, without ending the task.
+            horizon: episodes are truncated after this many steps.
             seed: of all randomness.
         """
         self.policy, self.config = policy, config
@@ -81,7 +81,7 @@ class Ppo(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Collect one stretch and learn from it; return the mean "std" of the actions."""
+        """Collect one rollout and learn from it; return the mean "std" of the actions."""
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * self.share_left
         self._learn(self._collect())

@@ -1,7 +1,7 @@
 """Rapid motor adaptation, phase 2: a student learns to estimate its teacher's extrinsics while it acts.
 
-After Kumar et al. 2021. The student's own actions decide what it learns from, so that it knows the
-histories that its mistakes lead to.
+After Kumar et al. 2021. The student learns on-policy, from its own actions, so that it knows the histories
+that its mistakes lead to.
 """
 
 import math
@@ -24,9 +24,9 @@ class RmaConfig(Config):
     """Settings of rapid motor adaptation. The paper prints none; sizes are those of Kumar et al. 2021."""
 
     extrinsics_size: Count = 8
-    """Numbers that the parameters of the simulator are encoded into."""
+    """Size of the encoding of the simulator's parameters."""
     history_length: Annotated[int, Field(ge=SHORTEST_HISTORY)] = 50
-    """Steps that extrinsics are estimated from."""
+    """Steps from which the extrinsics are estimated."""
     adaptation_steps: Count = 500_000
     """Environment steps of phase 2 in all."""
     adaptation_learning_rate: Positive = 1e-3
@@ -53,11 +53,11 @@ class Adaptation(Learner):
         """Prepare to train a student of `teacher` in `env`.
 
         Args:
-            env: the world that the teacher was trained in.
+            env: the environment that the teacher was trained in.
             teacher: trained.
             config: settings.
             rollout_steps: steps of every environment per iteration.
-            horizon: rows are restarted after so many steps, without ending the task.
+            horizon: episodes are truncated after this many steps.
             seed: of all randomness.
         """
         self.teacher, self.config = teacher, config
@@ -75,11 +75,11 @@ class Adaptation(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Act and learn for one stretch of steps.
+        """Act and learn for one rollout.
 
         Returns:
-            "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
-            the start of episodes, when nothing has been seen; NaN where nothing varies.
+            "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, also at the
+            start of episodes, where the history is empty; NaN where nothing varies.
         """
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.adaptation_learning_rate * self.share_left
@@ -95,7 +95,7 @@ class Adaptation(Learner):
         return {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
 
     def _learn(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Take in the current observations and update.
+        """Update on the current observations.
 
         Returns:
             the true extrinsics (B, E), the features (B, F), and the next hidden (B, H).

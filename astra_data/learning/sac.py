@@ -1,9 +1,9 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
 
 Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
-whose first steps only fill the memories; otherwise they learn from single steps. The policy's memory begins a
-window as it was when it acted, for it goes on through whole episodes when it acts again (Kapturowski et al.
-2019); that of the critics, which judge nothing but windows, begins empty.
+whose first steps only warm up the memories; otherwise they learn from single steps. In a window the policy's
+memory starts from the state stored when it acted, since it runs through whole episodes when it acts
+(Kapturowski et al. 2019); that of the critics, which only ever see windows, starts empty.
 """
 
 import copy
@@ -42,14 +42,14 @@ class SacConfig(Config):
     batch_size: Count = 256
     """Steps per update; where the policy has a memory, in as many windows as they make."""
     window: Count = 32
-    """Steps in a row, where the policy has a memory."""
+    """Consecutive steps per window, where the policy has a memory."""
     burn_in: Number = 8
-    """Steps at the start of a window that only fill the memory, until an episode begins."""
+    """Steps at the start of a window that only warm up the memory, until an episode starts."""
     buffer_size: Count = 1_000_000
-    """The most recent steps that are kept."""
+    """Steps that the replay buffer holds."""
     learning_rate: Positive = 1e-3
-    """Of actor, critics and temperature; over the second half of the training it falls to nothing. Without
-    that it is chance how good the policy is that the training happens to end with."""
+    """Of actor, critics and temperature; it falls linearly to zero over the second half of the training.
+    Otherwise the quality of the final policy is a matter of chance."""
     discount: Share = 0.97
     """Of the reward, per step."""
     reward_scale: Positive = 1.0
@@ -57,11 +57,11 @@ class SacConfig(Config):
     initial_temperature: Positive = 0.2
     """Of the entropy in the reward, at the start."""
     target_rate: Share = 0.005
-    """Share by which the target critics follow, per update."""
+    """Polyak rate of the target critics, per update."""
     imitation_weight: NotNegative = 0.0
-    """Of the mean squared distance from recorded actions in what the actor minimises, times the size of the
-    mean action value, entropy included. 0.4 is what Fujimoto and Gu (2021) take, of the mean size. Without
-    effect in the target: upper bounds learn from no data."""
+    """Weight of the mean squared distance from recorded actions in the actor's loss, times the size of the
+    mean action value with entropy. Fujimoto and Gu (2021) take 0.4, times the mean size. Without effect for
+    policies trained in the target, which learn from no data."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:
@@ -92,15 +92,15 @@ class Sac(Learner):
         """Prepare to train `policy` in `env`.
 
         Args:
-            env: the world.
+            env: the environment.
             policy: the actor.
             config: settings.
-            horizon: rows are restarted after so many steps, without ending the task.
+            horizon: episodes are truncated after this many steps.
             seed: of all randomness.
-            recorded: to imitate.
+            recorded: episodes to imitate, if any.
 
         Raises:
-            BadInputError: the buffer would hold no window.
+            BadInputError: the buffer is smaller than a window.
         """
         from torchrl.objectives import SoftUpdate
 
@@ -139,7 +139,7 @@ class Sac(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Act for a stretch of steps, and learn after each; return the "temperature" of the entropy."""
+        """Act for a rollout, and learn after each step; return the "temperature" of the entropy."""
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * min(1.0, 2.0 * self.share_left)
         for _ in range(self.rollout_steps):
@@ -151,7 +151,7 @@ class Sac(Learner):
 
     @torch.no_grad()
     def _act(self) -> None:
-        """Take one step and keep it."""
+        """Take one step and add it to the replay buffer."""
         acting = self.acting
         seen = {
             "observation": acting.observation,
@@ -199,11 +199,11 @@ class Sac(Learner):
         }
         batch = TensorDict(table, batch_size=[int(learned.sum())])
         wrong, _ = self._loss.qvalue_v2_loss(batch)
-        # The actor is not to make the critics' memory forget what is bad.
-        costs, told = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
-        total = wrong + costs + self._loss.alpha_loss(told["log_prob"]).mean()
+        # The actor's loss must not train the critics' memory: it would learn to forget what is bad.
+        costs, details = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
+        total = wrong + costs + self._loss.alpha_loss(details["log_prob"]).mean()
         if self._recorded is not None:
-            size = costs.detach().abs()  # hardly anything but action values
+            size = costs.detach().abs()  # mostly action values
             total = total + config.imitation_weight * size * self._distance(self._recorded)
         self._optimizer.zero_grad()
         total.backward()
@@ -214,7 +214,7 @@ class Sac(Learner):
                 late.data.lerp_(now.data, config.target_rate)
 
     def _distance(self, recorded: Recorded) -> Tensor:
-        """Return the mean squared distance of the policy's actions from recorded ones."""
+        """Return the mean squared distance of the policy's actions from the recorded ones."""
         steps, learned = recorded.windows(self.config.batch_size // self._window, self._window, self._burn_in)
         features = self.policy.remember_sequence(
             steps["observation"],
@@ -258,7 +258,7 @@ class _Policy(nn.Module):
 
 
 class _Critic(nn.Module):
-    """Action values; layer-normalised, which keeps them from diverging at this learning rate."""
+    """Action values; layer normalisation keeps them from diverging at this learning rate."""
 
     def __init__(self, policy: SoftActor) -> None:
         super().__init__()

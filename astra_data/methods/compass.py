@@ -1,9 +1,9 @@
-"""COMPASS: identify the simulator's parameters through a causal model of the trajectory gap; and its ranges.
+"""COMPASS: identify the simulator's parameters by a causal model of the trajectory gap; or use its ranges.
 
 After Huang et al., "What Went Wrong? Closing the Sim-to-Real Gap via Differentiable Causal Discovery" (CoRL
-2023). Where they drive the target anew in every iteration, the recorded episodes are all that there is here,
-and simulators are set back to the target's state at the beginning of short windows: replays of whole episodes
-drift too far apart to tell anything.
+2023). They run the target again in every iteration; here there are only the recorded episodes. Simulators are
+reset to the target's state at the start of short windows, since replays of whole episodes drift too far apart
+to be informative.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,47 +28,46 @@ from astra_data.training.train import InSimulator
 from astra_data.worlds.variation import AnyVariation, Variation
 
 Mask = dict[str, dict[str, float]]
-"""How probably each parameter reaches each gap, by their names. Gaps, the effects, are means over a window of
-the distance between the simulator and the target in each of the task's quantities."""
+"""The probability that each parameter affects each gap, by their names. A gap is the mean over a window of
+the distance between simulator and target in one of the task's quantities."""
 
 
 class CompassConfig(AnyVariation, CausalConfig):
-    """Ranges of the parameters, and how they are identified, of which the paper prints nothing.
+    """Ranges of the parameters, and settings of the identification, of which the paper prints none.
 
-    Only what steers is identified (see `Variation`). The rest keeps its ranges, and is drawn from them while
-    the policy is trained.
+    Only steering parameters are identified (see `Variation`). The others keep their ranges, from which they
+    are drawn while the policy is trained.
     """
 
     iterations: Count = 5
     """Replays, each followed by a fit of the causal model and a step of the parameters."""
     contexts: Annotated[int, Field(ge=2)] = 128
-    """Sets of parameters that every window is replayed with, per iteration."""
+    """Parameter sets with which every window is replayed, per iteration."""
     windows: Annotated[int, Field(ge=10)] = 500
     """Windows per iteration."""
     window: Count = 25
     """Steps per window."""
     outlier_share: Annotated[float, Field(ge=0, le=0.5)] = 0.05
-    """Share of the windows left out, those with the largest gaps; as the authors have it."""
+    """Share of the windows, those with the largest gaps, that is left out; the authors' value."""
     shrink: Annotated[float, Field(gt=0, lt=1)] = 0.6
-    """Factor on the ranges of what moved, after each iteration."""
+    """Factor on the ranges of the parameters that moved, after each iteration."""
     policy_at: Literal["point", "around"] = "point"
-    """Train the policy at the point that was found, as the authors do, where what was not identified is as in
-    the plain simulator; or around it, with parameters from the last ranges, which are still the whole ranges
-    of what was not identified."""
+    """"point": train the policy at the identified parameters, as the authors do. "around": draw them
+    from the last, narrowed ranges, which are still the whole ranges of those that were not identified."""
 
 
 def parameters_at(point: Mapping[str, float], kind: type[Variation]) -> Tensor:
-    """Return the parameters (P,) of a simulator without noise that is plain but for `point`."""
+    """Return parameters (P,) with the values in `point`, and otherwise those of the plain simulator."""
     return kind(**{name: (value, value) for name, value in point.items()}).ranges()[:, 0]
 
 
 @dataclass
 class Search:
-    """How far the identification is.
+    """The state of the identification.
 
     Attributes:
-        box: where the parameters are sought. point: the best so far, of what steers.
-        found: what each finished iteration tells. spent: the time that they took; None before the first.
+        box: ranges to search. point: the best steering parameters so far.
+        found: results of each finished iteration. spent: the time that they took; None before the first.
     """
 
     box: Variation
@@ -78,20 +77,21 @@ class Search:
 
     @classmethod
     def begin(cls, ranges: Variation, checkpoint: Path) -> "Search":
-        """Go on from `checkpoint`; without one, begin at the plain simulator, as far as it is in `ranges`."""
+        """Resume from `checkpoint`; without one, start at the plain simulator, clipped to `ranges`."""
         if checkpoint.exists():
-            with resumed(checkpoint) as (_, told):
-                return cls(Variation.of_json(told["box"]), told["point"], told["found"], told["spent"])
+            with resumed(checkpoint) as (_, metadata):
+                box = Variation.of_json(metadata["box"])
+                return cls(box, metadata["point"], metadata["found"], metadata["spent"])
         plain = type(ranges)()
         point = {name: _within(getattr(plain, name)[0], getattr(ranges, name)) for name in ranges.steering}
         return cls(ranges, point, [], None)
 
     def save(self, checkpoint: Path) -> None:
-        """Write what `begin` goes on from."""
+        """Write the checkpoint that `begin` resumes from."""
         save_tensors(checkpoint, {"box": self.box.ranges()}, vars(self) | {"box": self.box.model_dump()})
 
     def narrow(self, names: Iterable[str], shrink: float) -> None:
-        """Draw the box in around the point, for the parameters in `names` by the factor `shrink`."""
+        """Shrink the ranges of the parameters in `names` around the point by the factor `shrink`."""
         box = self.box.model_dump()
         for name in names:
             reach = shrink * (box[name][1] - box[name][0]) / 2
@@ -107,15 +107,15 @@ def _within(value: float, ends: tuple[float, float]) -> float:
 def identify(fitting: Fitting) -> tuple[Variation, dict[str, Any]]:
     """Find the parameters with which replays come closest to the recorded episodes.
 
-    Every iteration replays windows with parameters from a box, fits a causal model to the gaps, moves the
-    parameters that matter to where that expects the smallest, and draws the box in around them.
+    Every iteration replays windows with parameters drawn from a box, fits a causal model to the gaps, moves
+    the parameters that matter to where the model predicts the smallest gap, and shrinks the box around them.
 
     Returns:
-        the parameters, and: the mask in the whole ranges, the point, the mean gaps of held-out windows in the
-        plain simulator and at the point (without noise), and the same of every iteration.
+        the parameters, and: the mask of the first iteration, the point, the mean gaps of held-out windows in
+        the plain simulator and at the point (without noise), and the same of every iteration.
 
     Raises:
-        BadInputError: no episode is as long as a window, or nothing that steers has a range.
+        BadInputError: no episode is as long as a window, or no steering parameter has a range.
     """
     config, wide = fitting.settings, fitting.task.varied.wide
     if not isinstance(config, CompassConfig):
@@ -162,7 +162,7 @@ def _varied(box: Variation) -> list[str]:
 
 
 def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str) -> Mask:
-    """Move `search` on by one iteration; return the parameters' mask."""
+    """Make one iteration of `search`; return the mask of the parameters."""
     device, box = fitting.device, search.box
     torch.manual_seed(derive(fitting.seed, f"{name} windows"))
     episode, first = beginnings(fitting.training, config.window)
@@ -172,7 +172,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     gaps = trajectory_gaps(fitting.task, recorded, contexts, noise)
     of_window = gaps.mean(0)
     usual = (of_window <= of_window.quantile(1.0 - config.outlier_share, dim=0)).all(-1)
-    # Windows differ far more in their gaps than parameters make a difference: learn that difference alone.
+    # Gaps differ more between windows than between parameters: subtract each window's mean.
     difference = (gaps - of_window)[:, usual]
     scale = difference.std((0, 1)).clamp_min(1e-9)
     varied = _varied(box)
@@ -199,7 +199,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     points = (search.point, search.point | moved)
     both = torch.stack([parameters_at(point, kind) for point in points]).to(device)
     before, after = (trajectory_gaps(fitting.task, recorded, both, noise)[:, usual] / scale).mean((1, 2))
-    # The model is smooth where the gap has its edge: the simulator has the last word.
+    # The model is smooth where the gap has a kink, so a step is accepted only if replays confirm it.
     if after < before:
         search.point |= moved
     search.narrow(moved, config.shrink)

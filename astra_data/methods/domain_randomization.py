@@ -1,7 +1,7 @@
 """Domain randomization: noise and scaling of the actions (Section V-A, "DR uses action noise … and scaling").
 
-The paper's N(0, 0.05) is read as a standard deviation of 0.05, of commands of ±1; δ is drawn anew for every
-episode. The task has the ranges.
+The paper's N(0, 0.05) is read as a standard deviation of 0.05, on commands of ±1; δ is drawn once per
+episode. The ranges belong to the task.
 """
 
 from astra_data.methods.method import Method, Table

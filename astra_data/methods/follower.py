@@ -1,4 +1,4 @@
-"""Careful hand-written controllers: how well a task can be done (the ceiling)."""
+"""Careful hand-written controllers, which show how well a task can be done (the ceiling)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Act = Callable[[Tensor, Tensor], Tensor]
 
 
 def careful(task: Task, goal: Tensor) -> Act:
-    """Return how to act on abstract states (B, X) for goals (B, G), in episodes that begin with `goal`."""
+    """Return a controller of abstract states (B, X) and goals (B, G), for episodes that start with `goal`."""
     if isinstance(task.objective, Kicking):
         return CarefulKicker().command
     follower = CarefulFollower(task.maze)
@@ -33,7 +33,7 @@ class CarefulFollower:
     """Steer down the distance to the goal, along paths away from the walls, a little below full speed.
 
     Attributes:
-        maze: where. margin: distance from the walls that paths keep where they can, in cells of the maze.
+        maze: the maze. margin: preferred distance of paths from the walls, in cells of the maze.
         speed: of the faster axis, in units of commands.
     """
 
@@ -69,13 +69,13 @@ class CarefulFollower:
 
 @dataclass(frozen=True)
 class CarefulKicker:
-    """Walk to the place behind the ball, around the ball where it is near, from there up to it, and kick.
+    """Walk to a place behind the ball, around the ball where it is in the way, then up to it, and kick.
 
     Attributes:
-        clear_m: distance from the ball on the way around it.
-        cone_rad: it walks up to the ball where the way to it and on to the goal bends by less than this.
-        kick_m: from how near it kicks. brake_m: how far before that it begins to slow down.
-        rolls_m_s: balls that seem slower than this are taken to lie still.
+        clear_m: distance from the ball when walking around it.
+        cone_rad: it approaches the ball where robot, ball and goal are in line to within this angle.
+        kick_m: distance at which it kicks. brake_m: distance before that over which it slows down.
+        rolls_m_s: slower balls count as lying still.
         speed: of the faster axis, in units of commands.
     """
 

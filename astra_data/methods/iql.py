@@ -1,10 +1,10 @@
 """IQL on the target's own episodes, and direct transfer fine-tuned by it (Section V, "IQL" and "DT+IQL").
 
-And what IQL is without its critics: behavior cloning, against which the imitation in `[plus]` is to be held.
-The paper does not say whether the fine-tuning interacts with the target: ours learns from the same recorded
-episodes as every other row. On the Long Maze, after 1500 updates of the critics, the command that they value
-most has a mean cosine with the careful follower's of 0.35; of 0.50 with returns of ten steps; of 0.65 with
-sines and cosines of the position as well; but of 0.41 without those where the critics know the last command.
+And IQL without its critics, which is behavior cloning: the baseline for the imitation in `[plus]`. The paper
+does not say whether the fine-tuning interacts with the target: ours learns from the same recorded episodes as
+every other row. On the Long Maze, after 1500 updates of the critics, the command that they value most has a
+mean cosine with the careful follower's of 0.35; of 0.50 with ten-step returns; of 0.65 with sines and cosines
+of the position as well; but of 0.41 without those where the critics see the previous command.
 """
 
 import copy
@@ -39,7 +39,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
     """Learn by IQL from the target's side of the paired episodes, in no simulator.
 
     Returns:
-        the policy, which begins as `training.initial` where there is one, and the losses every few updates.
+        the policy, initialised from `training.initial` where there is one, and the losses every few updates.
     """
     config, episodes = _config(training), training.episodes
     experience = experience_of(training.task, episodes)
@@ -59,7 +59,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
 
 
 def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
-    """Imitate every recorded action alike, which is IQL at temperature 0; return what it returns."""
+    """Imitate all recorded actions equally, which is IQL at temperature 0; see `learn_from_episodes`."""
     cloning = _config(training).model_copy(update={"temperature": 0.0, "critic_updates": 1})
     return learn_from_episodes(replace(training, settings=cloning))
 
@@ -72,7 +72,7 @@ def _config(training: Training) -> IqlConfig:
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     """Return the target's side of `episodes` as a policy sees it: φ(s_i), goal, actions, rewards.
 
-    The critics also see sines and cosines of the position, where there is one.
+    The critics also see sines and cosines of the position, if the task has one.
     """
     windows = episodes.windows
     features = _position_features(task).to(windows.state.device)
@@ -93,17 +93,17 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
 
 
 def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
-    """Learn to the end, from the checkpoint in the folder if there is one; return the losses."""
+    """Train to the end, resuming from the checkpoint in the folder if there is one; return the losses."""
     logbook = Logbook(training.folder / "checkpoint.safetensors", iql.load_state_dict)
     points, stopwatch = logbook.points, logbook.stopwatch
     while not iql.done:
         losses = iql.iterate()
         if iql.updates % 10 == 0 or iql.done:
-            said = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
-            note = f"{iql.updates / stopwatch.seconds:,.0f} updates/s  {said}"
+            shown = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in losses.items())
+            note = f"{iql.updates / stopwatch.seconds:,.0f} updates/s  {shown}"
             training.progress(iql.updates / iql.total_updates, note)
         if iql.updates % _CHECKPOINT_EVERY == 0 or iql.done:
-            # Nobody acts while learning from records, so there is no success to tell.
+            # Nothing acts in offline training, so there is no success rate.
             points.append({"steps": iql.updates, "success": None, **losses})
             logbook.keep(iql.state_dict())
     return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}

@@ -1,9 +1,9 @@
 """Rapid motor adaptation: infer the simulator's parameters online (Section V-A; after Kumar et al. 2021).
 
-The parameters and their ranges are those that the paper prints for COMPASS, as the task has them. Kumar et
-al.'s policy has no memory; ours has that of every policy of a raw simulator, and differs from domain
-randomization in the parameters that vary and in the extrinsics alone. Without it, a million steps taught it
-nothing on the Long Maze, where others then begin to succeed.
+The parameters and their ranges are those that the paper prints for COMPASS, as far as the task has them.
+Kumar et al.'s policy has no memory; ours has the same memory as every policy of a raw simulator, and differs
+from domain randomization only in the parameters that vary and in the extrinsics. Without it, it learned
+nothing on the Long Maze in a million steps, after which the others begin to succeed.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from astra_data.training.train import InSimulator, PpoTrainConfig, Training, opt
 
 @dataclass(frozen=True)
 class TeacherThenStudent(InSimulator):
-    """Train a teacher by PPO, told the parameters of its simulator, then a student that estimates them."""
+    """Train a teacher by PPO that sees the simulator's parameters, then a student that estimates them."""
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the student, and the teacher's learning curve with the student's as "adaptation"."""

@@ -91,9 +91,12 @@ def test_an_update_is_adams_on_whole_episodes_with_residuals_in_their_deviations
     optimizer, losses = torch.optim.Adam(theirs.parameters(), lr=0.02), []
     for episode in generator(0, "grounding epoch 0").permutation(24).tolist():
         length = 25 if episode == 0 else STEPS
-        columns = (getattr(both.windows, name)[episode, None, :length] for name in ("state", "action"))
+        state, action = (
+            both.windows.state[episode, None, :length],
+            both.windows.action[episode, None, :length],
+        )
         simulated = both.windows.simulated_next[episode, None, :length]
-        corrected, _ = theirs.correct(*columns, simulated, theirs.initial_memory(1))
+        corrected, _ = theirs.correct(state, action, simulated, theirs.initial_memory(1))
         wrong = (corrected - both.windows.next_state[episode, None, :length]) / residual.std(0)
         losses.append(wrong.square().mean())
         optimizer.zero_grad()
