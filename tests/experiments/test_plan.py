@@ -120,7 +120,7 @@ def test_a_new_stage_is_planned_by_what_its_function_takes(
 ) -> None:
     def judge(method: str, *, policy: Path | None, dataset: Path, seed: int, out: Path) -> None: ...
 
-    stages = module.STAGES | {"judge": Stage("judge", judge, "policy", ("pair", "subset", "train"))}
+    stages = vars(module)["STAGES"] | {"judge": Stage("judge", judge, "policy", ("pair", "subset", "train"))}
     monkeypatch.setattr(module, "STAGES", stages)
     recipe = load(tmp_path, fake_recipe, HEAD)
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
