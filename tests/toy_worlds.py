@@ -106,3 +106,16 @@ class Slope(_World):
     def step(self, action: Tensor) -> Step:
         self.state = torch.stack([self.state[:, 0] + 0.02 * self.state[:, 1], self.state[:, 1]], dim=1)
         return self.outcome(torch.zeros(self.num_envs), torch.zeros(self.num_envs, dtype=torch.bool))
+
+
+class EndsAtZero(GoToZero):
+    """As `GoToZero`, but episodes end near 0; `steps` keeps what was returned."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self.steps: list[Step] = []
+
+    def step(self, action: Tensor) -> Step:
+        super().step(action)
+        self.steps.append(self.outcome(-self.state[:, 0].square(), self.state[:, 0].abs() < 0.15))
+        return self.steps[-1]

@@ -41,9 +41,9 @@ class Experiment:
     """A recipe and where its artefacts are.
 
     Attributes:
-        recipe: with everything that it takes from the one that it is based on.
+        recipe: with what it takes from its base.
         path: the recipe's file. folder: of its artefacts.
-        base: the experiment that it is based on, if any.
+        base: the experiment that this one is based on, if any.
     """
 
     recipe: Recipe
@@ -53,7 +53,7 @@ class Experiment:
 
     @cached_property
     def borrowed(self) -> set[str]:
-        """The stages whose artefacts are the base's."""
+        """The stages whose artefacts are taken from the base."""
         if self.base is None:
             return set()
         changed = _differences(self.base.recipe.settings, self.recipe)
@@ -83,7 +83,7 @@ class Experiment:
         """Link the folders of borrowed stages to the base's.
 
         Raises:
-            RecipeError: there are artefacts where a link belongs.
+            RecipeError: a link would replace artefacts.
         """
         for stage in STAGES:
             link = self.folder / stage
@@ -126,7 +126,7 @@ class Experiment:
 
     @property
     def results(self) -> Path:
-        """The folder that its results are published in."""
+        """The folder of published results."""
         return self.path.parent / "results"
 
     @property
@@ -198,7 +198,7 @@ def _reads(row: str, table: str) -> bool:
 
 
 def _stale_stages(changed: set[str]) -> set[str]:
-    """Return the stages that a change of the keys `changed` of a recipe reaches."""
+    """Return the stages that are affected when the keys `changed` of a recipe change."""
     stale: set[str] = set()
     for stage in STAGES:
         sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}

@@ -25,7 +25,7 @@ from astra_data.worlds.registry import TASKS
 from astra_data.worlds.score import Score
 
 WHOLE = 100
-"""Per cent of a dataset that is not swept over."""
+"""Per cent: the size of a dataset that is not swept over."""
 
 
 class SweepConfig(Config):

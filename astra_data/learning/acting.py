@@ -13,7 +13,7 @@ from astra_data.worlds.batched import BatchedEnv, Step
 
 @dataclass(frozen=True)
 class Taken:
-    """A step that was taken.
+    """The outcome of one step of all rows.
 
     Attributes:
         step: its outcome.

@@ -44,7 +44,7 @@ class Descent:
         Args:
             model: its parameters that require gradients are fitted.
             config: settings.
-            checkpoint: the file that `keep` writes; None to write none.
+            checkpoint: the file that `keep` writes; None for none.
             weight_decay: of AdamW.
 
         Raises:
@@ -71,7 +71,7 @@ class Descent:
 
     @property
     def share(self) -> float:
-        """The share of the updates that is done."""
+        """Share of the updates that are done."""
         return self.done / self._config.updates
 
     def update(self, loss: Tensor) -> None:

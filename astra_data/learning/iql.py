@@ -5,8 +5,8 @@ then the policy is extracted by advantage-weighted regression, from windows of c
 recurrent policy learns with its memory. The critics see no history: the recorded random commands are held for
 a while, and critics that know the last command learn little about any other.
 
-Every update seeds torch from (seed, update): a run that resumes from a checkpoint repeats what an
-uninterrupted run would have done.
+Every update seeds torch from (seed, update), so a run resumed from a checkpoint gives the same result as an
+uninterrupted one.
 """
 
 import math
@@ -41,7 +41,7 @@ class IqlConfig(Config):
     critic_learning_rate: Positive = 1e-3
     """Of the critics."""
     target_rate: Share = 0.005
-    """Share by which the slow action values follow, per update."""
+    """Polyak rate of the target action values, per update."""
     expectile: Share = 0.9
     """Expectile of action values that the state value estimates; that of the method's authors for AntMaze."""
     discount: Share = 0.99
@@ -62,7 +62,7 @@ class IqlConfig(Config):
     window: Count = 100
     """Steps per window, in backpropagation through time."""
     burn_in: Number = 20
-    """Steps at the start of a window that only fill the memory; none where the episode begins there."""
+    """Steps at the start of a window that only warm up the memory; none where the episode starts there."""
     learning_rate: Positive = 1e-3
     """Of the policy at the start; falls to zero along a half cosine."""
     temperature: NotNegative = 10.0
@@ -195,12 +195,13 @@ class Iql:
 
 
 def transitions(experience: Experience, config: IqlConfig) -> "TensorDict":
-    """Return steps of `experience` with the return of `config.return_steps` steps and what comes then, (N,).
+    """Return the transitions (N,) of `experience` with n-step returns and the observation n steps later.
 
-    Steps whose return the end of the record cuts short are left out; the end of the task does not cut it.
+    n is `config.return_steps`. Steps with fewer recorded steps after them are left out, unless the task ended
+    there.
 
     Raises:
-        BadInputError: no step is left.
+        BadInputError: there are none.
     """
     from tensordict import TensorDict
 

@@ -11,8 +11,8 @@ from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
 
 
-class Part(Protocol):
-    """A part of a training that is kept in checkpoints, such as a network or an optimiser."""
+class Resumable(Protocol):
+    """What checkpoints of a training hold, such as a network or an optimiser."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that `load_state_dict` needs."""
@@ -36,7 +36,13 @@ class Learner(ABC):
     """
 
     def __init__(
-        self, acting: Acting, parts: Mapping[str, Part], *, total_steps: int, rollout_steps: int, seed: int
+        self,
+        acting: Acting,
+        parts: Mapping[str, Resumable],
+        *,
+        total_steps: int,
+        rollout_steps: int,
+        seed: int,
     ) -> None:
         """Prepare to learn.
 
@@ -65,7 +71,7 @@ class Learner(ABC):
         """Take `rollout_steps` batched steps and learn.
 
         Returns:
-            the figures of `Acting`, and the learner's own.
+            the metrics of `Acting`, and the learner's own.
         """
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
         figures = self._iterate()
@@ -75,7 +81,7 @@ class Learner(ABC):
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
-        """Take `rollout_steps` batched steps and learn; return figures."""
+        """Take `rollout_steps` batched steps and learn; return metrics."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state; see `load_state_dict`."""

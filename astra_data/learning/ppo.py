@@ -1,7 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
 
-One iteration collects a stretch of steps from every environment and makes a few passes over it. Whole
-stretches are kept together, so the same code trains policies with and without memory.
+One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
+rollouts of some environments, so the same code trains policies with and without memory.
 """
 
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ class PpoConfig(Config):
     epochs: Count = 5
     """Passes over the collected steps per iteration."""
     minibatches: Count = 4
-    """Updates per pass; each takes whole stretches of a share of the environments."""
+    """Updates per pass; each takes the whole rollouts of a share of the environments."""
     learning_rate: Positive = 5e-4
     """Learning rate at the start; falls linearly to zero."""
     discount: Share = 0.99
@@ -81,7 +81,7 @@ class Ppo(Learner):
         )
 
     def _iterate(self) -> dict[str, float]:
-        """Collect one stretch and learn from it; return the mean "std" of the actions."""
+        """Collect one rollout and learn from it; return the mean "std" of the actions."""
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * self.share_left
         self._learn(self._collect())

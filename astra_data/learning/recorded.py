@@ -1,4 +1,4 @@
-"""Recorded episodes as a policy would have seen them, to learn from in windows."""
+"""Recorded episodes as a policy would have seen them, drawn as windows of consecutive steps."""
 
 from dataclasses import dataclass
 
@@ -37,8 +37,8 @@ class Recorded:
 def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
     """Draw windows of `length` steps, each step equally likely; from torch's global generator.
 
-    A window that is drawn across an end of its episode is moved inside. Without those, the last steps, where
-    episodes topple, would hardly be seen.
+    A window that is drawn across an end of its episode is shifted inside. Otherwise the last steps, where
+    robots fall, would hardly be seen.
 
     Args:
         lengths: of the episodes, (E,).
@@ -46,8 +46,8 @@ def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor
         length: of each window; at most the longest episode's.
 
     Returns:
-        episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn, (count,
-        length) bool. In an episode shorter than `length`, steps beyond its end are among them.
+        episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn before the
+        shift, (count, length) bool. In episodes shorter than `length` some lie beyond the end.
     """
     length = min(length, int(lengths.max()))
     beginnings = lengths + length - 1

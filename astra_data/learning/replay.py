@@ -1,4 +1,4 @@
-"""The most recent steps of a batched environment, from which windows of steps in a row are drawn."""
+"""A replay buffer of a batched environment, from which windows of consecutive steps are drawn."""
 
 from collections.abc import Mapping
 
@@ -9,10 +9,10 @@ from astra_data.worlds.batched import BatchedEnv
 
 
 class Replay:
-    """The last steps of B environments, row after row, in contiguous tensors."""
+    """A ring buffer of the last steps of B environments, in contiguous tensors."""
 
     def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: torch.device) -> None:
-        """Keep the last `size` steps of `env`, as many of each row, and memories of `memory_size` numbers."""
+        """Hold the last `size` steps of `env`, the same number per row, with memories of `memory_size`."""
         self._rows = size // env.num_envs
         self._added = 0
         place = self._rows, env.num_envs
@@ -23,7 +23,7 @@ class Replay:
             self._columns[name] = torch.empty(place, dtype=torch.bool, device=device)
 
     def __len__(self) -> int:
-        """Steps of each row that are kept."""
+        """Return the number of steps held per row."""
         return min(self._added, self._rows)
 
     def add(self, **step: Tensor) -> None:
@@ -40,12 +40,12 @@ class Replay:
         self._added += 1
 
     def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
-        """Draw windows of `length` steps in a row, and one step more, from torch's global generator.
+        """Draw windows of `length` consecutive steps, plus one, by torch's global generator.
 
         Returns:
-            the columns (count, length + 1, ...), and what can be learned from, (count, length) bool: steps of
-            a known outcome, but for the first `burn_in` of a window, which only fill the memory, as long as
-            no episode has begun in it.
+            the columns (count, length + 1, ...), and which steps to learn from, (count, length) bool: not
+            those at the horizon, whose next observation is not kept, nor the first `burn_in` of a window
+            before an episode starts in it, which only warm up the memory.
         """
         device = self._columns["reward"].device
         oldest = self._added - len(self)

@@ -24,9 +24,9 @@ class RmaConfig(Config):
     """Settings of rapid motor adaptation. The paper prints none; sizes are those of Kumar et al. 2021."""
 
     extrinsics_size: Count = 8
-    """Numbers that the parameters of the simulator are encoded into."""
+    """Size of the encoding of the simulator's parameters."""
     history_length: Annotated[int, Field(ge=SHORTEST_HISTORY)] = 50
-    """Steps that extrinsics are estimated from."""
+    """Steps from which the extrinsics are estimated."""
     adaptation_steps: Count = 500_000
     """Environment steps of phase 2 in all."""
     adaptation_learning_rate: Positive = 1e-3

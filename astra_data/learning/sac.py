@@ -42,9 +42,9 @@ class SacConfig(Config):
     batch_size: Count = 256
     """Steps per update; where the policy has a memory, in as many windows as they make."""
     window: Count = 32
-    """Steps in a row, where the policy has a memory."""
+    """Consecutive steps per window, where the policy has a memory."""
     burn_in: Number = 8
-    """Steps at the start of a window that only fill the memory, until an episode begins."""
+    """Steps at the start of a window that only warm up the memory, until an episode starts."""
     buffer_size: Count = 1_000_000
     """Steps kept for replay, the most recent ones."""
     learning_rate: Positive = 1e-3
@@ -57,7 +57,7 @@ class SacConfig(Config):
     initial_temperature: Positive = 0.2
     """Weight of the entropy in the reward, at the start."""
     target_rate: Share = 0.005
-    """Share by which the target critics follow, per update."""
+    """Polyak rate of the target critics, per update."""
     imitation_weight: NotNegative = 0.0
     """Weight of the mean squared distance from recorded actions in the actor's loss, relative to the size of
     the mean action value, entropy included. 0.4 is that of Fujimoto and Gu (2021), who take the mean of
@@ -100,7 +100,7 @@ class Sac(Learner):
             recorded: episodes to imitate, if any.
 
         Raises:
-            BadInputError: the buffer would hold no window.
+            BadInputError: the buffer is smaller than a window.
         """
         from torchrl.objectives import SoftUpdate
 
@@ -214,7 +214,7 @@ class Sac(Learner):
                 late.data.lerp_(now.data, config.target_rate)
 
     def _distance(self, recorded: Recorded) -> Tensor:
-        """Return the mean squared distance of the policy's actions from recorded ones."""
+        """Return the mean squared distance of the policy's actions from the recorded ones."""
         steps, learned = recorded.windows(self.config.batch_size // self._window, self._window, self._burn_in)
         features = self.policy.remember_sequence(
             steps["observation"],
@@ -258,7 +258,7 @@ class _Policy(nn.Module):
 
 
 class _Critic(nn.Module):
-    """Action values; layer-normalised, which keeps them from diverging at this learning rate."""
+    """Action values; layer normalisation keeps them from diverging at this learning rate."""
 
     def __init__(self, policy: SoftActor) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
 """All methods by name; each file defines one method, or a family of them."""
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import PLUS, base_method
+from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
 from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
@@ -42,6 +42,17 @@ METHODS: dict[str, Method] = {
 def tables() -> dict[str, Table]:
     """Return every table of a recipe that methods read, by its name."""
     return {method.table.name: method.table for method in METHODS.values() if method.table}
+
+
+ROLES: dict[str, str] = {name: method.role for name, method in METHODS.items() if method.role}
+"""What some rows are to the others."""
+
+
+def method_title(row: str) -> str:
+    """Return the title of a row: "astra_plus" is "ASTRA+"."""
+    base = base_method(row)
+    title = METHODS[base].title if base in METHODS else base.replace("_", " ").capitalize()
+    return f"{title}+" if is_plus(row) else title
 
 
 def method_named(row: str) -> Method:

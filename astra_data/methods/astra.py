@@ -23,7 +23,7 @@ ASTRA_WITHOUT_LATENT = replace(
     fit=HistoryFit(latent=False, reward=True),
     aligns=False,
 )
-"""Table II, "w/o dynamics". P_lat is not trained, so there is nothing to align by: ψ^s is deployed."""
+"""Table II, "w/o dynamics". P_lat is not trained, so no target encoder can be aligned: ψ^s is deployed."""
 
 ASTRA_WITHOUT_REWARD = replace(
     ASTRA,
@@ -43,4 +43,4 @@ ASTRA_TASK_REWARD = replace(
     learn=InSimulator(reward="abstract"),
     grounded_as="astra",
 )
-"""The grounding of ASTRA; the policy learns from the task's own reward on corrected states."""
+"""ASTRA's grounding; the policy is trained with the task's own reward on corrected states."""

@@ -29,8 +29,8 @@ from astra_data.training.train import InSimulator
 from astra_data.worlds.variation import AnyVariation, Variation
 
 Mask = dict[str, dict[str, float]]
-"""How probably each parameter reaches each gap, by their names. Gaps, the effects, are means over a window of
-the distance between the simulator and the target in each of the task's quantities."""
+"""The probability that each parameter affects each gap, by their names. A gap is the mean over a window of
+the distance between simulator and target in one of the task's quantities."""
 
 
 class CompassConfig(AnyVariation, CausalConfig):
@@ -43,7 +43,7 @@ class CompassConfig(AnyVariation, CausalConfig):
     iterations: Count = 5
     """Replays, each followed by a fit of the causal model and a step of the parameters."""
     contexts: Annotated[int, Field(ge=2)] = 128
-    """Sets of parameters that every window is replayed with, per iteration."""
+    """Parameter sets with which every window is replayed, per iteration."""
     windows: Annotated[int, Field(ge=10)] = 500
     """Windows per iteration."""
     window: Count = 25
@@ -53,13 +53,12 @@ class CompassConfig(AnyVariation, CausalConfig):
     shrink: Annotated[float, Field(gt=0, lt=1)] = 0.6
     """Factor on the ranges of the parameters that moved, after each iteration."""
     policy_at: Literal["point", "around"] = "point"
-    """Train the policy at the point that was found, as the authors do, where what was not identified is as in
-    the plain simulator; or around it, with parameters from the last ranges, which are still the whole ranges
-    of what was not identified."""
+    """"point": train the policy at the identified parameters, as the authors do. "around": draw them
+    from the last, narrowed ranges, which are still the whole ranges of those that were not identified."""
 
 
 def parameters_at(point: Mapping[str, float], kind: type[Variation]) -> Tensor:
-    """Return the parameters (P,) of a simulator without noise that is plain but for `point`."""
+    """Return parameters (P,) with the values in `point`, and otherwise those of the plain simulator."""
     return kind(**{name: (value, value) for name, value in point.items()}).ranges()[:, 0]
 
 
@@ -117,8 +116,8 @@ def identify(fitting: Fitting) -> tuple[IdentifiedParameters, dict[str, Any]]:
     parameters that matter to the predicted minimum, and shrinks the box around them.
 
     Returns:
-        the parameters, and: the mask in the whole ranges, the point, the mean gaps of held-out windows in the
-        plain simulator and at the point (without noise), and the same of every iteration.
+        the parameters, and: the mask of the first iteration, the point, the mean gaps of held-out windows in
+        the plain simulator and at the point (without noise), and the same of every iteration.
 
     Raises:
         BadInputError: no episode is as long as a window, or no steering parameter has a range.

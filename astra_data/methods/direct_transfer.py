@@ -1,4 +1,4 @@
-"""Direct transfer: a recurrent policy trained in the raw simulator and deployed as it is (the floor)."""
+"""Direct transfer: a recurrent policy trained in the raw simulator and deployed unchanged (the floor)."""
 
 from astra_data.methods.method import Method
 

@@ -1,4 +1,4 @@
-"""Careful hand-written controllers: how well a task can be done (the ceiling)."""
+"""Careful hand-written controllers, which show how well a task can be done (the ceiling)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

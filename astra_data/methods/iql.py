@@ -72,7 +72,7 @@ def _config(training: Training) -> IqlConfig:
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     """Return the target's side of `episodes` as a policy sees it: φ(s_i), goal, actions, rewards.
 
-    The critics also see sines and cosines of the position, where there is one.
+    The critics also see sines and cosines of the position, if the task has one.
     """
     windows = episodes.windows
     features = _position_features(task).to(windows.state.device)
@@ -93,7 +93,7 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
 
 
 def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
-    """Learn to the end, from the checkpoint in the folder if there is one; return the losses."""
+    """Train to the end, resuming from the checkpoint in the folder if there is one; return the losses."""
     logbook = Logbook(training.folder / "checkpoint.safetensors", iql.load_state_dict)
     points, stopwatch = logbook.points, logbook.stopwatch
     while not iql.done:

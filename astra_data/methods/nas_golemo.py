@@ -1,4 +1,4 @@
-"""NAS as Golemo et al. (2018) built it: an LSTM that adds to each simulated state what it lacks.
+"""NAS as Golemo et al. (2018) built it: an LSTM that predicts the residual of each simulated state.
 
 The policy sees no latent, so it has a memory of its own; its reward is the task's own on corrected states.
 """
@@ -35,7 +35,7 @@ class GolemoConfig(Config):
 def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:
     """Fit the residual model to whole episodes; return it and its telemetry.
 
-    The squared error is of residuals divided by their deviation in the training episodes.
+    The loss is the squared error of residuals divided by their deviation in the training episodes.
     """
     config = fitting.settings if isinstance(fitting.settings, GolemoConfig) else GolemoConfig()
     training, windows = fitting.training, fitting.training.windows
@@ -57,11 +57,11 @@ def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> d
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     episodes, count = fitting.training, len(fitting.training)
 
-    def go_on(state: dict[str, Any]) -> None:
+    def restore(state: dict[str, Any]) -> None:
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
 
-    logbook = Logbook(fitting.folder / "checkpoint.safetensors", go_on)
+    logbook = Logbook(fitting.folder / "checkpoint.safetensors", restore)
     points, stopwatch = logbook.points, logbook.stopwatch
     for epoch in range(len(points), config.epochs):
         order = generator(fitting.seed, f"grounding epoch {epoch}").permutation(count)
@@ -85,7 +85,7 @@ def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> d
 
 
 def _update(model: ResidualModel, optimizer: torch.optim.Optimizer, episode: PairedEpisodes) -> float:
-    """Learn from one episode; return the loss."""
+    """Make one update on an episode; return the loss."""
     steps, windows = slice(int(episode.lengths)), episode.windows
     corrected, _ = model.correct(
         windows.state[:, steps],
@@ -102,7 +102,7 @@ def _update(model: ResidualModel, optimizer: torch.optim.Optimizer, episode: Pai
 
 @torch.no_grad()
 def _corrected(model: ResidualModel, episodes: PairedEpisodes) -> torch.Tensor:
-    """Return the corrected next states (E, T, X) along the true ones."""
+    """Return the corrected next states (E, T, X), each one step from the true state."""
     windows = episodes.windows
     memory = model.initial_memory(len(episodes))
     return model.correct(windows.state, windows.action, windows.simulated_next, memory)[0]

@@ -5,6 +5,7 @@ from functools import reduce
 from typing import Any
 
 from astra_data.core.errors import BadInputError
+from astra_data.methods import method_title
 from astra_data.reports.comparing import improvement, summarised, validity
 from astra_data.reports.figures import method_title
 from astra_data.reports.origins import dataset_uses, merged_origins

@@ -23,6 +23,9 @@ from astra_data.reports.statistics import REPLICATES
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 
+if TYPE_CHECKING:
+    from astra_data.reports.drawing import Camera
+
 
 class ReportConfig(Config):
     """Settings of the report."""
@@ -90,6 +93,9 @@ def report(
             seeds.
         BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
+    from astra_data.reports.drawing import figure_of_sizes, figures_of
+    from astra_data.reports.figures import dynamics_mismatch, png
+
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
     known = {} if add_to is None else by_size(read_published(add_to))
@@ -144,7 +150,9 @@ def report(
     progress(1.0, _headline(sizes[-1]))
 
 
-def _camera(task: Task) -> Camera | None:
+def _camera(task: Task) -> "Camera | None":
+    from astra_data.reports.drawing import Camera
+
     if task.photograph is None:
         return None
     return Camera(task.photograph, task.timestep_s, task.objective.horizon * task.timestep_s)

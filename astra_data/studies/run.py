@@ -9,8 +9,6 @@ import torch
 from astra_data.core.config import load_recipe, load_tables
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.display import shown
-from astra_data.reports.figures import png
-from astra_data.studies.page import figure, render
 from astra_data.studies.recordings import place_name, read_recordings
 from astra_data.studies.study import GapRecipe, run_study
 
@@ -65,6 +63,9 @@ def measure_gap(
         RecipeError: the recipe has faults.
         BadInputError: there are no usable recordings, or the folder holds results of other settings.
     """
+    from astra_data.reports.figures import png
+    from astra_data.studies.page import figure, render
+
     recipe = load_gap_recipe(recipe_path)
     unknown = sorted(set(seeds) - set(recipe.seeds))
     if unknown:

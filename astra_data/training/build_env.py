@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from pydantic import ConfigDict, Field, model_validator
 from scipy.ndimage import gaussian_filter

@@ -280,6 +280,7 @@ def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_
 
 def test_recipes_are_read_without_what_only_trainings_and_tables_need() -> None:
     code = (
-        "import sys, astra_data.experiments.experiment; assert not {'torchrl', 'rliable'} & set(sys.modules)"
+        "import sys, astra_data.experiments.run, astra_data.studies.run; "
+        "assert not {'torchrl', 'rliable', 'matplotlib', 'gymnasium'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

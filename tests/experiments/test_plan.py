@@ -6,9 +6,11 @@ from fake_stages import FakeConfig
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
+from astra_data.experiments import plan as module
 from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
+from astra_data.stages.registry import Stage
 
 HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
 
@@ -111,6 +113,44 @@ def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_re
     assert items["collect/seed_7"].call.keywords["config"].episodes == 300  # type: ignore[attr-defined]
     options = "--method astra --seed 7 --percent 50"
     assert items["report"].call.keywords["command"].endswith(f"r.toml {options}")  # type: ignore[attr-defined]
+
+
+def test_a_new_stage_is_planned_by_what_its_function_takes(
+    tmp_path: Path, fake_recipe: type[Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def judge(method: str, *, policy: Path | None, dataset: Path, seed: int, out: Path) -> None: ...
+
+    stages = vars(module)["STAGES"] | {"judge": Stage("judge", judge, "policy", ("pair", "subset", "train"))}
+    monkeypatch.setattr(module, "STAGES", stages)
+    recipe = load(tmp_path, fake_recipe, HEAD)
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    item = items["judge/astra_plus/seed_7"]
+    assert item.inputs == ("train/astra_plus/seed_7", "pair/seed_7")
+    assert item.call.keywords == {  # type: ignore[attr-defined]
+        "method": "astra_plus",
+        "policy": tmp_path / "train/astra_plus/seed_7",
+        "dataset": tmp_path / "pair/seed_7",
+        "seed": 7,
+        "out": tmp_path / "judge/astra_plus/seed_7",
+    }
+    assert "judge/follower/seed_7" not in items and not item.is_threaded
+
+
+def test_who_steps_the_target_gets_threads_and_networks_a_device(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = HEAD.replace('"astra_plus"', '"target"')
+    recipe = load(tmp_path, fake_recipe, text)
+    items = plan(recipe, tmp_path / "r.toml", tmp_path, device="cuda")
+    threaded = {
+        item.key.removesuffix("/seed_0") for item in items if item.is_threaded and "seed_0" in item.key
+    }
+    rows = ("follower", "direct_transfer", "astra", "target")
+    assert threaded == {"collect", "train/target", *(f"evaluate/{row}" for row in rows)}
+    on_device = {module.stage_of(item) for item in items if item.device == "cuda"}
+    assert on_device == {"ground", "train", "align"}
+    settings = {item.key: item.call.keywords.get("settings") for item in items}  # type: ignore[attr-defined]
+    assert settings["train/target/seed_0"] is not None and settings["train/astra/seed_0"] is None
 
 
 def test_every_artefact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:

@@ -3,10 +3,15 @@ from typing import Any
 
 import pytest
 
-from astra_data.core.config import validated
+from astra_data.core.config import Config, validated
 from astra_data.core.errors import RecipeError
-from astra_data.experiments.recipe import Recipe
+from astra_data.experiments.recipe import Recipe, with_tables
+from astra_data.learning.iql import FINE_TUNING, IqlConfig
+from astra_data.methods.method import Table
+from astra_data.methods.nas_golemo import GolemoConfig
+from astra_data.stages.registry import STAGES
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig
+from astra_data.training.train_in_target import TargetConfig
 
 BASE = {
     "task": "humanoid-walker2d",
@@ -47,6 +52,46 @@ def test_rows_that_predict_no_reward_are_not_trained_with_it() -> None:
     for row, trained in {"nas": "nas", "direct_transfer_iql": "direct_transfer"}.items():
         with pytest.raises(RecipeError, match=rf"train\.reward: {trained} predicts none"):
             read(**tables | {"methods": ["astra", row]}, train=predicted)
+
+
+class MyConfig(Config):
+    rate: float = 0.5
+
+
+def test_the_table_of_a_new_method_is_read() -> None:
+    tables = [Table("mine", MyConfig), Table("yours", MyConfig, default=MyConfig(rate=2.0))]
+    model = with_tables(Recipe, STAGES.values(), tables)
+    recipe = validated(BASE | {"mine": {"rate": 0.7}}, model, "r.toml")
+    assert recipe.mine == MyConfig(rate=0.7) and recipe.yours == MyConfig(rate=2.0)
+    with pytest.raises(RecipeError, match=r"mine\.rat: unknown key: did you mean 'rate'"):
+        validated(BASE | {"mine": {"rat": 0.7}}, model, "r.toml")
+
+
+def test_settings_are_those_of_the_rows_method_for_the_stage_that_takes_them() -> None:
+    rows = ["iql", "behavior_cloning", "direct_transfer_iql", "nas_golemo", "target", "full_obs", "astra"]
+    recipe = read(methods=rows, iql={"batch_windows": 5}, nas_golemo={"epochs": 2}, target={"num_envs": 3})
+    assert recipe.settings_of("iql", "train") == IqlConfig(batch_windows=5)
+    assert recipe.settings_of("behavior_cloning", "train") == IqlConfig(batch_windows=5)
+    assert recipe.settings_of("direct_transfer_iql", "train") == FINE_TUNING
+    assert recipe.settings_of("nas_golemo", "ground") == GolemoConfig(epochs=2)
+    assert recipe.settings_of("nas_golemo_plus", "train") is None
+    assert recipe.settings_of("full_obs", "train") == TargetConfig(num_envs=3)
+    assert recipe.settings_of("target", "ground") is recipe.settings_of("astra", "train") is None
+
+
+def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
+    recipe = read(
+        train={"num_envs": 8},
+        plus={"num_envs": 4},
+        collect={"start": "task", "episodes": 40},
+        sweep={"percent": [50]},
+    )
+    assert recipe.config_of("train", "astra").num_envs == 8  # type: ignore[union-attr]
+    assert recipe.config_of("train", "astra_plus").num_envs == 4  # type: ignore[union-attr]
+    assert recipe.config_of("evaluate", "astra_plus") == recipe.evaluate
+    # What is collected is the largest size.
+    assert recipe.config_of("collect").episodes == 20  # type: ignore[union-attr]
+    assert recipe.config_of("subset") is None
 
 
 @pytest.mark.parametrize(

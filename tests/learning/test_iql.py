@@ -3,10 +3,12 @@ from typing import Any
 import pytest
 import torch
 from pydantic import ValidationError
+from tensordict import TensorDict
 from torch import Tensor
 
 from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import derive
 from astra_data.learning.iql import Experience, Iql, IqlConfig, transitions
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.policy import Policy
@@ -140,6 +142,47 @@ def test_returns_are_those_of_a_plain_loop() -> None:
             assert bool(got["next", "terminated"]) == bool(experience.terminated[episode, end - 1])
             row += 1
     assert row == len(table)
+
+
+def test_updates_are_those_of_the_printed_losses() -> None:
+    """Kostrikov et al. (2022): expectile regression, then advantage-weighted regression."""
+    settings = config(
+        expectile=0.8,
+        temperature=3.0,
+        critic_updates=1,
+        policy_updates=1,
+        gradient_norm=1e-3,
+        reward_scale=9.0,
+    )
+    experience = walks()
+    iql = learner(experience, settings)
+
+    def advantage(observation: Tensor, action: Tensor) -> Tensor:
+        loss, seen = iql._loss, {"observation": observation, "action": action}
+        values = []
+        for index in range(2):
+            with torch.no_grad(), loss.target_qvalue_network_params[index].to_module(loss.qvalue_network):
+                batch = TensorDict(seen, batch_size=observation.shape[:-1])
+                values.append(loss.qvalue_network(batch)["state_action_value"].squeeze(-1))
+        return torch.minimum(*values) - iql.values(observation)
+
+    table = transitions(experience, settings)
+    torch.manual_seed(derive(2, "update 0"))
+    batch = table[torch.randint(len(table), (256,))]
+    ahead = advantage(batch["observation"], batch["action"])
+    assert (ahead > 0).any() and (ahead < 0).any()
+    expected = torch.where(ahead > 0, 0.8, 0.2) * ahead.square()
+    assert iql.iterate()["value"] == pytest.approx(float(expected.mean()), rel=1e-4)
+    torch.manual_seed(derive(2, "update 1"))
+    columns, learned = experience.windows(16, 16, 4)
+    weight = (3.0 * advantage(columns["observation"], columns["action"])).exp().clamp_max(100.0)
+    with torch.no_grad():
+        normal = torch.distributions.Normal(*iql.policy.policy(columns["observation"]))
+        log_prob = normal.log_prob(columns["action"]).sum(-1)
+    expected = -(weight * log_prob)[learned].mean()
+    assert iql.iterate()["policy"] == pytest.approx(float(expected), rel=1e-4)
+    gradients = [parameter.grad.flatten() for parameter in iql._actor if parameter.grad is not None]
+    assert float(torch.cat(gradients).norm()) == pytest.approx(1e-3, rel=1e-2)
 
 
 def test_settings_and_episodes_that_leave_nothing_to_learn_from_are_told() -> None:

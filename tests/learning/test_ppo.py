@@ -1,10 +1,12 @@
+import copy
 import math
 from statistics import fmean
 from typing import Any
 
 import pytest
 import torch
-from toy_worlds import ConstantReward, GoToZero, Recall
+from torch import Tensor
+from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
 from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
@@ -85,6 +87,110 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(terminates_after: fl
     with torch.no_grad():
         value = float(learner.policy.value(torch.ones(1, 1)))
     assert value == pytest.approx(expected, rel=0.12)
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_advantages_are_those_of_a_plain_loop(memory: int) -> None:
+    env = EndsAtZero(32)
+    learner = ppo(env, 3, horizon=5, memory=memory, discount=0.9, gae_lambda=0.8, reward_scale=0.5)
+    learner.iterate()  # from here on, memories and actions go on from the last stretch
+    env.steps.clear()
+    policy, acting = learner.policy, learner.acting
+    hidden, previous = acting.hidden.clone(), acting.previous_action.clone()
+    torch.manual_seed(3)
+    rollout = learner._collect()
+    assert torch.equal(rollout["hidden"], hidden)
+    done, terminated = rollout["done"], rollout["terminated"]
+    ends = done.nonzero()
+    assert terminated.any() and (done & ~terminated).any() and len(ends) > 64
+    value, after = torch.zeros(2, 32, 16)
+    with torch.no_grad():
+        for step in range(16):
+            assert torch.equal(rollout["previous_action"][:, step], previous)
+            features, hidden = policy.remember(rollout["observation"][:, step], previous, hidden)
+            action = rollout["action"][:, step]
+            mean, std = policy.policy(features)
+            log_prob = -((action - mean) / std).square() / 2 - std.log() - math.log(2 * math.pi) / 2
+            torch.testing.assert_close(rollout["action_log_prob"][:, step], log_prob.sum(-1))
+            value[:, step] = policy.value(features)
+            executed = action.clamp(-1.0, 1.0)
+            beyond, _ = policy.remember(env.steps[step].observation, executed, hidden)
+            after[:, step] = policy.value(beyond)
+            going = (~done[:, step]).float().unsqueeze(-1)
+            hidden, previous = hidden * going, executed * going
+    advantage = torch.zeros(32, 17)
+    for step in reversed(range(16)):
+        reward = 0.5 * env.steps[step].reward
+        wrong = reward + 0.9 * after[:, step] * ~env.steps[step].terminated - value[:, step]
+        advantage[:, step] = wrong + 0.9 * 0.8 * advantage[:, step + 1] * ~done[:, step]
+    torch.testing.assert_close(rollout["value"], value)
+    torch.testing.assert_close(rollout["advantage"].squeeze(-1), advantage[:, :-1], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(
+        rollout["value_target"].squeeze(-1), advantage[:, :-1] + value, atol=1e-5, rtol=1e-4
+    )
+
+
+def test_an_update_is_that_of_the_printed_loss() -> None:
+    settings: dict[str, Any] = {
+        "epochs": 3,
+        "minibatches": 1,
+        "clip": 0.05,
+        "entropy_weight": 0.02,
+        "value_weight": 0.7,
+    }
+    learner = ppo(EndsAtZero(32), 3, horizon=5, gradient_norm=0.3, **settings)
+    ours, theirs = learner.policy, copy.deepcopy(learner.policy)
+    rollout = learner._collect()
+    kept = {name: values.clone() for name, values in rollout.items()}
+    learner._learn(rollout)
+    optimizer = torch.optim.Adam(theirs.parameters(), lr=3e-3, eps=1e-5)
+    target = kept["value_target"].squeeze(-1)
+    advantage = (kept["advantage"].squeeze(-1) - kept["advantage"].mean()) / kept["advantage"].std()
+    for epoch in range(3):
+        mean, std = theirs.policy(kept["observation"])
+        normal = torch.distributions.Normal(mean, std)
+        ratio = (normal.log_prob(kept["action"]).sum(-1) - kept["action_log_prob"]).exp()
+        clipped = ratio.clamp(0.95, 1.05)
+        assert epoch == 0 or ((ratio - clipped).abs() > 0).any()
+        gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
+        wrong = (theirs.value(kept["observation"]) - target).square().mean()
+        loss = 0.7 * wrong - gain - 0.02 * normal.entropy().sum(-1).mean()
+        gradients = torch.autograd.grad(loss, list(theirs.parameters()))
+        norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        assert norm > 0.3
+        for parameter, gradient in zip(theirs.parameters(), gradients, strict=True):
+            parameter.grad = gradient * 0.3 / norm
+        optimizer.step()
+    for name, value in ours.state_dict().items():
+        torch.testing.assert_close(value, theirs.state_dict()[name], atol=1e-5, rtol=1e-3, msg=name)
+
+
+def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
+    learner = ppo(GoToZero(4), 4, horizon=5)
+    rates = []
+    while not learner.done:
+        learner.iterate()
+        rates.append(learner._optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([3e-3 * left for left in (1.0, 0.75, 0.5, 0.25)])
+
+
+def test_an_epoch_learns_from_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = ppo(GoToZero(10), 1, horizon=5, epochs=2, minibatches=4, memory=2)
+    rollout = learner._collect()
+    starts = rollout["observation"][:, 0, 0]
+    learned: list[list[int]] = []
+    remember = learner.policy.remember_sequence
+
+    def watched(observation: Tensor, *rest: Tensor) -> Tensor:
+        learned.append([int((starts == start).nonzero()) for start in observation[:, 0, 0]])
+        return remember(observation, *rest)
+
+    monkeypatch.setattr(learner.policy, "remember_sequence", watched)
+    learner._learn(rollout)
+    assert [len(rows) for rows in learned] == [3, 3, 3, 1] * 2
+    for epoch in (learned[:4], learned[4:]):
+        assert sorted(row for rows in epoch for row in rows) == list(range(10))
+    assert learned[:4] != learned[4:]
 
 
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:

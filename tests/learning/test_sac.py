@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from toy_worlds import ConstantReward, GoToZero, Recall
+from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
 from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.core.errors import BadInputError
@@ -213,6 +213,124 @@ def _memory_of(learner: Sac, which: str) -> list[torch.Tensor]:
     memory = learner._memory if which == "now" else learner._late_memory
     assert memory is not None
     return [values.detach().clone() for values in memory.parameters()]
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Haarnoja et al. (2018), by hand from the windows that were drawn."""
+    settings: dict[str, Any] = {"window": 6, "burn_in": 2, "batch_size": 512, "initial_temperature": 0.4}
+    learner = sac(EndsAtZero(8), 60, horizon=9, memory=memory, reward_scale=3.0, target_rate=0.3, **settings)
+    for _ in range(3):
+        learner.iterate()
+    loss, policy, replay = learner._loss, learner.policy, learner._replay
+    drawn: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []
+    draw = replay.windows
+
+    def windows(count: int, length: int, burn_in: int) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        drawn.append(draw(count, length, burn_in))
+        return drawn[-1]
+
+    monkeypatch.setattr(replay, "windows", windows)
+    losses: dict[str, torch.Tensor] = {}
+    memories = [] if learner._memory is None else list(learner._memory.parameters())
+    gradients: dict[str, Any] = {}
+
+    def seeded(name: str) -> None:
+        original = getattr(loss, name)
+
+        def compute(batch: Any) -> Any:  # noqa: ANN401
+            torch.manual_seed(11)
+            found = original(batch)
+            losses[name] = found[0].detach()
+            if memories and name == "qvalue_v2_loss":
+                gradients["critics"] = torch.autograd.grad(found[0], memories, retain_graph=True)
+            if name == "actor_loss":
+                losses["log_prob"] = found[1]["log_prob"].detach()
+            return found
+
+        monkeypatch.setattr(loss, name, compute)
+
+    seeded("qvalue_v2_loss")
+    seeded("actor_loss")
+    before = copy.deepcopy((policy, learner._memory, learner._late_memory))
+    online, slow = (
+        [
+            {name: value.detach().clone() for name, value in params[index].items(True, True)}
+            for index in range(2)
+        ]
+        for params in (loss.qvalue_network_params, loss.target_qvalue_network_params)
+    )
+    temperature = float(loss.log_alpha.detach().exp())
+    learner._learn()
+    (steps, learned) = drawn[0]
+    actor, memory_now, memory_late = before
+    seen = steps["observation"], steps["previous_action"]
+    first, nothing = steps["first"].float(), actor.initial_hidden(len(learned))
+
+    def action_values(critics: list[Any], features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        values = []
+        for critic in critics:
+            hidden = torch.cat([features, action], dim=-1)
+            layers = sorted({int(name[2]) for name in critic})
+            for layer in layers[:-1:2]:
+                hidden = hidden @ critic["module", "network", str(layer), "weight"].T
+                hidden = hidden + critic["module", "network", str(layer), "bias"]
+                hidden = (hidden - hidden.mean(-1, keepdim=True)) / (
+                    hidden.var(-1, correction=0, keepdim=True) + 1e-5
+                ).sqrt()
+                hidden = hidden * critic["module", "network", str(layer + 1), "weight"]
+                hidden = torch.relu(hidden + critic["module", "network", str(layer + 1), "bias"])
+            last = critic["module", "network", str(layers[-1]), "weight"]
+            values.append((hidden @ last.T)[..., 0] + critic["module", "network", str(layers[-1]), "bias"])
+        return torch.stack(values)
+
+    def squashed(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        torch.manual_seed(11)
+        normal = torch.distributions.Normal(*actor.policy(features))
+        raw = normal.rsample()
+        return torch.tanh(raw), (normal.log_prob(raw) - torch.log(1.0 - torch.tanh(raw).square())).sum(-1)
+
+    with torch.no_grad():
+        acting = actor.remember_sequence(*seen, steps["hidden"][:, 0], first)
+        judging = features_of(memory_now, *seen, nothing, first)
+        late = features_of(memory_late, *seen, nothing, first)
+        following, log_prob = squashed(acting[:, 1:][learned])
+        beyond = action_values(slow, late[:, 1:][learned], following).amin(0) - temperature * log_prob
+        over, reward = steps["terminated"][:, :-1][learned], steps["reward"][:, :-1][learned]
+        assert over.any() and not over.all()
+        within = learned & ~steps["first"][:, 1:]
+        shown = steps["observation"][:, 1:, 0][within]
+        torch.testing.assert_close(steps["reward"][:, :-1][within], -3.0 * shown.square())
+        target = reward + 0.9 * ~over * beyond
+        given = action_values(online, judging[:, :-1][learned], steps["action"][:, :-1][learned])
+        torch.testing.assert_close(
+            losses["qvalue_v2_loss"], (given - target).square().sum(0).mean(), rtol=1e-4, atol=1e-4
+        )
+        action, log_prob = squashed(acting[:, :-1][learned])
+        worst = action_values(online, judging[:, :-1][learned], action).amin(0)
+        torch.testing.assert_close(
+            losses["actor_loss"], (temperature * log_prob - worst).mean(), rtol=1e-4, atol=1e-4
+        )
+    # The temperature rises where actions are less random than one unit of entropy per dimension below 0.
+    assert loss.log_alpha.grad is not None
+    torch.testing.assert_close(
+        loss.log_alpha.grad, -(losses["log_prob"].mean() - 1.0).reshape(loss.log_alpha.shape)
+    )
+    # The critics' memory learns from their loss alone.
+    for parameter, gradient in zip(memories, gradients.get("critics", []), strict=True):
+        torch.testing.assert_close(parameter.grad, gradient)
+    for index in range(2):
+        now = {n: v.detach() for n, v in loss.qvalue_network_params[index].items(True, True)}
+        for name, value in loss.target_qvalue_network_params[index].items(True, True):
+            torch.testing.assert_close(value, 0.7 * slow[index][name] + 0.3 * now[name])
+
+
+def test_it_learns_so_often_after_each_step_that_a_window_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = sac(GoToZero(8), 20, horizon=9, memory=4, window=4, burn_in=1, updates_per_step=3)
+    at: list[int] = []
+    monkeypatch.setattr(learner, "_learn", lambda: at.append(len(learner._replay)))
+    learner.iterate()
+    assert at == [kept for kept in range(5, 11) for _ in range(3)]
 
 
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:

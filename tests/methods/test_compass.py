@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from spending import SPENT, spend
+from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.core.config import Config, load_recipe, validated
@@ -15,7 +16,9 @@ from astra_data.experiments.plan import plan
 from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.methods.compass import CompassConfig, identify
+from astra_data.learning.networks.causal import CausalConfig, CausalModel, fit_causes
+from astra_data.methods import compass
+from astra_data.methods.compass import CompassConfig, Search, identify
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import WIDE_RANGES, PlanarVariation, Variation
@@ -140,6 +143,76 @@ def test_after_an_interruption_it_goes_on(tmp_path: Path) -> None:
     assert metrics["iterations"] == expected["iterations"]
     assert all(seconds < metrics[clock] < seconds + 500 for clock, seconds in SPENT.items())
     assert metrics["replays_per_second"] == pytest.approx(4 * 8 * 60 / metrics["wall_seconds"], rel=0.01)
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_the_point_moves_only_to_where_replays_come_closer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, better: bool
+) -> None:
+    """Whatever the causal model expects: here it is asked for the planted parameters, or for the corner."""
+    steering = {"friction": 0.92, "action_scale": 0.05, "timestep_scale": 1.1, "heading_bias_deg": 3.0}
+    plain = {"friction": 1.0, "action_scale": 0.0, "timestep_scale": 1.0, "heading_bias_deg": 0.0}
+    names = [name for name in QUICK.of_kind(PlanarVariation).names if name in _varied(QUICK)]
+
+    def answer(model: object, mask: object, start: Tensor, moves: Tensor, others: object) -> Tensor:
+        assert [name for name, moving in zip(names, moves, strict=True) if moving] == [
+            name for name in names if name in steering
+        ]
+        there = torch.full_like(start, -1.0)
+        for index, name in enumerate(names):
+            if better and name in steering:
+                low, high = getattr(QUICK, name)
+                there[index] = 2 * (steering[name] - low) / (high - low) - 1
+        return there
+
+    monkeypatch.setattr(compass, "descend", answer)
+    settings = QUICK.model_copy(update={"contexts": 4, "updates": 5, "iterations": 1, "mask_threshold": 0.0})
+    _, metrics = identify(fitting(tmp_path, settings))
+    assert metrics["point"] == pytest.approx(steering if better else plain, abs=1e-5)
+
+
+def _varied(settings: CompassConfig) -> list[str]:
+    return [
+        name for name, (low, high) in settings.of_kind(PlanarVariation).model_dump().items() if low < high
+    ]
+
+
+def test_the_box_is_drawn_in_around_the_point(tmp_path: Path) -> None:
+    search = Search.begin(
+        PlanarVariation(friction=(0.9, 1.3), heading_bias_deg=(2.0, 10.0)), tmp_path / "none"
+    )
+    # From the plain simulator, or the end of the range that is next to it.
+    assert search.point["friction"] == 1.0 and search.point["heading_bias_deg"] == 2.0
+    search.narrow(["friction", "heading_bias_deg"], 0.5)
+    assert search.box.model_dump()["friction"] == pytest.approx((0.9, 1.1))
+    assert search.box.model_dump()["heading_bias_deg"] == pytest.approx((2.0, 4.0))
+    assert search.box.model_dump()["timestep_scale"] == (1.0, 1.0)
+
+
+def test_windows_with_the_largest_gaps_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = QUICK.model_copy(
+        update={"contexts": 4, "updates": 5, "iterations": 1, "windows": 40, "outlier_share": 0.1}
+    )
+    told: list[tuple[Tensor, Tensor]] = []
+
+    def fit(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalised: int) -> CausalModel:
+        told.append((cause, effect))
+        assert penalised == 6
+        return fit_causes(cause, effect, config, penalised=penalised)
+
+    monkeypatch.setattr(compass, "fit_causes", fit)
+    identify(fitting(tmp_path, settings))
+    cause, effect = told[0]
+    # 4 of 40 in each of two quantities at most, in each of four contexts.
+    assert 4 * 32 <= len(effect) <= 4 * 36
+    assert cause.shape[1] == 6 + 2 + 2  # parameters; first velocity and mean command
+    # What is to be explained is what the parameters change, of deviation 1 in each quantity.
+    windows = effect.view(4, -1, 2)
+    torch.testing.assert_close(effect.std(0), torch.ones(2), rtol=1e-3, atol=1e-3)
+    assert windows.mean(0).abs().max() < 1e-4
+    # Parameters are the same in all windows of a context, and windows in all contexts.
+    causes = cause.view(4, -1, 10)
+    assert (causes[..., :6] == causes[:, :1, :6]).all() and (causes[..., 6:] == causes[:1, :, 6:]).all()
 
 
 def test_around_the_point_is_within_the_ranges(

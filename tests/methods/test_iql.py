@@ -152,6 +152,13 @@ def test_cloning_does_what_was_recorded_whatever_it_paid(
     assert mean[learn_from_episodes] > recorded + 0.3
 
 
+def test_cloning_is_iql_at_temperature_zero(learn: Learn, tmp_path: Path) -> None:
+    cloned = learn(how=clone_behavior)[0].policy
+    (tmp_path / "checkpoint.safetensors").unlink()
+    plain = learn(temperature=0.0, critic_updates=1)[0].policy
+    assert all(map(torch.equal, cloned.parameters(), plain.parameters()))
+
+
 class Stopped(Exception):  # noqa: N818 - stands for a kill
     pass
 

@@ -1,24 +1,16 @@
+import re
+
 import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.fit import GroundConfig, HistoryFit
+from astra_data.learning.iql import FINE_TUNING
 from astra_data.learning.networks.grounding import LossWeights
-from astra_data.methods import METHODS, method_named
-from astra_data.reports.figures import method_colour, method_title
+from astra_data.methods import METHODS, ROLES, method_named, method_title, tables
+from astra_data.reports.costs import THROUGHPUT
+from astra_data.reports.figures import method_colour
 from astra_data.reports.figures.style import SPARE_COLOURS
 from astra_data.training.train import InSimulator
-
-
-def weights(name: str) -> LossWeights | None:
-    fit = METHODS[name].fit
-    config = GroundConfig(latent_weight=0.2, reward_weight=0.3)
-    return fit.weights(config) if isinstance(fit, HistoryFit) else None
-
-
-def reward(name: str) -> str:
-    learn = METHODS[name].learn
-    assert isinstance(learn, InSimulator)
-    return learn.reward
 
 
 def test_methods_are_known_by_their_names() -> None:
@@ -28,30 +20,101 @@ def test_methods_are_known_by_their_names() -> None:
         method_named("astro")
 
 
-def test_figures_call_methods_by_their_titles_in_colours_of_their_own() -> None:
-    assert {name: method_title(name) for name in METHODS} == {
-        name: method.title for name, method in METHODS.items()
-    }
+def test_methods_have_titles_and_colours_of_their_own() -> None:
+    assert method_title("nas_golemo") == "NAS (Golemo et al.)" and method_title("nas_plus") == "NAS+"
+    assert method_title("my_own_plus") == "My own+"
+    titles = [method.title for method in METHODS.values()]
+    assert len(set(titles)) == len(titles)
+    assert all(re.fullmatch(r"#[0-9A-F]{6}", method.colour) for method in METHODS.values())
     colours = [method_colour(name) for name in METHODS]
     assert len(set(colours)) == len(colours)
     assert not set(colours).intersection(SPARE_COLOURS)
 
 
+def test_roles_say_what_the_others_are_compared_with() -> None:
+    assert ROLES == {
+        "direct_transfer": "floor",
+        "target": "trained there",
+        "full_obs": "trained there",
+        "follower": "ceiling",
+    }
+
+
+def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None:
+    read = {name: (method.table.name, method.configures) for name, method in METHODS.items() if method.table}
+    assert read == {
+        "domain_randomization": ("domain_randomization", "train"),
+        "nas_golemo": ("nas_golemo", "ground"),
+        "rma": ("rma", "train"),
+        "target": ("target", "train"),
+        "full_obs": ("target", "train"),
+        "compass": ("compass", "ground"),
+        "compass_uniform": ("compass", "train"),
+        "iql": ("iql", "train"),
+        "behavior_cloning": ("iql", "train"),
+        "direct_transfer_iql": ("direct_transfer_iql", "train"),
+    }
+    # Recorded settings are compared as text as well: the order stays.
+    assert list(tables()) == [
+        *("domain_randomization", "nas_golemo", "rma", "target", "compass", "iql", "direct_transfer_iql")
+    ]
+    assert all(
+        method.table is None or tables()[method.table.name] is method.table for method in METHODS.values()
+    )
+    assert {name: table.ranges for name, table in tables().items() if table.ranges} == {
+        "domain_randomization": "randomized",
+        "compass": "wide",
+    }
+    assert {name: table.default for name, table in tables().items() if table.default} == {
+        "direct_transfer_iql": FINE_TUNING
+    }
+
+
+def test_costs_show_the_speeds_that_methods_record() -> None:
+    assert THROUGHPUT["ground"] == ("windows_per_second", "episodes_per_second", "replays_per_second")
+    assert THROUGHPUT["train"] == ("simulator_steps_per_second", "steps_per_second", "updates_per_second")
+    recording: dict[str, list[str]] = {rate: [] for rate in (*THROUGHPUT["ground"], *THROUGHPUT["train"])}
+    for name, method in METHODS.items():
+        for rate in (*(method.fit_rates if method.grounds else ()), *method.learn_rates):
+            recording[rate].append(name)
+    assert recording["episodes_per_second"] == ["nas_golemo"]
+    assert recording["replays_per_second"] == ["compass"]
+    assert recording["updates_per_second"] == ["iql", "behavior_cloning", "direct_transfer_iql"]
+
+
 def test_what_the_rows_of_the_paper_differ_in() -> None:
-    assert weights("direct_transfer") is None
-    assert weights("nas") == LossWeights(0.0, 0.0, 1.0)
-    assert weights("astra") == LossWeights(0.2, 0.3, 1.0)
-    assert weights("astra_without_latent") == LossWeights(0.0, 0.3, 1.0)
-    assert weights("astra_without_reward") == LossWeights(0.2, 0.0, 1.0)
+    assert [name for name, method in METHODS.items() if method.grounds] == [
+        *("nas", "nas_golemo", "compass", "astra"),
+        *("astra_without_latent", "astra_without_reward", "astra_task_reward"),
+    ]
+    fit = METHODS["nas"].fit
+    assert isinstance(fit, HistoryFit)
+    assert fit.weights(GroundConfig(latent_weight=0.2, reward_weight=0.3)) == LossWeights(0.0, 0.0, 1.0)
     assert {name for name, method in METHODS.items() if method.aligns} == {
-        "astra",
-        "astra_without_reward",
-        "astra_task_reward",
+        *("astra", "astra_without_reward", "astra_task_reward")
     }
     assert [name for name, method in METHODS.items() if not method.trains] == ["follower"]
+    assert [name for name, method in METHODS.items() if method.planar] == ["follower"]
     assert {name for name, method in METHODS.items() if method.steps_target} == {"target", "full_obs"}
-    assert [reward(name) for name in ("direct_transfer", "nas", "astra")] == ["abstract"] * 2 + ["predicted"]
-    assert [reward(name) for name in ("astra_without_reward", "astra_task_reward")] == ["abstract"] * 2
+    learned = {name: method.learn for name, method in METHODS.items()}
+    in_simulator = {
+        name: (learn.reward, learn.ranges)
+        for name, learn in learned.items()
+        if isinstance(learn, InSimulator)
+    }
+    assert in_simulator == {
+        "direct_transfer": ("abstract", None),
+        "domain_randomization": ("abstract", "randomized"),
+        "nas": ("abstract", None),
+        "nas_golemo": ("abstract", None),
+        "rma": ("abstract", "wide"),
+        "compass": ("abstract", None),
+        "compass_uniform": ("abstract", "wide"),
+        "astra": ("predicted", None),
+        "astra_without_latent": ("predicted", None),
+        "astra_without_reward": ("abstract", None),
+        "astra_task_reward": ("abstract", None),
+    }
 
 
 def test_what_a_method_borrows_is_there() -> None:

@@ -8,10 +8,11 @@ from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.core.progress import silent
+from astra_data.core.seeding import derive, generator
 from astra_data.grounding.diagnostics import correction_r2
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.residual import ResidualModel
+from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.methods.nas_golemo import GolemoConfig, fit_residual
 from astra_data.worlds.registry import TASKS
 
@@ -62,6 +63,50 @@ def test_learns_a_constant_offset_and_how_what_is_left_scatters(tmp_path: Path) 
     assert [point["step"] for point in metrics["epochs"]] == [24 * (epoch + 1) for epoch in range(12)]
     assert metrics["epochs"][-1]["r2_state"] == pytest.approx(
         explained(model, given.held_out, forgets=False), abs=1e-6
+    )
+
+
+def test_the_scatter_is_that_of_held_out_episodes(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    deviation = torch.tensor([0.1] * 24 + [1.0] * 24)[:, None, None]
+    given = fitting(episodes(48, deviation * torch.randn(48, STEPS, 4), torch.randn(48, STEPS, 2)), tmp_path)
+    given = replace(given, settings=CONFIG.model_copy(update={"epochs": 1, "hidden_size": 4}))
+    model, _ = fit_residual(given)
+    scatter = (model.residual_factor @ model.residual_factor.T).diagonal().sqrt()
+    assert scatter.tolist() == pytest.approx([1.0] * 4, rel=0.1)
+
+
+def test_an_update_is_adams_on_whole_episodes_with_residuals_in_their_deviations(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    both = episodes(
+        25, torch.randn(25, STEPS, 4) * torch.tensor([0.1, 1.0, 2.0, 5.0]), torch.randn(25, STEPS, 2)
+    )
+    given = fitting(both, tmp_path, GolemoConfig(epochs=1, hidden_size=4, layers=1, learning_rate=0.02))
+    steps = given.training.windows.mask.bool()
+    residual = (given.training.windows.next_state - given.training.windows.simulated_next)[steps]
+    ours, metrics = fit_residual(given)
+    torch.manual_seed(derive(0, "grounding"))
+    theirs = ResidualModel(ResidualShape(4, 2, 4, 1))
+    theirs.set_scales(given.training.windows.state[steps], residual)
+    torch.testing.assert_close(theirs.correction_std, residual.std(0), rtol=1e-3, atol=1e-6)
+    optimizer, losses = torch.optim.Adam(theirs.parameters(), lr=0.02), []
+    for episode in generator(0, "grounding epoch 0").permutation(24).tolist():
+        length = 25 if episode == 0 else STEPS
+        state, action = (
+            both.windows.state[episode, None, :length],
+            both.windows.action[episode, None, :length],
+        )
+        simulated = both.windows.simulated_next[episode, None, :length]
+        corrected, _ = theirs.correct(state, action, simulated, theirs.initial_memory(1))
+        wrong = (corrected - both.windows.next_state[episode, None, :length]) / residual.std(0)
+        losses.append(wrong.square().mean())
+        optimizer.zero_grad()
+        losses[-1].backward()
+        optimizer.step()
+    for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+    assert metrics["epochs"][0]["loss_state"] == pytest.approx(
+        float(torch.stack(losses).mean().detach()), rel=1e-3
     )
 
 

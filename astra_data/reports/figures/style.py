@@ -13,14 +13,13 @@ from PIL import Image
 
 from astra_data.core.naming import base_method, is_plus
 from astra_data.methods import METHODS
+from astra_data.methods import ROLES as ROLES
+from astra_data.methods import method_title as method_title
 from astra_data.worlds.score import Score
 
 SPARE_COLOURS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a colour of their own. The others are Okabe and Ito's palette and shades that
 colour-blind readers can tell from it."""
-
-ROLES: dict[str, str] = {name: method.role for name, method in METHODS.items() if method.role}
-"""What some rows are to the others."""
 
 SIMULATED = "#E07B00"
 """A simulator, in every figure (as in the paper's Fig. 3)."""
@@ -69,13 +68,6 @@ def style() -> Iterator[None]:
     """Draw in the figures' style, whatever the caller's matplotlib settings are."""
     with context(_RC, after_reset=True):
         yield
-
-
-def method_title(method: str) -> str:
-    """Return the title of a row: "astra_plus" is "ASTRA+"."""
-    base = base_method(method)
-    title = METHODS[base].title if base in METHODS else base.replace("_", " ").capitalize()
-    return f"{title}+" if is_plus(method) else title
 
 
 def method_colour(method: str) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-import gymnasium.envs.mujoco
 import mujoco
 import numpy as np
 import torch
@@ -50,7 +49,7 @@ def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0, integrator: s
         leg_scale: factor on the length of all leg segments (1.25 in the paper's morphology test).
         integrator: "RK4" (Gymnasium's) or "Euler" (3.7 times faster, other contact dynamics).
     """
-    path = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "ant.xml"
+    path = Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))
     tree = ElementTree.parse(path)
     root = tree.getroot()
     _find(root, "option").set("integrator", integrator)

@@ -4,7 +4,6 @@ import os
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
@@ -28,6 +27,8 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
     model = humanoid_model()
     data = mujoco.MjData(model)
     try:
+        from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer  # noqa: PLC0415 - slow
+
         viewer = OffScreenViewer(model, data, width, height)
     except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
         raise BadInputError(

@@ -4,10 +4,10 @@ Four joints follow commands: hips and knees, each about one axis. All others are
 """
 
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
-import gymnasium.envs.mujoco
 import mujoco
 import numpy as np
 import torch
@@ -57,7 +57,7 @@ def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
     the paper's gains in every physics step, with torques up to those of the motors. If torques were computed
     only once per control step, the same gains would make the joints chatter.
     """
-    path = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "humanoid.xml"
+    path = Path(str(files("gymnasium.envs.mujoco") / "assets" / "humanoid.xml"))
     model = mujoco.MjModel.from_xml_path(str(path))
     if actuators == "positions":
         torque = MOTOR_RANGE * model.actuator_gear[:, 0]

@@ -6,8 +6,8 @@ Grids have square cells of the maze's `fine_m` and are indexed [y, x] from the m
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
 from astra_data.worlds.plane.mazes import Maze
@@ -39,7 +39,7 @@ class FreeSpace:
         """Return the free space of a disc of `radius_m`, a multiple of the grid's cell."""
         reach = round(radius_m / maze.fine_m)
         square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-        blocked = binary_dilation(maze.fine_walls, square, border_value=1)
+        blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
         return cls(
             torch.from_numpy(blocked).to(device),
             torch.tensor(maze.half_extent, dtype=torch.float32, device=device),

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +69,7 @@ class Maze:
     @cached_property
     def clearance_field(self) -> Floats:
         """Distance in m from each fine grid cell to the nearest wall, indexed [y, x]."""
-        return np.asarray(distance_transform_edt(~self.fine_walls)) * self.fine_m
+        return np.asarray(scipy.ndimage.distance_transform_edt(~self.fine_walls)) * self.fine_m
 
     def fine_index(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the fine grid indices (y, x) of `points` (..., 2), clipped to the grid."""
@@ -106,10 +104,12 @@ class Maze:
             weights.append((0.5 * (cost[here] + cost[there])[both]) * np.hypot(dy, dx))
         count = int(free.sum())
         entries = (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets)))
-        graph = coo_array(entries, shape=(count, count)).tocsr()
+        graph = scipy.sparse.coo_array(entries, shape=(count, count)).tocsr()
         source = int(numbers[self.fine_index(goal)])
-        lengths = np.asarray(dijkstra(graph, directed=False, indices=source)) * self.fine_m
-        into_wall, nearest = distance_transform_edt(~free, return_indices=True)
+        lengths = (
+            np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=source)) * self.fine_m
+        )
+        into_wall, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)
         field = np.zeros(free.shape)
         field[free] = lengths
         return np.asarray(field[tuple(nearest)] + into_wall * self.fine_m)

@@ -3,7 +3,6 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.humanoid import camera
 from astra_data.worlds.humanoid.camera import photograph
 from astra_data.worlds.humanoid.model import STANDING
 
@@ -35,6 +34,6 @@ def test_without_opengl_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch
     def none(*_: object) -> None:
         raise ImportError("no libEGL")
 
-    monkeypatch.setattr(camera, "OffScreenViewer", none)
+    monkeypatch.setattr("gymnasium.envs.mujoco.mujoco_rendering.OffScreenViewer", none)
     with pytest.raises(BadInputError, match=r"OpenGL that works without a window.*no libEGL.*MUJOCO_GL"):
         photograph(np.array([STANDING]))

@@ -1,0 +1,46 @@
+import pytest
+
+from astra_data.core.config import Config
+from astra_data.grounding.fit import HistoryFit
+from astra_data.methods.method import Method, Table
+from astra_data.training.train import InSimulator
+from astra_data.training.train_in_target import InTarget
+
+PLAIN = Method(name="mine", title="Mine")
+
+
+def test_by_default_a_method_trains_in_the_raw_simulator() -> None:
+    assert (PLAIN.grounds, PLAIN.trains, PLAIN.in_simulator, PLAIN.steps_target) == (False, True, True, False)
+    assert PLAIN.learn == InSimulator(reward="abstract", ranges=None)
+    assert not (PLAIN.aligns or PLAIN.planar or PLAIN.initial or PLAIN.table or PLAIN.role or PLAIN.colour)
+
+
+def test_where_a_policy_comes_from() -> None:
+    by_hand = Method(name="mine", title="Mine", learn=None)
+    assert not by_hand.trains and not by_hand.in_simulator and not by_hand.steps_target
+    there = Method(name="mine", title="Mine", learn=InTarget("full"))
+    assert there.trains and there.steps_target and not there.in_simulator
+    recorded = Method(name="mine", title="Mine", learn=lambda training: None)  # type: ignore[arg-type, return-value]
+    assert recorded.trains and not recorded.in_simulator and not recorded.steps_target
+
+
+@pytest.mark.parametrize(
+    ("method", "predicted"),
+    [
+        (PLAIN, False),
+        (Method(name="mine", title="Mine", fit=HistoryFit(latent=True, reward=False)), False),
+        (Method(name="mine", title="Mine", fit=HistoryFit(latent=False, reward=True)), True),
+        (Method(name="mine", title="Mine", learn=InTarget("abstract")), True),
+    ],
+    ids=["raw", "without reward", "with reward", "not in a simulator"],
+)
+def test_only_a_simulator_whose_grounding_predicts_the_reward_pays_it(
+    method: Method, predicted: bool
+) -> None:
+    assert method.learns_from("predicted") == predicted
+    assert method.learns_from("abstract") and method.learns_from("blend") and method.learns_from(None)
+
+
+def test_a_table_has_the_defaults_of_its_model() -> None:
+    table = Table("mine", Config)
+    assert (table.name, table.model, table.default, table.ranges) == ("mine", Config, None, None)

@@ -1,0 +1,45 @@
+import inspect
+
+from astra_data.experiments.plan import ARTEFACTS
+from astra_data.stages.registry import STAGES
+
+
+def test_a_stage_is_named_as_the_function_that_makes_it() -> None:
+    for name, stage in STAGES.items():
+        assert stage.name == name == stage.run.__name__
+        assert stage.run.__module__ == f"astra_data.stages.{name}"
+
+
+def test_a_stage_reads_earlier_ones() -> None:
+    assert {name: stage.reads for name, stage in STAGES.items()} == {
+        "collect": (),
+        "augment": ("collect",),
+        "pair": ("collect", "augment"),
+        "subset": ("pair",),
+        "ground": ("pair", "subset"),
+        "train": ("pair", "subset", "ground"),
+        "align": ("pair", "subset", "ground"),
+        "evaluate": ("train", "ground", "align"),
+        "report": ("evaluate",),
+    }
+    names = list(STAGES)
+    for name, stage in STAGES.items():
+        assert set(stage.reads) <= set(names[: names.index(name)])
+
+
+def test_a_stage_asks_for_nothing_that_the_plan_does_not_know() -> None:
+    known = {"task", "simulator", "method", "config", "settings", "seed", "percent", "of", "out", "device"}
+    for stage in STAGES.values():
+        if stage.each == "recipe":
+            continue
+        parameters = inspect.signature(stage.run).parameters.values()
+        needed = {parameter.name for parameter in parameters if parameter.default is parameter.empty}
+        assert needed <= known | set(ARTEFACTS) | {"progress"}, stage.name
+        assert ("config" in {parameter.name for parameter in parameters}) == (stage.config is not None)
+
+
+def test_datasets_are_made_of_seeds_and_sizes() -> None:
+    assert [name for name, stage in STAGES.items() if stage.makes_dataset] == [
+        *("collect", "augment", "pair", "subset")
+    ]
+    assert [name for name, stage in STAGES.items() if stage.is_optional] == ["augment"]
