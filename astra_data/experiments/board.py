@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from rich.table import Table
 
 from astra_data.experiments.points import RunPoint
-from astra_data.reports.figures import method_title
+from astra_data.methods import method_title
 from astra_data.worlds.score import Score
 
 

@@ -8,7 +8,6 @@ from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
-from astra_data.methods import ROLES, method_title
 from astra_data.reports.artefacts import (
     EVALUATION,
     TRAJECTORIES,

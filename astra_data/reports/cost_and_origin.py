@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from astra_data.reports.figures import method_title
+from astra_data.methods import method_title
 from astra_data.reports.formatting import duration, short
 from astra_data.reports.schema import Origin, Results
 

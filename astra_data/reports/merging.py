@@ -7,7 +7,6 @@ from typing import Any
 from astra_data.core.errors import BadInputError
 from astra_data.methods import method_title
 from astra_data.reports.comparing import improvement, summarised, validity
-from astra_data.reports.figures import method_title
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.schema import DatasetOrigin, GapMeans, Results
 from astra_data.reports.seed_table import lines_of, row_of

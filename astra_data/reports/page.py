@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from astra_data.core.naming import is_plus, reference_of
+from astra_data.methods import method_title
 from astra_data.reports.cost_and_origin import (
     COSTED,
     dataset_lines,
@@ -11,7 +12,6 @@ from astra_data.reports.cost_and_origin import (
     row_costs,
     stage_costs,
 )
-from astra_data.reports.figures import method_title
 from astra_data.reports.formatting import fill, interval, mean_std, spread
 from astra_data.reports.schema import BandMeans, Results
 from astra_data.reports.statistics import Correlation

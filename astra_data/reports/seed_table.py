@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.reports.figures import ROLES, method_title
+from astra_data.methods import ROLES, method_title
 from astra_data.reports.schema import Cost, GapMeans, MethodResults, Results
 
 Named = tuple[str | None, str | None]

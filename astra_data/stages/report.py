@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import Field, JsonValue
 
@@ -13,8 +14,6 @@ from astra_data.core.progress import Progress
 from astra_data.methods import method_named
 from astra_data.reports.assembly import assemble
 from astra_data.reports.command_replay import replay_commands
-from astra_data.reports.drawing import Camera, figure_of_sizes, figures_of
-from astra_data.reports.figures import dynamics_mismatch, png
 from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
 from astra_data.reports.page import render
 from astra_data.reports.schema import Results

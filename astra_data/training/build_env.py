@@ -7,7 +7,6 @@ import numpy as np
 import scipy
 import torch
 from pydantic import ConfigDict, Field, model_validator
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from astra_data.core.config import Config, Count, NotNegative, Positive, Share
@@ -142,7 +141,7 @@ def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:
     height, width = free.blocked.shape
     rows, columns = free.cells(positions)
     counts = torch.bincount(rows * width + columns, minlength=height * width).reshape(height, width)
-    smooth = gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / maze.fine_m)
+    smooth = scipy.ndimage.gaussian_filter(counts.double().cpu().numpy(), _KERNEL_M / maze.fine_m)
     # Where most of the maze was never visited, the median is zero, and any visit at all is enough.
     enough = max(density * float(np.median(smooth[~maze.fine_walls])), 1e-9)
     return torch.from_numpy(1.0 - smooth / enough).clamp_min(0.0).float().to(positions.device)

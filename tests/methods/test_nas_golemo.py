@@ -71,7 +71,8 @@ def test_the_scatter_is_that_of_held_out_episodes(tmp_path: Path) -> None:
     deviation = torch.tensor([0.1] * 24 + [1.0] * 24)[:, None, None]
     given = fitting(episodes(48, deviation * torch.randn(48, STEPS, 4), torch.randn(48, STEPS, 2)), tmp_path)
     given = replace(given, settings=CONFIG.model_copy(update={"epochs": 1, "hidden_size": 4}))
-    model, _ = fit_residual(given)
+    grounding, _ = fit_residual(given)
+    model = grounding.model
     scatter = (model.residual_factor @ model.residual_factor.T).diagonal().sqrt()
     assert scatter.tolist() == pytest.approx([1.0] * 4, rel=0.1)
 
@@ -84,7 +85,8 @@ def test_an_update_is_adams_on_whole_episodes_with_residuals_in_their_deviations
     given = fitting(both, tmp_path, GolemoConfig(epochs=1, hidden_size=4, layers=1, learning_rate=0.02))
     steps = given.training.windows.mask.bool()
     residual = (given.training.windows.next_state - given.training.windows.simulated_next)[steps]
-    ours, metrics = fit_residual(given)
+    fitted, metrics = fit_residual(given)
+    ours = fitted.model
     torch.manual_seed(derive(0, "grounding"))
     theirs = ResidualModel(ResidualShape(4, 2, 4, 1))
     theirs.set_scales(given.training.windows.state[steps], residual)

@@ -29,7 +29,7 @@ class FreeSpace:
         self.blocked = blocked
         self.half_extent = half_extent
         self.cell_m = cell_m
-        depth = torch.from_numpy(distance_transform_edt(blocked.cpu().numpy()))
+        depth = torch.from_numpy(scipy.ndimage.distance_transform_edt(blocked.cpu().numpy()))
         # Distance of blocked cells from the nearest free one, in cells; 0 in free ones.
         self._depth = depth.float().to(blocked.device)
         self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
