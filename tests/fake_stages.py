@@ -73,7 +73,7 @@ class FakeMethod:
         self.steps_target, self.table, self.configures = steps_target, table, "train"
         self.grounded_as, self.initial = grounded_as, initial
 
-    def learns_from(self, reward: str | None) -> bool:
+    def accepts(self, reward: str | None) -> bool:
         return True
 
 

@@ -44,7 +44,7 @@ from astra_data.learning.networks.policy import PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo
 from astra_data.learning.sac import Sac, SacConfig
-from astra_data.training.simulator_env import SimulatorWorld
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.train import PpoTrainConfig
 from astra_data.worlds.ant.body import POSITIONS, VelocityController
 from astra_data.worlds.registry import TASKS
@@ -130,7 +130,7 @@ def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
     config = SETTINGS.train
     assert isinstance(config, PpoTrainConfig)
-    env = SimulatorWorld(TASK.objective, grounding.simulator(TASK, config.num_envs))
+    env = SimulatorEnv(TASK.objective, grounding.simulator(TASK, config.num_envs))
     shape = ActorCriticShape(
         observation_size=env.observation_size,
         action_size=env.action_size,
@@ -149,7 +149,7 @@ def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
 def sac(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train an actor without memory in an abstract simulator of the humanoid."""
     count, updates, steps = 32, 8, 8 if quick else 64
-    env = SimulatorWorld(WALKER.objective, NO_GROUNDING.simulator(WALKER, count))
+    env = SimulatorEnv(WALKER.objective, NO_GROUNDING.simulator(WALKER, count))
     actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
     config = SacConfig(rollout_steps=steps, updates_per_step=updates, batch_size=256)
     learner = Sac(env, actor, config, horizon=WALKER.objective.horizon, seed=0)

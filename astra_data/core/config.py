@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, Field, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
-from astra_data.core.errors import RecipeError
+from astra_data.core.errors import BadInputError, RecipeError
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -41,6 +41,19 @@ class Config(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+
+def own_settings[C: Config](given: Config | None, usual: C) -> C:
+    """Return the settings that a component was given, or its `usual` ones if it was given none.
+
+    Raises:
+        BadInputError: they are those of another component.
+    """
+    if given is None:
+        return usual
+    if not isinstance(given, type(usual)):
+        raise BadInputError(f"expected settings of {type(usual).__name__}, got {type(given).__name__}")
+    return given
 
 
 def as_json(**settings: Config | str | int | None) -> str:

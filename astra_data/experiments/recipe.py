@@ -136,7 +136,7 @@ class Recipe(Config):
         initial = [METHODS[base_method(row)].initial for row in self.methods]
         for row in (*self.methods, *filter(None, initial)):
             table = "plus" if is_plus(row) else "train"
-            if not METHODS[base_method(row)].learns_from(getattr(self, table).reward):
+            if not METHODS[base_method(row)].accepts(getattr(self, table).reward):
                 raise ValueError(
                     f"{table}.reward: {row} predicts none: expected 'abstract' or 'blend', got 'predicted'"
                 )

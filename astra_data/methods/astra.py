@@ -11,6 +11,7 @@ ASTRA = Method(
     title="ASTRA",
     colour="#009E73",
     fit=HistoryFit(latent=True, reward=True),
+    predicts_reward=True,
     learn=InSimulator(reward="predicted"),
     aligns=True,
 )
@@ -31,6 +32,7 @@ ASTRA_WITHOUT_REWARD = replace(
     title="ASTRA w/o L_rew",
     colour="#999933",
     fit=HistoryFit(latent=True, reward=False),
+    predicts_reward=False,
     learn=InSimulator(),
 )
 """Table II, "w/o reward". Without R_pred the policy learns from the task's own reward."""

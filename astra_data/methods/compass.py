@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.checkpoint import resumed, save_tensors
-from astra_data.core.config import Count
+from astra_data.core.config import Count, own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
@@ -122,9 +122,8 @@ def identify(fitting: Fitting) -> tuple[IdentifiedParameters, dict[str, Any]]:
     Raises:
         BadInputError: no episode is as long as a window, or no steering parameter has a range.
     """
-    config, wide = fitting.settings, fitting.task.varied.wide
-    if not isinstance(config, CompassConfig):
-        config = CompassConfig(**wide.model_dump())
+    wide = fitting.task.varied.wide
+    config = own_settings(fitting.settings, CompassConfig(**wide.model_dump()))
     checkpoint = fitting.folder / "checkpoint.safetensors"
     ranges = config.of_kind(type(wide))
     if not set(ranges.steering).intersection(_varied(ranges)):

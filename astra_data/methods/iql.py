@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from astra_data.core.config import own_settings
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -65,8 +66,7 @@ def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
 
 
 def _config(training: Training) -> IqlConfig:
-    usual = FINE_TUNING if training.initial else IqlConfig()
-    return training.settings if isinstance(training.settings, IqlConfig) else usual
+    return own_settings(training.settings, FINE_TUNING if training.initial else IqlConfig())
 
 
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
@@ -116,6 +116,7 @@ IQL = Method(
     title="IQL",
     colour="#D55E00",
     learn=learn_from_episodes,
+    learns_from="episodes",
     table=Table("iql", IqlConfig),
     learn_rates=_RATES,
 )
@@ -129,6 +130,7 @@ DIRECT_TRANSFER_IQL = Method(
     title="Direct transfer + IQL",
     colour="#7B3294",
     learn=learn_from_episodes,
+    learns_from="episodes",
     initial="direct_transfer",
     table=Table("direct_transfer_iql", IqlConfig, default=FINE_TUNING),
     learn_rates=_RATES,

@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from astra_data.core.config import Config
-from astra_data.grounding.fit import Fit, HistoryFit
+from astra_data.grounding.fit import Fit
 from astra_data.training.simulator_env import RewardSource
 from astra_data.training.train import InSimulator, Learn
-from astra_data.training.train_in_target import InTarget
 
 IN_RAW_SIMULATOR = InSimulator()
+
+Source = Literal["simulator", "target", "episodes"]
+"""What a policy learns from: steps of the abstract simulator or of the target, or recorded episodes alone."""
 
 Role = Literal["floor", "ceiling", "trained there"]
 """Rows for comparison: no grounding at all; a hand-written controller; a policy trained in the target itself,
@@ -41,7 +43,8 @@ class Method:
         colour: in figures, as "#rrggbb"; one of the spare colours where empty.
         role: set for rows that the others are compared with.
         fit: what it learns about the simulator from pairs; None where the simulator stays raw.
-        learn: how it learns its policy; None where there is none to learn.
+        predicts_reward: whether that includes the target's reward.
+        learn: how it learns its policy; None where there is none to learn. learns_from: from what.
         aligns: whether a target encoder is fitted for deployment.
         initial: the method from whose policy its own training starts, if any.
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
@@ -55,7 +58,9 @@ class Method:
     colour: str = ""
     role: Role | None = None
     fit: Fit | None = None
+    predicts_reward: bool = False
     learn: Learn | None = IN_RAW_SIMULATOR
+    learns_from: Source = "simulator"
     aligns: bool = False
     initial: str | None = None
     grounded_as: str = ""
@@ -78,14 +83,13 @@ class Method:
     @property
     def in_simulator(self) -> bool:
         """Whether its policy is trained in the abstract simulator, so that `[plus]` applies."""
-        return isinstance(self.learn, InSimulator)
+        return self.trains and self.learns_from == "simulator"
 
     @property
     def steps_target(self) -> bool:
         """Whether its policy is trained in the target itself."""
-        return isinstance(self.learn, InTarget)
+        return self.trains and self.learns_from == "target"
 
-    def learns_from(self, reward: RewardSource | None) -> bool:
+    def accepts(self, reward: RewardSource | None) -> bool:
         """Return whether it can be trained with `reward`: "predicted" needs a grounding that predicts it."""
-        predicts = isinstance(self.fit, HistoryFit) and self.fit.reward
-        return reward != "predicted" or predicts or not self.in_simulator
+        return reward != "predicted" or self.predicts_reward or not self.in_simulator

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from astra_data.core.config import Config, Count, Positive
+from astra_data.core.config import Config, Count, Positive, own_settings
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.diagnostics import correction_r2
@@ -37,7 +37,7 @@ def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:
 
     The loss is the squared error of residuals divided by their deviation in the training episodes.
     """
-    config = fitting.settings if isinstance(fitting.settings, GolemoConfig) else GolemoConfig()
+    config = own_settings(fitting.settings, GolemoConfig())
     training, windows = fitting.training, fitting.training.windows
     torch.manual_seed(derive(fitting.seed, "grounding"))
     states, actions = windows.state.shape[-1], windows.action.shape[-1]

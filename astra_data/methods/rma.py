@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import part
 from astra_data.core.seeding import derive
@@ -31,7 +32,7 @@ class TeacherThenStudent(InSimulator):
         config, seed = training.config, training.seed
         if not isinstance(config, PpoTrainConfig):
             raise BadInputError(f'rma: expected train.learner "ppo", got "{config.learner}"')
-        settings = training.settings if isinstance(training.settings, RmaConfig) else RmaConfig()
+        settings = own_settings(training.settings, RmaConfig())
         env, simulation = self.world(training, shows_parameters=True)
         torch.manual_seed(derive(seed, "policy"))
         shape = AdaptiveShape(

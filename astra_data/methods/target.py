@@ -11,6 +11,7 @@ TARGET = Method(
     colour="#4D4D4D",
     role="trained there",
     learn=InTarget("abstract"),
+    learns_from="target",
     table=Table("target", TargetConfig),
 )
 

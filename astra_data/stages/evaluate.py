@@ -29,11 +29,11 @@ from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.training.build_env import WorldParts, training_world
+from astra_data.training.build_env import EnvParts, training_env
 from astra_data.training.deployment import DeployedPolicy, EncoderKind
 from astra_data.training.episode_record import EpisodeRecord, Outcome
 from astra_data.training.policy_file import PolicyFile, Simulation, deploy
-from astra_data.training.simulator_env import SimulatorWorld
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -106,7 +106,7 @@ def evaluate(
     results: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
     results["leg_scale"] = config.leg_scale
     results |= origin()
-    simulators: dict[str, SimulatorWorld] = {}
+    simulators: dict[str, SimulatorEnv] = {}
     headline: EncoderKind = "source"
     if policy is None:
         begin: Begin = partial(careful, world)
@@ -206,25 +206,23 @@ def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str
 
 def _training_simulator(
     task: Task, simulation: Simulation, grounding: Grounding, config: EvaluateConfig
-) -> SimulatorWorld:
-    parts = WorldParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
-    return training_world(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
+) -> SimulatorEnv:
+    parts = EnvParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
+    return training_env(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
 
 
-def _shared_simulators(
-    task: Task, reference: Path | None, config: EvaluateConfig
-) -> dict[str, SimulatorWorld]:
+def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
         groundings["grounded"] = load_grounding(reference / "grounding.safetensors")
     return {
-        name: SimulatorWorld(task.objective, grounding.simulator(task, config.episodes))
+        name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()
     }
 
 
 @torch.no_grad()
-def _in_simulator(world: SimulatorWorld, begin: Begin, horizon: int, seed: int) -> Outcome:
+def _in_simulator(world: SimulatorEnv, begin: Begin, horizon: int, seed: int) -> Outcome:
     """Return the outcome in the simulator `world`, from starts that are the same in every simulator."""
     torch.manual_seed(derive(seed, "simulated evaluation"))
     world.reset()

@@ -68,7 +68,7 @@ def train(
         raise BadInputError(f"method '{method}' trains in a grounded simulator: run the stage `ground` first")
     if base.initial and initial is None:
         raise BadInputError(f"method '{method}' starts from the policy of {base.initial}: train that first")
-    if not base.learns_from(config.reward):
+    if not base.accepts(config.reward):
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)

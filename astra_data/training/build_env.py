@@ -13,7 +13,7 @@ from astra_data.core.config import Config, Count, NotNegative, Positive, Share
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.learning.recorded import Recorded
-from astra_data.training.simulator_env import DataStarts, RewardSource, SimulatorWorld, policy_observation
+from astra_data.training.simulator_env import DataStarts, RewardSource, SimulatorEnv, policy_observation
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
@@ -26,7 +26,7 @@ _KERNEL_M = 0.25
 """Standard deviation of the kernel that smooths the density of the data."""
 
 
-class WorldConfig(Config):
+class EnvConfig(Config):
     """Switches of the environment that a policy is trained in; all off is the method as published.
 
     Each may be given to any method, but the raw simulator has no model to predict from: there `topple` and
@@ -77,7 +77,7 @@ class WorldConfig(Config):
 
 
 @dataclass(frozen=True)
-class WorldParts:
+class EnvParts:
     """What a training environment is made of, beside its switches.
 
     Attributes:
@@ -95,13 +95,13 @@ class WorldParts:
 
 
 @torch.no_grad()
-def world_parts(
+def env_parts(
     task: Task,
-    config: WorldConfig,
+    config: EnvConfig,
     episodes: PairedEpisodes,
     grounding: Grounding,
     variation: Variation | None = None,
-) -> WorldParts:
+) -> EnvParts:
     """Derive thinness, scatter and starts from paired episodes, as far as `config` asks for them."""
     windows = episodes.windows
     thinness = None
@@ -118,7 +118,7 @@ def world_parts(
             previous_action=windows.previous_action[:, ::every][moments],
             hidden=None if hidden is None else hidden[moments],
         )
-    return WorldParts(thinness, config.residual_noise * grounding.scatter(episodes), starts, variation)
+    return EnvParts(thinness, config.residual_noise * grounding.scatter(episodes), starts, variation)
 
 
 @torch.no_grad()
@@ -147,16 +147,16 @@ def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:
     return torch.from_numpy(1.0 - smooth / enough).clamp_min(0.0).float().to(positions.device)
 
 
-def training_world(
+def training_env(
     task: Task,
-    config: WorldConfig,
-    parts: WorldParts,
+    config: EnvConfig,
+    parts: EnvParts,
     grounding: Grounding,
     *,
     num_envs: int,
     device: str,
     shows_parameters: bool = False,
-) -> SimulatorWorld:
+) -> SimulatorEnv:
     """Build the environment: the task in the raw, varied, scattered or grounded simulator.
 
     With `shows_parameters`, observations end with the normalised parameters of a simulator that varies.
@@ -167,7 +167,7 @@ def training_world(
     if task.plane is None and (config.support_penalty or config.limits_commands):
         raise task.without_maze()
     scatter = parts.scatter if config.residual_noise else None
-    return SimulatorWorld(
+    return SimulatorEnv(
         task.objective,
         grounding.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter),
         reward=config.reward or "abstract",

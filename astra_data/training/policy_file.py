@@ -14,7 +14,7 @@ from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.training.build_env import WorldConfig
+from astra_data.training.build_env import EnvConfig
 from astra_data.training.deployment import DeployedPolicy, Observed
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
@@ -39,7 +39,7 @@ class Simulation:
 
     thinness: Tensor | None
     scatter: Tensor
-    world: WorldConfig
+    world: EnvConfig
     variation: Variation | None = None
 
 
@@ -107,7 +107,7 @@ class PolicyFile:
                 simulation = Simulation(
                     tensors.get("thinness"),
                     tensors["scatter"],
-                    WorldConfig(**recorded["world"]),
+                    EnvConfig(**recorded["world"]),
                     Variation.of_json(variation) if variation else None,
                 )
             read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
@@ -122,7 +122,7 @@ def deploy(
     target_encoder: TargetEncoder | None = None,
 ) -> DeployedPolicy:
     """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
-    world = trained.simulation.world if trained.simulation else WorldConfig()
+    world = trained.simulation.world if trained.simulation else EnvConfig()
     return DeployedPolicy(
         task,
         trained.policy,

@@ -41,7 +41,7 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
     return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
 
 
-class SimulatorWorld:
+class SimulatorEnv:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", the target's as R_pred predicts it

@@ -19,7 +19,7 @@ from astra_data.learning.sac import Sac, SacConfig
 from astra_data.training.behaviors import PolicyBehavior
 from astra_data.training.deployment import DeployedPolicy, Observed
 from astra_data.training.policy_file import PolicyFile
-from astra_data.training.target_env import TargetWorld
+from astra_data.training.target_env import ObservedTargetEnv
 from astra_data.worlds.task import Task
 
 _PPO_ENVS = 128
@@ -49,7 +49,7 @@ def suboptimal_by_ppo(
         the policy, and how it was trained.
     """
     torch.manual_seed(derive(seed, "suboptimal policy"))
-    world = TargetWorld(task, _PPO_ENVS, num_threads=num_threads)
+    world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
     policy = ActorCritic(ActorCriticShape(world.observation_size, world.action_size))
     config = PpoConfig(total_steps=steps)
     ppo = Ppo(world, policy, config, horizon=task.objective.horizon, seed=seed)
@@ -85,7 +85,7 @@ def suboptimal_by_sac(
     if not task.objective.is_lasting:
         raise BadInputError(f"in {task.name} good episodes are short: take 'suboptimal_ppo'")
     torch.manual_seed(derive(seed, "suboptimal policy"))
-    world = TargetWorld(task, _SAC_ENVS, observed="full", num_threads=num_threads)
+    world = ObservedTargetEnv(task, _SAC_ENVS, observed="full", num_threads=num_threads)
     actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))
     config = _SAC.model_copy(update={"total_steps": steps})
     sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
@@ -101,7 +101,7 @@ def suboptimal_by_sac(
 
 def _train(
     learner: Ppo | Sac,
-    world: TargetWorld,
+    world: ObservedTargetEnv,
     judge: Callable[[Mapping[str, float]], tuple[float, str]],
     folder: Path,
     progress: Progress,

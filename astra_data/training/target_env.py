@@ -30,7 +30,7 @@ class TargetStarts:
         return cls(episodes.steps(state).cpu(), episodes.steps(goal).cpu())
 
 
-class TargetWorld:
+class ObservedTargetEnv:
     """B target environments whose observation (B, O) is made of their state and the goal.
 
     The physics runs on the CPU, whatever the device of observations and actions. All randomness comes from

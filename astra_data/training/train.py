@@ -28,15 +28,15 @@ from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo, PpoConfig
 from astra_data.learning.recorded import Recorded
 from astra_data.learning.sac import Sac, SacConfig
-from astra_data.training.build_env import WorldConfig, recorded_steps, training_world, world_parts
+from astra_data.training.build_env import EnvConfig, env_parts, recorded_steps, training_env
 from astra_data.training.policy_file import PolicyFile, Simulation
-from astra_data.training.simulator_env import RewardSource, SimulatorWorld
+from astra_data.training.simulator_env import RewardSource, SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
 
-class TrainConfig(WorldConfig):
+class TrainConfig(EnvConfig):
     """How policies are trained, but for the learner's own settings."""
 
     num_envs: Count = 256
@@ -199,17 +199,15 @@ class InSimulator:
         policy, curve = train_in(env, config, memory_size, training, training.simulated_steps, recorded)
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
-    def world(
-        self, training: Training, *, shows_parameters: bool = False
-    ) -> tuple[SimulatorWorld, Simulation]:
+    def world(self, training: Training, *, shows_parameters: bool = False) -> tuple[SimulatorEnv, Simulation]:
         """Return the environment to train in, and what a policy file records about it."""
         config, settings = training.config, training.settings
-        switches = WorldConfig(**{name: getattr(config, name) for name in WorldConfig.model_fields})
+        switches = EnvConfig(**{name: getattr(config, name) for name in EnvConfig.model_fields})
         switches = switches.model_copy(update={"reward": switches.reward or self.reward})
         usual: Variation | None = getattr(training.task.varied, self.ranges) if self.ranges else None
         variation = settings if isinstance(settings, Variation) else usual
-        parts = world_parts(training.task, switches, training.episodes, training.grounding, variation)
-        env = training_world(
+        parts = env_parts(training.task, switches, training.episodes, training.grounding, variation)
+        env = training_env(
             training.task,
             switches,
             parts,

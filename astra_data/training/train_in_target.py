@@ -6,7 +6,7 @@ from typing import Any
 from astra_data.core.config import Config, Count, Number
 from astra_data.training.deployment import Observed
 from astra_data.training.policy_file import PolicyFile
-from astra_data.training.target_env import TargetStarts, TargetWorld
+from astra_data.training.target_env import ObservedTargetEnv, TargetStarts
 from astra_data.training.train import Training, train_in
 
 
@@ -36,7 +36,7 @@ class InTarget:
         """Return the policy and its learning curve."""
         settings, episodes = training.settings, training.episodes
         config = training.config.model_copy(update=settings.model_dump(exclude_none=True) if settings else {})
-        env = TargetWorld(
+        env = ObservedTargetEnv(
             training.task,
             config.num_envs,
             observed=self.observed,

@@ -4,8 +4,8 @@ from typing import Literal
 import pytest
 from pydantic import Field, ValidationError
 
-from astra_data.core.config import Config, did_you_mean, load_recipe
-from astra_data.core.errors import RecipeError
+from astra_data.core.config import Config, did_you_mean, load_recipe, own_settings
+from astra_data.core.errors import BadInputError, RecipeError
 
 
 class Training(Config):
@@ -101,3 +101,13 @@ def test_a_missing_or_unreadable_recipe_is_one_line(tmp_path: Path) -> None:
 def test_names_without_a_close_match_are_all_listed() -> None:
     assert did_you_mean("nass", ("nas", "astra")) == ": did you mean 'nas'?"
     assert did_you_mean("x", ("nas", "astra")) == "; known: nas, astra"
+
+
+def test_a_component_takes_its_own_settings_or_the_usual_ones() -> None:
+    class Other(Config):
+        pass
+
+    usual, given = Training(), Training(env_steps=3)
+    assert own_settings(None, usual) is usual and own_settings(given, usual) is given
+    with pytest.raises(BadInputError, match="expected settings of Training, got Other"):
+        own_settings(Other(), usual)

@@ -4,7 +4,7 @@ import torch
 
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.methods.follower import CarefulFollower, CarefulKicker, careful
-from astra_data.training.simulator_env import SimulatorWorld
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import TASKS
 
 
@@ -45,7 +45,7 @@ def test_the_careful_kicker_kicks_from_near_behind_the_ball(robot: tuple[float, 
 def test_the_careful_kicker_scores_from_every_start_of_its_simulator() -> None:
     task = TASKS["nao-kick"]
     torch.manual_seed(0)
-    world = SimulatorWorld(task.objective, EpisodeSimulator(task.simulator(100)))
+    world = SimulatorEnv(task.objective, EpisodeSimulator(task.simulator(100)))
     world.reset()
     act = careful(task, world.goal)
     scored, ended = torch.zeros(2, 100, dtype=torch.bool)

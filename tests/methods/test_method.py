@@ -18,9 +18,9 @@ def test_by_default_a_method_trains_in_the_raw_simulator() -> None:
 def test_where_a_policy_comes_from() -> None:
     by_hand = Method(name="mine", title="Mine", learn=None)
     assert not by_hand.trains and not by_hand.in_simulator and not by_hand.steps_target
-    there = Method(name="mine", title="Mine", learn=InTarget("full"))
+    there = Method(name="mine", title="Mine", learn=InTarget("full"), learns_from="target")
     assert there.trains and there.steps_target and not there.in_simulator
-    recorded = Method(name="mine", title="Mine", learn=lambda training: None)  # type: ignore[arg-type, return-value]
+    recorded = Method(name="mine", title="Mine", learns_from="episodes")
     assert recorded.trains and not recorded.in_simulator and not recorded.steps_target
 
 
@@ -29,16 +29,21 @@ def test_where_a_policy_comes_from() -> None:
     [
         (PLAIN, False),
         (Method(name="mine", title="Mine", fit=HistoryFit(latent=True, reward=False)), False),
-        (Method(name="mine", title="Mine", fit=HistoryFit(latent=False, reward=True)), True),
-        (Method(name="mine", title="Mine", learn=InTarget("abstract")), True),
+        (
+            Method(
+                name="mine", title="Mine", fit=HistoryFit(latent=False, reward=True), predicts_reward=True
+            ),
+            True,
+        ),
+        (Method(name="mine", title="Mine", learn=InTarget("abstract"), learns_from="target"), True),
     ],
     ids=["raw", "without reward", "with reward", "not in a simulator"],
 )
 def test_only_a_simulator_whose_grounding_predicts_the_reward_pays_it(
     method: Method, predicted: bool
 ) -> None:
-    assert method.learns_from("predicted") == predicted
-    assert method.learns_from("abstract") and method.learns_from("blend") and method.learns_from(None)
+    assert method.accepts("predicted") == predicted
+    assert method.accepts("abstract") and method.accepts("blend") and method.accepts(None)
 
 
 def test_a_table_has_the_defaults_of_its_model() -> None:

@@ -11,6 +11,7 @@ from astra_data.reports.costs import THROUGHPUT
 from astra_data.reports.figures import method_colour
 from astra_data.reports.figures.style import SPARE_COLOURS
 from astra_data.training.train import InSimulator
+from astra_data.training.train_in_target import InTarget
 
 
 def test_methods_are_known_by_their_names() -> None:
@@ -117,9 +118,18 @@ def test_what_the_rows_of_the_paper_differ_in() -> None:
     }
 
 
+def test_methods_say_of_themselves_what_their_parts_do() -> None:
+    fitted = {name: isinstance(m.fit, HistoryFit) and m.fit.reward for name, m in METHODS.items()}
+    assert fitted == {name: method.predicts_reward for name, method in METHODS.items()}
+    places = {InSimulator: "simulator", InTarget: "target"}
+    for method in METHODS.values():
+        known = [place for kind, place in places.items() if isinstance(method.learn, kind)]
+        assert not method.trains or method.learns_from == (known or ["episodes"])[0]
+
+
 def test_what_a_method_borrows_is_there() -> None:
     for method in METHODS.values():
         assert METHODS[method.grounded_as or method.name].fit == method.fit
         assert method.initial is None or METHODS[method.initial].trains
         if method.in_simulator:
-            assert not method.learns_from("predicted") or method.grounds
+            assert not method.accepts("predicted") or method.grounds

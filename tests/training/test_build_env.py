@@ -11,7 +11,7 @@ from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.build_env import WorldConfig, training_world, world_parts
+from astra_data.training.build_env import EnvConfig, env_parts, training_env
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
@@ -48,16 +48,16 @@ def grounding() -> HistoryGrounding:
 def test_without_switches_it_is_the_plain_simulator(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
-    config = WorldConfig()
+    config = EnvConfig()
     kinds: dict[type[EpisodeSimulator], Grounding] = {
         EpisodeSimulator: NO_GROUNDING,
         GroundedSimulator: grounding,
     }
     for kind, used in kinds.items():
-        parts = world_parts(TASK, config, episodes, used)
+        parts = env_parts(TASK, config, episodes, used)
         assert not parts.scatter.any()
         assert parts.starts is None
-        world = training_world(TASK, config, parts, used, num_envs=4, device="cpu")
+        world = training_env(TASK, config, parts, used, num_envs=4, device="cpu")
         assert type(world.simulator) is kind
         assert type(world.simulator.simulator) is PointMass
         assert world.simulator.scatter is None
@@ -71,18 +71,18 @@ def test_without_switches_it_is_the_plain_simulator(
 def test_scatter_is_what_the_simulator_does_not_explain(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
-    config = WorldConfig(residual_noise=2.0)
-    parts = world_parts(TASK, config, episodes, NO_GROUNDING)
-    world = training_world(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
+    config = EnvConfig(residual_noise=2.0)
+    parts = env_parts(TASK, config, episodes, NO_GROUNDING)
+    world = training_env(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.simulator.scatter is parts.scatter
     deviations = (parts.scatter @ parts.scatter.T).diagonal().sqrt()
     torch.testing.assert_close(deviations, 2 * torch.tensor([0.01, 0.02, 0.1, 0.2]), rtol=0.1, atol=0)
     grounding.model.residual_factor.copy_(torch.eye(4))
-    assert torch.equal(world_parts(TASK, config, episodes, grounding).scatter, 2 * torch.eye(4))
+    assert torch.equal(env_parts(TASK, config, episodes, grounding).scatter, 2 * torch.eye(4))
 
 
 def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
-    thinness = world_parts(TASK, WorldConfig(), episodes, NO_GROUNDING).thinness
+    thinness = env_parts(TASK, EnvConfig(), episodes, NO_GROUNDING).thinness
     assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     far = HERE + torch.tensor([[1.5, 0.0], [0.0, -1.5]])
@@ -92,30 +92,30 @@ def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
 
 
 def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> None:
-    config = WorldConfig(support_penalty=0.3)
-    parts = world_parts(TASK, config, episodes, NO_GROUNDING)
-    world = training_world(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
+    config = EnvConfig(support_penalty=0.3)
+    parts = env_parts(TASK, config, episodes, NO_GROUNDING)
+    world = training_env(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.thinness is not None and parts.thinness is not None
     torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
 
 
 def test_what_needs_a_maze_is_refused_without_one(episodes: PairedEpisodes) -> None:
     nowhere = replace(TASK, plane=None)
-    plain, *asked = WorldConfig(), WorldConfig(support_penalty=0.3), WorldConfig(command_limit_m_s=1.0)
-    parts = world_parts(nowhere, plain, episodes, NO_GROUNDING)
+    plain, *asked = EnvConfig(), EnvConfig(support_penalty=0.3), EnvConfig(command_limit_m_s=1.0)
+    parts = env_parts(nowhere, plain, episodes, NO_GROUNDING)
     assert parts.thinness is None
-    world = training_world(nowhere, plain, parts, NO_GROUNDING, num_envs=1, device="cpu")
+    world = training_env(nowhere, plain, parts, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.thinness is None
     for config in asked:
         with pytest.raises(BadInputError, match="expected a task in a maze"):
-            training_world(nowhere, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
+            training_env(nowhere, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
 
 
 def test_recorded_starts_come_with_the_history_before_them(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
-    config = WorldConfig(data_start_share=1.0)
-    starts = world_parts(TASK, config, episodes, grounding).starts
+    config = EnvConfig(data_start_share=1.0)
+    starts = env_parts(TASK, config, episodes, grounding).starts
     assert starts is not None
     assert starts.hidden is not None
     assert len(starts.state) == len(starts.hidden) == 700
@@ -136,9 +136,9 @@ def test_a_recorded_start_is_one_of_the_recorded_moments(
     few = replace(
         episodes, windows=replace(episodes.windows, mask=(torch.arange(400) < 3) * torch.ones(2, 1))
     )
-    config = WorldConfig(data_start_share=1.0)
-    parts = world_parts(TASK, config, few, grounding)
-    world = training_world(TASK, config, parts, grounding, num_envs=64, device="cpu")
+    config = EnvConfig(data_start_share=1.0)
+    parts = env_parts(TASK, config, few, grounding)
+    world = training_env(TASK, config, parts, grounding, num_envs=64, device="cpu")
     world.reset()
     moments = few.steps(few.windows.state)
     assert len(moments) == 6

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 import astra_data.envs
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.gymnasium import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
+from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.worlds.registry import TASKS
 
 gymnasium.register_envs(astra_data.envs)
@@ -18,14 +18,14 @@ gymnasium.register_envs(astra_data.envs)
 NAMES = [f"astra_data/{world}{maze}-v0" for world in ("AntMaze", "PointMaze") for maze in ("UMaze", "Long")]
 
 
-def point_mazes(num_envs: int, max_episode_steps: int) -> WorldVectorEnv:
+def point_mazes(num_envs: int, max_episode_steps: int) -> BatchedVectorEnv:
     env = gymnasium.make_vec(
         NAMES[2],
         num_envs=num_envs,
         vectorization_mode="vector_entry_point",
         max_episode_steps=max_episode_steps,
     )
-    assert isinstance(env, WorldVectorEnv)
+    assert isinstance(env, BatchedVectorEnv)
     return env
 
 
@@ -49,7 +49,7 @@ def test_registration_loads_no_world() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_own_checks_pass(name: str) -> None:
     env = gymnasium.make(name)
-    assert isinstance(env.unwrapped, WorldEnv)
+    assert isinstance(env.unwrapped, SingleEnv)
     assert env.observation_space.shape == ((31,) if "Ant" in name else (8,))
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
     check_env(env.unwrapped, skip_render_check=True)
@@ -64,7 +64,7 @@ def test_time_limits_are_the_tasks_horizons(name: str) -> None:
 
 def test_an_option_reaches_the_world() -> None:
     env = gymnasium.make(NAMES[0], leg_scale=1.25)
-    assert env.unwrapped.world.leg_scale == 1.25  # type: ignore[attr-defined]
+    assert env.unwrapped.env.leg_scale == 1.25  # type: ignore[attr-defined]
 
 
 def test_one_env_is_truncated_and_tells_of_walls() -> None:
@@ -147,7 +147,7 @@ def test_a_grounded_simulator_shows_its_latents() -> None:
     task = TASKS["antmaze-umaze"]
     model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
     grounded = HistoryGrounding(model.requires_grad_(False)).simulator(task, 3)
-    env = WorldVectorEnv(SeededSimulatorWorld(task.objective, grounded), max_episode_steps=5)
+    env = BatchedVectorEnv(SeededSimulatorEnv(task.objective, grounded), max_episode_steps=5)
     raw = point_mazes(3, max_episode_steps=5)
     first, _ = env.reset(seed=1)
     expected, _ = raw.reset(seed=1)

@@ -13,7 +13,7 @@ from astra_data.grounding.protocols import FittedGrounding
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.build_env import WorldConfig
+from astra_data.training.build_env import EnvConfig
 from astra_data.training.policy_file import PolicyFile, Simulation
 from astra_data.worlds.variation import PlanarVariation
 
@@ -21,7 +21,7 @@ from astra_data.worlds.variation import PlanarVariation
 def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
     thinness, scatter = torch.rand(6, 5), torch.randn(4, 4)
-    world = WorldConfig(reward="blend", topple=True, residual_noise=0.5)
+    world = EnvConfig(reward="blend", topple=True, residual_noise=0.5)
     variation = PlanarVariation(friction=(0.8, 1.2))
     simulation = Simulation(thinness, scatter, world, variation)
     saved = PolicyFile(policy, simulation, "toy@data-1.0.0", "abc")

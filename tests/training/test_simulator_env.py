@@ -5,7 +5,7 @@ from astra_data.grounding.history import GroundedSimulator
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.simulator_env import DataStarts, SimulatorWorld, policy_observation
+from astra_data.training.simulator_env import DataStarts, SimulatorEnv, policy_observation
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass
@@ -16,9 +16,9 @@ from astra_data.worlds.variation import PlanarVariation
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def world(num_envs: int = 4, **options: float | torch.Tensor) -> SimulatorWorld:
+def world(num_envs: int = 4, **options: float | torch.Tensor) -> SimulatorEnv:
     simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
-    return SimulatorWorld(TASK, simulator, **options)  # type: ignore[arg-type]
+    return SimulatorEnv(TASK, simulator, **options)  # type: ignore[arg-type]
 
 
 def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
@@ -56,7 +56,7 @@ def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
     task = TASKS["humanoid-walker2d"]
     variation = task.varied.wide if is_varied else None
     first, second = (
-        SimulatorWorld(task.objective, NO_GROUNDING.simulator(task, 3, variation=variation)) for _ in range(2)
+        SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, 3, variation=variation)) for _ in range(2)
     )
     first.reset()
     inner = first.simulator.simulator
@@ -97,7 +97,7 @@ def test_disagreement_costs_its_penalty() -> None:
     for penalty in (0.0, 0.5):
         model.usual_disagreement.fill_(spread / 3)
         grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), model)
-        one = SimulatorWorld(TASK, grounded, disagreement_penalty=penalty)
+        one = SimulatorEnv(TASK, grounded, disagreement_penalty=penalty)
         torch.manual_seed(1)
         one.reset()
         rewards.append(one.step(torch.zeros(2, 2)).reward)
@@ -152,7 +152,7 @@ def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
     rewards = []
     for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
         grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
-        one = SimulatorWorld(TASK, grounded, **options)
+        one = SimulatorEnv(TASK, grounded, **options)
         one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
         latent = grounded.latent
         rewards.append(one.step(action).reward)
@@ -166,7 +166,7 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     torch.manual_seed(0)
     task = TASKS["nao-kick"]
     model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, position_octaves=0, ball_index=4))
-    one = SimulatorWorld(task.objective, GroundedSimulator(task.simulator(3), model), reward="predicted")
+    one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(3), model), reward="predicted")
     # Balls that roll on in the field, into the goal, and over the side line.
     balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
     state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
@@ -191,7 +191,7 @@ def test_predicted_corrections_are_added_to_the_tasks_own_reward() -> None:
         torch.manual_seed(1)
         model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, corrects_reward=corrects))
         for reward in ("abstract", "predicted"):
-            one = SimulatorWorld(
+            one = SimulatorEnv(
                 TASK, GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model), reward=reward
             )
             state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4)
@@ -206,7 +206,7 @@ def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
     torch.manual_seed(0)
     task = TASKS["nao-navigation"]
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0))
-    one = SimulatorWorld(task.objective, GroundedSimulator(task.simulator(2), model), reward="predicted")
+    one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(2), model), reward="predicted")
     # The one in the middle of a corridor, the other just before the wall at x = -2.
     state = torch.tensor([[0.0, 2.0, 0.0, 0.0], [-1.999, 2.0, 0.0, 0.0]])
     goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)]).float().expand(2, 2)
@@ -244,8 +244,8 @@ def test_the_penalty_scale_scales_the_penalties() -> None:
 def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
-    assert SimulatorWorld(TASK, EpisodeSimulator(simulator)).observation_size == 8
-    showing = SimulatorWorld(TASK, EpisodeSimulator(simulator), shows_parameters=True)
+    assert SimulatorEnv(TASK, EpisodeSimulator(simulator)).observation_size == 8
+    showing = SimulatorEnv(TASK, EpisodeSimulator(simulator), shows_parameters=True)
     assert (showing.observation_size, showing.parameter_count) == (8 + 7, 7)
     before = showing.reset()
     torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
@@ -267,7 +267,7 @@ def test_topples_are_drawn_at_the_predicted_risk_and_end_the_episode() -> None:
     for logit, share in ((50.0, 1 / 20), (-50.0, 0.0)):
         last[-1].fill_(logit)
         inner = PointMass(U_MAZE, count, timestep_s=0.05)
-        one = SimulatorWorld(TASK, GroundedSimulator(inner, model), topple=True, reward="blend")
+        one = SimulatorEnv(TASK, GroundedSimulator(inner, model), topple=True, reward="blend")
         # Half of them reach the goal in this step: whoever does has not toppled.
         state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
         goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
@@ -288,7 +288,7 @@ def test_recorded_starts_hand_over_their_history() -> None:
     state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
     starts = DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
     grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
-    one = SimulatorWorld(TASK, grounded, starts=starts, data_start_share=1.0)
+    one = SimulatorEnv(TASK, grounded, starts=starts, data_start_share=1.0)
     one.reset()
     assert starts.hidden is not None
     expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)

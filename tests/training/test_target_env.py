@@ -4,7 +4,7 @@ from torch import Tensor
 
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.training.deployment import DeployedPolicy, Observed
-from astra_data.training.target_env import TargetStarts, TargetWorld
+from astra_data.training.target_env import ObservedTargetEnv, TargetStarts
 from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
@@ -21,14 +21,16 @@ def recorded() -> TargetStarts:
     return TargetStarts(torch.cat(states), torch.tensor([[3.0, -4.0], [-4.0, 1.0]]).repeat(5, 1))
 
 
-def world(observed: Observed = "full", share: float = 0.0, count: int = 4, threads: int = 1) -> TargetWorld:
+def world(
+    observed: Observed = "full", share: float = 0.0, count: int = 4, threads: int = 1
+) -> ObservedTargetEnv:
     starts = recorded() if share else None
-    return TargetWorld(
+    return ObservedTargetEnv(
         TASK, count, observed=observed, starts=starts, data_start_share=share, num_threads=threads
     )
 
 
-def stretch(env: TargetWorld, count: int, seed: int) -> list[Tensor]:
+def stretch(env: ObservedTargetEnv, count: int, seed: int) -> list[Tensor]:
     """Act at random for `count` steps; rows 1 and 3 start anew in the midst of it."""
     torch.manual_seed(seed)
     seen = []
@@ -64,7 +66,7 @@ def test_all_of_the_state_is_observed_in_full_and_the_planar_part_otherwise() ->
         env = world(observed, count=1)
         assert env.observation_size == (8 if observed == "abstract" else 33)
 
-        def observe(state: Tensor, env: TargetWorld = env) -> Tensor:
+        def observe(state: Tensor, env: ObservedTargetEnv = env) -> Tensor:
             # The physics has the state in doubles; its clock, first, is not observed.
             physics = env.state_dict()["physics"]
             physics[:, 1:30] = state.double()
@@ -94,7 +96,7 @@ def test_toppling_ends_the_episode_and_costs() -> None:
     lying = recorded().state[:1].repeat(1, 1)
     lying[0, 2:7] = torch.tensor([2.0, 0.0, 1.0, 0.0, 0.0])  # on its back, above the ground
     starts = TargetStarts(lying, torch.tensor([[3.0, -4.0]]))
-    env = TargetWorld(TASK, 3, starts=starts, data_start_share=1.0, num_threads=1)
+    env = ObservedTargetEnv(TASK, 3, starts=starts, data_start_share=1.0, num_threads=1)
     env.reset()
     step = env.step(torch.zeros(3, 2))
     assert step.terminated.all() and not step.success.any()

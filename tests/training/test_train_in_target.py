@@ -31,7 +31,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         seen["train"] = given
         return "policy", {"points": []}
 
-    monkeypatch.setattr(train_in_target, "TargetWorld", build)
+    monkeypatch.setattr(train_in_target, "ObservedTargetEnv", build)
     monkeypatch.setattr(train_in_target, "train_in", train)
     return seen
 

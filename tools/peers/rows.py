@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from astra_data.training.gymnasium import Array, WorldVectorEnv
+from astra_data.training.gymnasium import Array, BatchedVectorEnv
 
 
 class Rows(VecEnv):  # type: ignore[misc]
     """Gymnasium's vector environment as Stable-Baselines3 wants it."""
 
-    def __init__(self, env: WorldVectorEnv) -> None:
+    def __init__(self, env: BatchedVectorEnv) -> None:
         """Show `env`."""
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)

@@ -24,7 +24,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.gymnasium import Array, SeededSimulatorWorld, WorldEnv, WorldVectorEnv
+from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.train import PpoTrainConfig
 from astra_data.worlds.registry import TASKS
 
@@ -58,15 +58,17 @@ def main(algorithm: Algorithm, face: Face) -> None:
         grounding = HistoryGrounding(GroundingModel(shape).requires_grad_(False))
     horizon = task.objective.horizon
 
-    def world(num_envs: int) -> SeededSimulatorWorld:
-        return SeededSimulatorWorld(task.objective, grounding.simulator(task, num_envs))
+    def world(num_envs: int) -> SeededSimulatorEnv:
+        return SeededSimulatorEnv(task.objective, grounding.simulator(task, num_envs))
 
     def single() -> gymnasium.Env[Array, Array]:
-        return gymnasium.wrappers.TimeLimit(WorldEnv(world(1)), horizon)
+        return gymnasium.wrappers.TimeLimit(SingleEnv(world(1)), horizon)
 
     count = config.num_envs if face is Face.vector else SINGLE_WORLDS
     env = (
-        Rows(WorldVectorEnv(world(count), horizon)) if face is Face.vector else DummyVecEnv([single] * count)
+        Rows(BatchedVectorEnv(world(count), horizon))
+        if face is Face.vector
+        else DummyVecEnv([single] * count)
     )
     sizes: dict[str, Any] = {"net_arch": list(config.hidden_sizes), "activation_fn": torch.nn.ELU}
     if algorithm is Algorithm.recurrent_ppo:

@@ -14,7 +14,7 @@ from rows import Rows
 from stable_baselines3 import SAC
 
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.gymnasium import SeededSimulatorWorld, WorldVectorEnv
+from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
 from astra_data.worlds.registry import TASKS
 
 
@@ -22,10 +22,10 @@ def main(count: int, updates: int, steps: int) -> None:
     """Train on demand."""
     torch.set_num_threads(1)
     task = TASKS["humanoid-walker2d"]
-    world = SeededSimulatorWorld(task.objective, NO_GROUNDING.simulator(task, count))
+    world = SeededSimulatorEnv(task.objective, NO_GROUNDING.simulator(task, count))
     learner = SAC(
         "MlpPolicy",
-        Rows(WorldVectorEnv(world, task.objective.horizon)),
+        Rows(BatchedVectorEnv(world, task.objective.horizon)),
         learning_starts=0,
         batch_size=256,
         gradient_steps=updates,
