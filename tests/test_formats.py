@@ -10,6 +10,8 @@ import pytest
 import torch
 from fake_report import REPLAY
 
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.doctor.check import check as check_dataset
 from astra_data.dataset.edit import subset
 from astra_data.dataset.reader import Dataset
@@ -115,6 +117,20 @@ def test_a_run_is_finished_without_manifests(unpacked: Path, capsys: pytest.Capt
     assert remarks == datasets | made
     assert len(found) == 22
     assert "doubt_penalty is now called disagreement_penalty" in capsys.readouterr().err
+
+
+def test_weights_of_a_run_without_manifests_are_read_on_request(unpacked: Path, tmp_path: Path) -> None:
+    shutil.copytree(unpacked, tmp_path, dirs_exist_ok=True)
+    recipe, root = tmp_path / "small.toml", tmp_path / "runs"
+    policy = root / "small/train/iql/seed_0/policy.safetensors"
+    tensors, metadata = load_tensors(policy)
+    save_tensors(policy, {name: value * float("nan") for name, value in tensors.items()}, metadata)
+    assert check(recipe, root=root)["train/iql/seed_0"].is_finished
+    found = check(recipe, root=root, verify=True)
+    assert [key for key, of in found.items() if not of.is_finished] == ["train/iql/seed_0"]
+    assert "expected finite weights" in found["train/iql/seed_0"].why
+    with pytest.raises(BadInputError, match="expected finite weights"):
+        load_policy(root / "small", "iql")
 
 
 def test_a_run_goes_on_with_its_report(

@@ -84,8 +84,8 @@ def check(
             typer.echo(f"  {'to do' if found.state == 'missing' else found.state:8}  {key}{why}")
         spoilt = [f"{states.count(state)} {state}" for state in ("damaged", "stale") if state in states]
         if spoilt:
-            again = f"`astra-data run {recipe}` makes them again, unless the recipe changed"
-            faults.append(f"{recipe}: {' and '.join(spoilt)}, as listed: {again}")
+            again = f"`astra-data run {recipe}` makes again what the list does not ask you to remove"
+            faults.append(f"{recipe}: {' and '.join(spoilt)}: {again}")
     if faults:
         raise AstraDataError("\n".join(faults))
 

@@ -2,7 +2,7 @@
 
 An artefact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
 it was made from something else than what lies there now, or with other settings. Version 0.1 wrote no
-manifests: what it finished counts as finished.
+manifests: what it finished counts as finished, if its result is there.
 """
 
 from collections.abc import Callable, Collection
@@ -63,14 +63,16 @@ def damage(key: str, experiment: Experiment, *, verify: bool) -> str:
 
     Of datasets, what the metadata and the footers of the files show or, with `verify`, all values.
     """
-    folder = experiment.place(key)
+    folder, stage = experiment.place(key), _stage(key)
     try:
-        if _stage(key).makes_dataset:
+        if stage.makes_dataset:
             dataset = Dataset.open(folder)
             faults = dataset.verify() if verify else []
+        elif manifest := read_manifest(folder):
+            faults = manifest.faults(folder, verify=verify)
         else:
-            manifest = read_manifest(folder)
-            faults = manifest.faults(folder, verify=verify) if manifest else []
+            whole = stage.result is None or _has_bytes(folder / stage.result)
+            faults = [] if whole else [f"{stage.result} is missing or empty"]
     except AstraDataError as error:
         return str(error)
     return "; ".join(faults)
@@ -118,6 +120,10 @@ def can_be_made_again(key: str, experiment: Experiment) -> bool:
     return False
 
 
+def _has_bytes(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
 def _stage(key: str) -> Stage:
     return STAGES[key.partition("/")[0]]
 
@@ -129,7 +135,7 @@ def _unreadable(key: str, experiment: Experiment) -> str:
         if stage.result:
             LOADERS[stage.name](experiment.place(key) / stage.result)
     except AstraDataError as error:
-        return str(error)
+        return f"{error}, after removing this"
     return ""
 
 
