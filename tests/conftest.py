@@ -40,6 +40,9 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     for module in (recipe, experiment):
         monkeypatch.setattr(module, "TASKS", fake_stages.TASKS)
     monkeypatch.setattr(experiment, "Recipe", model)
+    condition = importlib.import_module("astra_data.experiments.condition")
+    monkeypatch.setattr(condition, "Dataset", fake_stages.FakeDataset)
+    monkeypatch.setattr(condition, "read_description", fake_stages.read_description)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
     monkeypatch.setattr("torch.set_num_threads", int)

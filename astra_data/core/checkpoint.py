@@ -100,8 +100,8 @@ def understood(
         device: torch device.
 
     Raises:
-        BadInputError: the file cannot be read, is of another kind, or lacks something that the block needs,
-            as one of an older version.
+        BadInputError: the file cannot be read, is of another kind, has values that are not finite, or lacks
+            something that the block needs, as one of an older version.
     """
     tensors, metadata = load_tensors(path)
     kind = metadata.get("kind")
@@ -109,6 +109,11 @@ def understood(
         found = "a file without a kind" if kind is None else f"kind {kind}"
         raise BadInputError(
             f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again"
+        )
+    if not_finite := [name for name, tensor in tensors.items() if not _is_usable(name, tensor)]:
+        raise BadInputError(
+            f"{path}: expected finite weights, found NaN or infinity in {', '.join(not_finite[:3])}"
+            f"{', …' if len(not_finite) > 3 else ''}: run that stage again"
         )
     moved = {name: tensor.to(device) for name, tensor in tensors.items()}
     try:
@@ -157,6 +162,11 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         os.replace(out, old)
     os.replace(partial, out)
     _remove(old)
+
+
+def _is_usable(name: str, tensor: Tensor) -> bool:
+    # An infinite deviation is how networks leave out a part of their input.
+    return not (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
 
 
 def _remove(*folders: Path) -> None:

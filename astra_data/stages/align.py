@@ -11,6 +11,7 @@ from torch import Tensor
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
+from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -84,9 +85,8 @@ def align(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    settings_text = as_json(
-        **episodes.named, grounding_sha256=file_digest(grounding_file), seed=seed, align=config
-    )
+    grounding_digest = file_digest(grounding_file)
+    settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
     with finished_folder(out, config=settings_text) as folder:
         checkpoint = folder / "checkpoint.safetensors"
         descent = Descent(encoder, config, checkpoint=checkpoint)
@@ -110,6 +110,7 @@ def align(
         }
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
         checkpoint.unlink(missing_ok=True)
+        write_manifest(folder, {"dataset": episodes.content_hash, "grounding": grounding_digest})
 
 
 def _losses(

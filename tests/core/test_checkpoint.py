@@ -1,4 +1,5 @@
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,14 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from astra_data.core.checkpoint import finished_folder, flatten, load_tensors, save_tensors, unflatten
+from astra_data.core.checkpoint import (
+    finished_folder,
+    flatten,
+    load_tensors,
+    save_tensors,
+    understood,
+    unflatten,
+)
 from astra_data.core.errors import BadInputError
 
 
@@ -65,6 +73,28 @@ def test_files_that_are_missing_damaged_or_foreign_are_refused(tmp_path: Path) -
     save_file({"a": torch.ones(1)}, path, {"format": "pt"})
     with pytest.raises(BadInputError, match="not written by astra-data"):
         load_tensors(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "is_refused"),
+    [
+        ("layer.weight", float("nan"), True),
+        ("layer.weight", float("inf"), True),
+        ("state_std", float("nan"), True),
+        ("state_std", float("inf"), False),
+        ("layer.weight", 1e30, False),
+    ],
+)
+def test_weights_that_are_not_finite_are_refused(
+    tmp_path: Path, name: str, value: float, is_refused: bool
+) -> None:
+    path = tmp_path / "a.safetensors"
+    save_tensors(path, {name: torch.tensor([1.0, value]), "whole": torch.ones(1)}, {"kind": "toy"})
+    refusal = pytest.raises(
+        BadInputError, match=rf"expected finite weights, found NaN or infinity in {name}: "
+    )
+    with refusal if is_refused else nullcontext(), understood(path, "a toy", ["toy"], "cpu") as (tensors, _):
+        assert tensors[name][0] == 1
 
 
 @pytest.mark.parametrize(
