@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents
 from astra_data.dataset.description import ContentHash
 from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.lerobot_recording import open_recording
 from astra_data.dataset.parquet import read_arrays
+from astra_data.dataset.plain import read_statistics
 
 
 class Dataset(Contents):
@@ -30,16 +33,17 @@ class Dataset(Contents):
 
     @classmethod
     def open(cls, root: Path | str) -> "Dataset":
-        """Open the dataset in folder `root`; `versions.open_dataset` also takes names.
+        """Open the dataset in folder `root`, ours or LeRobot's; `versions.open_dataset` also takes names.
 
         Raises:
-            BadInputError: there is no dataset, or a LeRobot dataset without our metadata.
+            BadInputError: there is no dataset, or one of LeRobot without states or actions.
             CorruptDatasetError: it is incomplete or was altered; lists every fault.
         """
         root = Path(root)
         _refuse_others(root)
         with _explained(root):
-            return cls(**vars(read_contents(root)))
+            is_ours = (root / "meta/astra").is_dir() or not (root / INFO_PATH).is_file()
+            return cls(**vars(read_contents(root) if is_ours else open_recording(root)))
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -113,7 +117,10 @@ class Dataset(Contents):
             for episode in self.selected(episodes):
                 wanted[self.starts[episode] : self.starts[episode] + self.lengths[episode]] = True
         with _explained(self.root):
-            yield from read_arrays(self.paths, specs, wanted)
+            if self.recorded is None:
+                yield from read_arrays(self.paths, specs, wanted)
+            else:
+                yield from self.recorded.blocks(specs, self.selected(episodes))
 
     def selected(self, episodes: Collection[int] | None) -> NDArray[np.int64]:
         """Return the episode indices `episodes`, by default all, in the dataset's order.
@@ -176,6 +183,15 @@ class Dataset(Contents):
             raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
         return self.order[:count]
 
+    def statistics(self) -> dict[str, dict[str, Any]] | str:
+        """Return meta/stats.json, column to statistic to values, or what is wrong with it.
+
+        Of what LeRobot recorded, min, max and mean are computed from the values.
+        """
+        if self.recorded is None:
+            return read_statistics(self.root)
+        return ranges(self.blocks([column.name for column in self.schema]))
+
     def verify(self) -> list[str]:
         """Read every value again and compare the content hash; return what is wrong, empty if nothing is.
 
@@ -214,11 +230,6 @@ def _refuse_others(root: Path) -> None:
         raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
     if not (root / "meta").is_dir():
         raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
-    if (root / INFO_PATH).is_file() and not (root / "meta/astra").is_dir():
-        raise BadInputError(
-            f"{root} is a LeRobot dataset without our metadata: `astra-data repair {root} --out FOLDER` "
-            "makes one of ours of it, and leaves it as it is."
-        )
 
 
 @contextmanager

@@ -26,7 +26,7 @@ _STRUCTURE = {*(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX), *(names.TI
 
 
 def whole_runs(
-    folder: Path, columns: Sequence[PlainColumn], fps: int, notes: list[str]
+    folder: Path, columns: Sequence[PlainColumn], fps: int, notes: list[str], *, repeated: bool = False
 ) -> Iterator[tuple[int, Run]]:
     """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
 
@@ -35,6 +35,7 @@ def whole_runs(
         columns: the columns to read, LeRobot's own among them.
         fps: steps per second.
         notes: a sentence is added for each loss.
+        repeated: also yield episodes whose uid an earlier one has.
     """
     lengths = _lengths(folder, notes)
     episode = row = 0
@@ -51,7 +52,7 @@ def whole_runs(
                 return
             faults = [*(fault for _, fault in found), *flag_faults(run, episode)]
             uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
-            if uid in uids or uid < 0:
+            if uid < 0 or (uid in uids and not repeated):
                 faults.append(f"its uid {uid} is taken or negative")
             if faults:
                 notes.append(f"left out episode {episode}: {'; '.join(faults)}")
