@@ -54,10 +54,14 @@ def record(source: Source) -> str | None:
     """Return the record of an export of ours, None if it has none."""
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
-        found = _datasets(h5py, file).get(RECORD)
-        if found is None or found.shape != () or h5py.check_string_dtype(found.dtype) is None:
-            return None
-        return str(found.asstr()[()])
+        found = file
+        for part in RECORD.split("/"):
+            is_here = isinstance(found, h5py.Group) and part in found
+            if not is_here or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+                return None
+            found = found[part]
+        is_text = isinstance(found, h5py.Dataset) and h5py.check_string_dtype(found.dtype) is not None
+        return str(found.asstr()[()]) if is_text and found.shape == () else None
 
 
 def layout(source: Source) -> dict[str, Any]:
