@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
-from astra_data.dataset.lerobot_rows import Recorded
+from astra_data.dataset.lerobot_rows import RecordedFiles
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
@@ -51,7 +51,7 @@ class Contents:
     subset_seed: int
     task: str
     paths: list[Path]
-    recorded: Recorded | None = None
+    recorded: RecordedFiles | None = None
 
 
 def read_contents(root: Path) -> Contents:

@@ -19,7 +19,7 @@ from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
 from astra_data.dataset.declared import declared_columns, name_of
 from astra_data.dataset.description import ContentHash, complete_description, permutation
-from astra_data.dataset.lerobot_rows import ENDS, Recorded, Rows, our_columns
+from astra_data.dataset.lerobot_rows import ENDS, RecordedFiles, Rows, our_columns
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.plain import (
     Run,
@@ -103,7 +103,7 @@ def open_recording(root: Path) -> Contents:
         subset_seed=0,
         task=" / ".join(tasks[index] for index in sorted(tasks)),
         paths=data_files(root),
-        recorded=Recorded(
+        recorded=RecordedFiles(
             root=root,
             paths=data_files(root),
             rows=rows,

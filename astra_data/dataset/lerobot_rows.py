@@ -103,7 +103,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedFiles:
     """The files of a recording, and the E episodes in them that have steps.
 
     Attributes:

@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,11 @@ from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.lerobot_rows import RECORDED_TASK, Rows, our_columns
 from astra_data.dataset.plain import PlainColumn, Run
 
+More = Mapping[str, Array] | None
 STEPS = 4
 
 
-def rows_and_run(**more: Array) -> tuple[Rows, Run]:
+def rows_and_run(more: Mapping[str, Array]) -> tuple[Rows, Run]:
     """Return one episode of 4 rows with a state, and the columns `more`."""
     columns = {
         names.STATE: np.arange(2.0 * STEPS).reshape(STEPS, 2),
@@ -26,8 +28,10 @@ def rows_and_run(**more: Array) -> tuple[Rows, Run]:
     return Rows(stored, 10), Run(Path("file"), columns)
 
 
-def values(name: str, dtype: str = "float32", size: int = 1, **more: Array) -> Array:
-    rows, run = rows_and_run(**more)
+def values(
+    name: str, dtype: str = "float32", size: int = 1, more: Mapping[str, Array] | None = None
+) -> Array:
+    rows, run = rows_and_run(more or {})
     return rows.values(Column(name, dtype, size), run, 3, 100, 9)
 
 
@@ -43,8 +47,8 @@ def test_rows_are_numbered_anew() -> None:
 def test_recorded_next_states_keep_every_row() -> None:
     after = np.ones((STEPS, 2), np.float32)
     assert values(names.NEXT_STATE, size=2).tolist() == [[2, 3], [4, 5], [6, 7]]
-    np.testing.assert_array_equal(values(names.NEXT_STATE, size=2, **{names.NEXT_STATE: after}), after)
-    assert len(values(names.STATE, size=2, **{names.NEXT_STATE: after})) == STEPS
+    np.testing.assert_array_equal(values(names.NEXT_STATE, size=2, more={names.NEXT_STATE: after}), after)
+    assert len(values(names.STATE, size=2, more={names.NEXT_STATE: after})) == STEPS
 
 
 @pytest.mark.parametrize("has_next", [True, False])
@@ -53,15 +57,15 @@ def test_an_episode_that_is_cut_off_is_truncated_unless_it_terminated(has_next: 
     more: dict[str, Array] = {names.TERMINATED: np.arange(STEPS) == steps - 1}
     more |= {names.NEXT_STATE: np.ones((STEPS, 2), np.float32)} if has_next else {}
     last = np.arange(steps) == steps - 1
-    np.testing.assert_array_equal(values(names.TERMINATED, "bool", **more), last)
-    assert not values(names.TRUNCATED, "bool", **more).any()
-    np.testing.assert_array_equal(values(names.DONE, "bool", **more), last)
+    np.testing.assert_array_equal(values(names.TERMINATED, "bool", more=more), last)
+    assert not values(names.TRUNCATED, "bool", more=more).any()
+    np.testing.assert_array_equal(values(names.DONE, "bool", more=more), last)
     del more[names.TERMINATED]
-    np.testing.assert_array_equal(values(names.TRUNCATED, "bool", **more), last)
+    np.testing.assert_array_equal(values(names.TRUNCATED, "bool", more=more), last)
 
 
 def test_only_the_columns_that_are_needed_are_read() -> None:
-    rows, _ = rows_and_run(**{names.FRAME_INDEX: np.arange(STEPS), "force": np.ones(STEPS)})
+    rows, _ = rows_and_run({names.FRAME_INDEX: np.arange(STEPS), "force": np.ones(STEPS)})
 
     def read(name: str) -> set[str]:
         return {column.name for column in rows.stored_for([name])} - {names.EPISODE_INDEX, names.FRAME_INDEX}

@@ -54,7 +54,7 @@ def test_fields_of_another_kind_are_told(source: Source) -> None:
         list(restored(hdf5, source, record))
     with h5py.File(source.path, "r+") as file:
         file["rewards"] = rewards.astype("S")
-    with pytest.raises(CorruptDatasetError, match="field 'rewards' holds .*, expected 1 numbers per row"):
+    with pytest.raises(CorruptDatasetError, match=r"field 'rewards' holds .*, expected 1 numbers per row"):
         list(restored(hdf5, source, record))
     with h5py.File(source.path, "r+") as file:
         del file["rewards"]
