@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
+from astra_data.dataset.lerobot_rows import RecordedFiles
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
@@ -38,6 +39,7 @@ class Contents:
         task: the task of all episodes.
         paths: the data files in order.
         file_starts: first row of each file.
+        recorded: its files, where LeRobot recorded it and rows have to be converted; None for ours.
     """
 
     root: Path
@@ -52,6 +54,7 @@ class Contents:
     task: str
     paths: list[Path]
     file_starts: Ints
+    recorded: RecordedFiles | None = None
 
 
 def read_contents(root: Path) -> Contents:

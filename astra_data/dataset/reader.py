@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, Ints, read_contents
 from astra_data.dataset.digests import Digests, altered_columns, digests_of, read_digests
 from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.lerobot_recording import open_recording
+from astra_data.dataset.plain import read_statistics
 from astra_data.dataset.values import alterations, measure, read_values
 
 _LOG = logging.getLogger(__name__)
@@ -34,16 +37,17 @@ class Dataset(Contents):
 
     @classmethod
     def open(cls, root: Path | str) -> "Dataset":
-        """Open the dataset in folder `root`; `versions.open_dataset` also takes names.
+        """Open the dataset in folder `root`, ours or LeRobot's; `versions.open_dataset` also takes names.
 
         Raises:
-            BadInputError: there is no dataset, or a LeRobot dataset without our metadata.
+            BadInputError: there is no dataset, or one of LeRobot without states or actions.
             CorruptDatasetError: it is incomplete or was altered; lists every fault.
         """
         root = Path(root)
         _refuse_others(root)
         with _explained(root):
-            return cls(**vars(read_contents(root)))
+            is_ours = (root / "meta/astra").is_dir() or not (root / INFO_PATH).is_file()
+            return cls(**vars(read_contents(root) if is_ours else open_recording(root)))
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -186,6 +190,15 @@ class Dataset(Contents):
             raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
         return self.order[:count]
 
+    def statistics(self) -> dict[str, dict[str, Any]] | str:
+        """Return meta/stats.json, column to statistic to values, or what is wrong with it.
+
+        Of what LeRobot recorded, min, max and mean are computed from the values.
+        """
+        if self.recorded is None:
+            return read_statistics(self.root)
+        return ranges(self.blocks([column.name for column in self.schema]))
+
     def verify(self) -> list[str]:
         """Read every value again and compare content hash and digests; return what is wrong, if anything.
 
@@ -212,6 +225,8 @@ class Dataset(Contents):
     @cached_property
     def _digests(self) -> Digests:
         """The stored digests; where there are none, those of the values, if these have the content hash."""
+        if self.recorded is not None:
+            return self.recorded.digests
         try:
             stored, lack = self._stored_digests(), "it was written without digests of its values"
         except CorruptDatasetError as error:
@@ -259,11 +274,6 @@ def _refuse_others(root: Path) -> None:
         raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
     if not (root / "meta").is_dir():
         raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
-    if (root / INFO_PATH).is_file() and not (root / "meta/astra").is_dir():
-        raise BadInputError(
-            f"{root} is a LeRobot dataset without our metadata: `astra-data repair {root} --out FOLDER` "
-            "makes one of ours of it, and leaves it as it is."
-        )
 
 
 @contextmanager

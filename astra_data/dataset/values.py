@@ -24,6 +24,10 @@ def read_values(
     """
     if not columns:
         return
+    if contents.recorded is not None:
+        for position, block in enumerate(contents.recorded.blocks(columns, episodes)):
+            yield block, episodes[position : position + 1]
+        return
     wanted = None
     if len(episodes) < len(contents.lengths):
         wanted = np.zeros(int(contents.lengths.sum()), dtype=bool)

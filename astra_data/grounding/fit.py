@@ -9,8 +9,10 @@ import torch
 from pydantic import Field
 
 from astra_data.core.config import Config, Count, Number, Positive, Share
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
+from astra_data.dataset.columns import REWARD
 from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -109,9 +111,18 @@ class HistoryFit:
         )
 
     def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
-        """Return the grounding and its figures."""
+        """Return the grounding and its figures.
+
+        Raises:
+            BadInputError: the reward is to be predicted, and none was recorded.
+        """
         config = fitting.config
-        if config.reward == "correction":
+        if self.reward and not fitting.training.has_rewards:
+            raise BadInputError(
+                f"{fitting.training.reference} has no {REWARD}, which the method predicts: take one "
+                "that does not, such as nas"
+            )
+        if config.reward == "correction" and fitting.training.has_rewards:
             fitting = replace(
                 fitting,
                 training=residual_rewards(fitting.task, fitting.training),

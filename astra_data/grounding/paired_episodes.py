@@ -26,7 +26,7 @@ from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindow
 from astra_data.learning.recorded import draw_steps
 
 _COLUMNS = (
-    *(STATE, ACTION, REWARD, TERMINATED, SUCCESS),
+    *(STATE, ACTION, TERMINATED),
     *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE),
 )
 
@@ -44,6 +44,7 @@ class PairedEpisodes:
         content_hash: its hash.
         held_out: the episodes that the dataset marks as held out, (E,) bool; None if it marks none.
         dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
+        has_rewards: whether rewards were recorded; otherwise they are 0 here.
     """
 
     target_state: Tensor
@@ -54,6 +55,7 @@ class PairedEpisodes:
     content_hash: str
     held_out: Tensor | None = None
     dropped_place: tuple[int, ...] = ()
+    has_rewards: bool = True
 
     @property
     def named(self) -> dict[str, str]:
@@ -71,15 +73,16 @@ class PairedEpisodes:
         dataset = open_dataset(root)
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
-        names = [*_COLUMNS, *({GOAL} & dataset.features.keys())]
+        names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
         lengths = dataset.lengths.tolist()
         padded = {}
         for name, values in dataset.columns(names).items():
             steps = torch.from_numpy(values if values.dtype == bool else values.astype("float32", copy=False))
             padded[name] = pad_sequence(steps.to(device).split(lengths), batch_first=True)
         mask = torch.arange(max(lengths), device=device) < torch.tensor(lengths, device=device)[:, None]
-        action, reward, terminated = padded[ACTION], padded[REWARD], padded[TERMINATED]
-        failed = terminated & ~padded[SUCCESS]
+        action, terminated = padded[ACTION], padded[TERMINATED]
+        reward = padded.get(REWARD, torch.zeros_like(terminated, dtype=action.dtype))
+        failed = terminated & ~padded.get(SUCCESS, terminated)
         held_out = [bool(flag) for flag in dataset.metadata.get("held_out", ())]
         return cls(
             target_state=padded[STATE],
@@ -100,6 +103,7 @@ class PairedEpisodes:
             content_hash=dataset.content_hash,
             held_out=torch.tensor(held_out, device=device) if any(held_out) else None,
             dropped_place=_dropped_place(dataset),
+            has_rewards=REWARD in padded,
         )
 
     def __len__(self) -> int:

@@ -1,5 +1,4 @@
 import itertools
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -138,13 +137,6 @@ def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:
         write_fake(tmp_path / f"fake/data-{version}")
     with pytest.raises(BadInputError, match=r"holds versions .*: name one of data-1.0.0, data-1.1.0"):
         Dataset.open(tmp_path / "fake")
-
-
-def test_a_plain_lerobot_dataset_is_not_called_damaged(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    shutil.rmtree(root / "meta/astra")
-    with pytest.raises(BadInputError, match=r"LeRobot dataset without our metadata: `astra-data repair"):
-        Dataset.open(str(root))
 
 
 def test_damage_behind_an_open_dataset_is_told_too(tmp_path: Path) -> None:

@@ -27,7 +27,13 @@ _STRUCTURE = {*(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX), *(names.TI
 
 
 def whole_runs(
-    folder: Path, columns: Sequence[PlainColumn], digests: Digests, fps: int, notes: list[str]
+    folder: Path,
+    columns: Sequence[PlainColumn],
+    digests: Digests,
+    fps: int,
+    notes: list[str],
+    *,
+    repeated: bool = False,
 ) -> Iterator[tuple[int, Run]]:
     """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
 
@@ -37,6 +43,7 @@ def whole_runs(
         digests: those of the values, empty if they are not known; they tell altered episodes from whole ones.
         fps: steps per second.
         notes: a sentence is added for each loss.
+        repeated: also yield episodes whose uid an earlier one has.
     """
     lengths = _lengths(folder, notes)
     episode = row = 0
@@ -54,7 +61,7 @@ def whole_runs(
             faults = [*(fault for _, fault in found), *flag_faults(run, episode)]
             faults += run_alterations(run, episode, digests)
             uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
-            if uid in uids or uid < 0:
+            if uid < 0 or (uid in uids and not repeated):
                 faults.append(f"its uid {uid} is taken or negative")
             if faults:
                 notes.append(f"left out episode {episode}: {'; '.join(faults)}")
