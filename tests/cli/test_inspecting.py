@@ -7,7 +7,7 @@ from fake_dataset import COLUMNS, write_fake
 from typer.testing import CliRunner, Result
 
 from astra_data.cli import app as cli
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import AstraDataError
 
 
 def call(*arguments: str) -> Result:
@@ -31,9 +31,9 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     for arguments, told in (
         ([str(tmp_path / "none")], "no such folder"),
         ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "no column with the role position"),
-        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "expected a folder to write to"),
+        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: a file is where"),
     ):
         error = call("inspect", *arguments).exception
-        assert isinstance(error, BadInputError)
-        with pytest.raises(BadInputError, match=told):
+        assert isinstance(error, AstraDataError)
+        with pytest.raises(AstraDataError, match=told):
             raise error

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from racing import ROUNDS, race
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, DiskError
 from astra_data.core.lock import held
 from astra_data.dataset.atomic import atomic_file, atomic_folder
 
@@ -17,7 +17,7 @@ def test_a_place_that_cannot_be_written_is_told(
 ) -> None:
     (tmp_path / "file").touch()
     with (
-        pytest.raises(BadInputError, match=r"set cannot be written: .*; choose another place"),
+        pytest.raises(DiskError, match=r"set cannot be written: a file is where its folder would be"),
         writing(tmp_path / "file" / "set"),
     ):
         pass
@@ -40,7 +40,7 @@ def test_nothing_is_overwritten(
 
     with writing(target) as path:
         write(path, "first")
-        assert path.parent == tmp_path and path.name.startswith(".set.tmp-")
+        assert path.relative_to(tmp_path).parts[0].startswith(".set.tmp-")
         assert not target.exists()
     with pytest.raises(BadInputError, match="exists already"), writing(target):
         raise AssertionError("refused before anything is written")

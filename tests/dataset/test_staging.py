@@ -25,9 +25,8 @@ def leftovers(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
 
 
-@pytest.mark.parametrize("fsync", [True, False])
-def test_a_recording_is_the_dataset_that_is_written_at_once(tmp_path: Path, fsync: bool) -> None:
-    with staged_writer(tmp_path / "set", fsync=fsync) as writer:
+def test_a_recording_is_the_dataset_that_is_written_at_once(tmp_path: Path) -> None:
+    with staged_writer(tmp_path / "set") as writer:
         for episode in fake_episodes():
             writer.add(episode)
     assert files(tmp_path / "set") == files(write_fake(tmp_path / "whole").root)
@@ -129,7 +128,7 @@ def test_what_a_kill_after_the_end_left_is_cleared(tmp_path: Path) -> None:
 
 
 def test_another_dataset_in_its_place_does_not_cost_the_recording(tmp_path: Path) -> None:
-    interrupted(tmp_path / "set", fake_episodes()[:3])
+    interrupted(tmp_path / "set", [*fake_episodes()[:2], fake_episode(6, 31)])
     write_fake(tmp_path / "set")
     again = staged_writer(tmp_path / "set", resume=True)
     with pytest.raises(BadInputError, match="interrupted recording, which left 3 episodes in"), again:
@@ -168,8 +167,10 @@ def test_an_episode_is_on_the_disk_itself_before_it_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[str] = []
-    monkeypatch.setattr("astra_data.dataset.staging.sync", lambda path: synced.append(path.name))
-    with staged_writer(tmp_path / "set") as writer:
+    for module in ("dataset.staging", "core.durable"):
+        monkeypatch.setattr(f"astra_data.{module}.sync", lambda path: synced.append(path.name))
+    with staged_writer(tmp_path / "new" / "set") as writer:
+        assert {tmp_path.name, "new", "plan.json", ".set.staged"} <= {*synced}
         synced.clear()
         writer.add(fake_episode(1, 4))
         assert synced == ["000000.partial", ".set.staged"]
@@ -201,7 +202,7 @@ def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
 
 def record(root: Path) -> None:
     """Record, or go on with it, and print which episodes are safe."""
-    with staged_writer(root, resume=True, fsync=False) as writer:
+    with staged_writer(root, resume=True) as writer:
         for position in range(EPISODES_OF_THE_RECORDED):
             if position not in writer.staged:
                 writer.add(fake_episode(position, STEPS_OF_THE_RECORDED), position)
