@@ -2,9 +2,8 @@
 
 import os
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
 
@@ -25,23 +24,34 @@ def small_files(most: int) -> Iterator[None]:
 
 
 @contextmanager
-def failing(names: str, at: int, error: BaseException, *, dead: bool = False) -> Iterator[list[str]]:
-    """Raise `error` at call `at` of the functions `names` of `os`, if `dead` at all later ones too.
+def failing(
+    names: str, at: int, error: BaseException, then: BaseException | None = None
+) -> Iterator[list[str]]:
+    """Raise `error` at call `at` of the functions `names` of `os`, and `then` at all later ones.
 
     Yields the calls, in order.
     """
     calls: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         for name in names.split():
-            patch.setattr(os, name, _counted(name, getattr(os, name), calls, at, error, dead))
+            patch.setattr(os, name, _counted(name, getattr(os, name), calls, at, error, then))
         yield calls
 
 
-def _counted(name: str, works: Any, calls: list[str], at: int, error: BaseException, dead: bool) -> Any:  # noqa: ANN401
-    def call(*arguments: Any, **options: Any) -> Any:  # noqa: ANN401
+def _counted(
+    name: str,
+    works: Callable[..., object],
+    calls: list[str],
+    at: int,
+    error: BaseException,
+    then: BaseException | None,
+) -> Callable[..., object]:
+    def call(*arguments: object, **options: object) -> object:
         calls.append(name)
-        if len(calls) == at + 1 or (dead and len(calls) > at):
+        if len(calls) == at + 1:
             raise error
+        if then and len(calls) > at:
+            raise then
         return works(*arguments, **options)
 
     return call

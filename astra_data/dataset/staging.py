@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from astra_data.core.disk import writing
-from astra_data.core.durable import discard, make_folder, move, sync, write_file
+from astra_data.core.durable import discard, make_folder, move, sweep, sync, write_file
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
@@ -119,6 +119,7 @@ class StagedWriter:
             )
         with writing(self.folder), ExitStack() as stack:
             make_folder(self.folder)
+            sweep(self.root)
             if not stack.enter_context(held(self.folder)):
                 raise BadInputError(
                     f"{self.root} is being recorded right now; wait or choose another folder."

@@ -145,15 +145,17 @@ class DatasetWriter:
 
     def __enter__(self) -> "DatasetWriter":
         """Start the hidden folder."""
-        self._folder = self._exit.enter_context(atomic_folder(self.root))
-        encodings = layout.data_encodings(self._stored)
-        self._data = RotatingWriter(
-            self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
-        )
-        self._exit.callback(self._data.abandon)
-        self._rows = EpisodeRows(self._folder, self._stored, self._task)
-        self._exit.callback(self._rows.abandon)
-        self._exit.push(self._finish)
+        with ExitStack() as stack:
+            self._folder = stack.enter_context(atomic_folder(self.root))
+            encodings = layout.data_encodings(self._stored)
+            self._data = RotatingWriter(
+                self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
+            )
+            stack.callback(self._data.abandon)
+            self._rows = EpisodeRows(self._folder, self._stored, self._task)
+            stack.callback(self._rows.abandon)
+            stack.push(self._finish)
+            self._exit = stack.pop_all()
         self._is_open = True
         return self
 

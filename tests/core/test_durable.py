@@ -52,7 +52,7 @@ def test_a_kill_at_any_operation_leaves_the_old_file_or_the_new_one(tmp_path: Pa
     path = tmp_path / "file"
     for at in count():
         write_file(path, "old")
-        with failing(MUTATING, at, Killed(), dead=True) as calls:
+        with failing(MUTATING, at, Killed(), Killed()) as calls:
             try:
                 write_file(path, "new")
             except Killed:
@@ -112,7 +112,7 @@ def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path
         (folder / "deep").mkdir(parents=True)
         for name in ("plan", "deep/1", "deep/2"):
             (folder / name).touch()
-        with failing(MUTATING, at, Killed(), dead=True) as calls:
+        with failing(MUTATING, at, Killed(), Killed()) as calls:
             try:
                 discard(folder, tmp_path / "set")
             except Killed:

@@ -7,7 +7,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
 from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import RecipeError
+from astra_data.core.errors import DiskError, RecipeError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.exchange.sharing.card import render_card, write_card
