@@ -152,6 +152,7 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         if config is not None:
             _begin(partial, config)
         yield partial
+        clean(partial)
         sync_tree(partial)
         _put(partial, out, old)
 

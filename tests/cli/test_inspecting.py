@@ -37,3 +37,22 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
         assert isinstance(error, AstraDataError)
         with pytest.raises(AstraDataError, match=told):
             raise error
+
+
+def test_what_killed_commands_left_is_removed_on_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    dead, other = tmp_path / "home/ant/.data-1.0.0.tmp-7", tmp_path / "runs/.recipe.json.tmp-7"
+    staged = tmp_path / "home/.walks.staged"
+    for folder in (dead, other, staged):
+        folder.mkdir(parents=True)
+    assert call("list", "--clean").output.splitlines() == [
+        f"kept: {staged}: the command that was interrupted goes on with it, or delete it",
+        f"removed: {dead}",
+    ]
+    assert not dead.exists() and other.exists()
+    assert f"removed: {other}" in call("list", "--clean", str(tmp_path / "runs")).output
+    staged.rmdir()
+    assert call("list", "--clean").output == "nothing was left by killed commands\n"
+    assert "folders are for --clean" in str(call("list", str(tmp_path / "runs")).exception)
