@@ -96,9 +96,13 @@ def hidden_folder(target: Path) -> Iterator[Path]:
 
 
 def discard(folder: Path, target: Path) -> None:
-    """Remove `folder`, which belongs to `target`: rename it first, so that it cannot be half removed."""
+    """Remove `folder`, if it is there, which belongs to `target`.
+
+    It is renamed first, so that it cannot be half removed.
+    """
     dead = next(name for name in _hidden_names(target) if not name.exists())
-    move(folder, dead)
+    with suppress(FileNotFoundError):
+        move(folder, dead)
     shutil.rmtree(dead, ignore_errors=True)
 
 

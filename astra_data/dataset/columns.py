@@ -247,10 +247,7 @@ class Episode:
 
     def __post_init__(self) -> None:
         """Convert numpy scalars and array layouts, and validate the episode."""
-        metadata = {
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in self.metadata.items()
-        }
+        metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         given = self.columns.items()
         masked = [name for name, a in given if isinstance(a, np.ma.MaskedArray) and a.mask.any()]
         columns = {name: np.asarray(values, order="C") for name, values in given}

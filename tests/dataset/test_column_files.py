@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from failing_disk import small_files
 from fake_frames import NAMES, assert_equal, everything
 
-from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.errors import CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset, column_files
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.frames import Frames
@@ -54,6 +55,15 @@ def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
     os.truncate(path, 200)
     with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .*; delete it and try again"):
         Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+
+
+def test_a_full_disk_ends_with_an_error_and_no_raw_file(fake: Dataset, tmp_path: Path) -> None:
+    with (
+        small_files(200),
+        pytest.raises(DiskError, match=f"{STATE} cannot be written: a file would be"),
+    ):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert not list(tmp_path.rglob("*.npy"))
 
 
 def test_a_failure_leaves_no_raw_file(
