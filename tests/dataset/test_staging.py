@@ -306,6 +306,19 @@ def test_on_a_full_disk_the_episodes_are_safe_and_the_recording_goes_on(tmp_path
     assert leftovers(tmp_path) == []
 
 
+def test_a_disk_that_is_full_when_the_dataset_is_written_costs_no_episode(tmp_path: Path) -> None:
+    episodes = [fake_episode(uid, 200) for uid in range(4)]
+    with (
+        pytest.raises(DiskError, match=r"set cannot be written: .* 4 episodes are safe in"),
+        small_files(18_000),
+    ):
+        write_episodes(tmp_path / "set", episodes)
+    assert leftovers(tmp_path) == [".set.staged"]
+    assert files(write_episodes(tmp_path / "set", episodes)) == files(
+        write_episodes(tmp_path / "whole", episodes)
+    )
+
+
 def test_a_disk_that_fails_at_any_operation_loses_no_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
