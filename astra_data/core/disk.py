@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from astra_data.core.errors import DiskError
+from astra_data.core.errors import AstraDataError, DiskError
 
 _OF_THE_DISK = {
     errno.ENOSPC: ("the disk is full", "free space"),
@@ -64,7 +64,12 @@ def _report(fault: str, code: int) -> str:
 
 
 def _code(error: Exception) -> int | None:
-    """Return the system's number of a fault; HDF5 has it in the text of errors of any type."""
+    """Return the system's number of a fault; HDF5 has it in the text of errors of any type.
+
+    None where there is no number, or the error is one of ours, which says all there is to say.
+    """
+    if isinstance(error, AstraDataError):
+        return None
     if isinstance(error, OSError) and error.errno:
         return error.errno
     found = re.search(r"\berrno = (\d+)", str(error))

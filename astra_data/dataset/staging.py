@@ -162,8 +162,8 @@ class StagedWriter:
             yield
         except DiskError as error:
             raise DiskError(
-                f"{error} {len(self.staged)} episodes are safe in {self.folder}; "
-                "resume the recording (--resume)."
+                f"{error} {len(self.staged)} episodes are safe in {self.folder}: a recipe goes on with them "
+                "by itself, the command for a task with --resume."
             ) from error
 
     def add(self, episode: Episode, position: int | None = None) -> None:

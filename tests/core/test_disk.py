@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.disk import disk_error, writing
-from astra_data.core.errors import DiskError
+from astra_data.core.errors import BadInputError, DiskError
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,15 @@ def test_only_faults_of_what_is_written_are_blamed_on_it(name: str, is_ours: boo
         raise error
 
 
-@pytest.mark.parametrize("error", [ValueError("a bug"), OSError("without a number"), KeyError("errno = x")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("a bug"),
+        OSError("without a number"),
+        KeyError("errno = x"),
+        BadInputError("log.h5 cannot be read (errno = 5)"),
+    ],
+)
 def test_other_errors_pass(error: Exception) -> None:
     with pytest.raises(type(error)) as caught, writing(Path("a/set")):
         raise error

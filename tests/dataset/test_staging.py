@@ -295,7 +295,8 @@ def test_on_a_full_disk_the_episodes_are_safe_and_the_recording_goes_on(tmp_path
     assert str(caught.value) == (
         f"{tmp_path / '.set.staged' / '000001.arrow'} cannot be written: a file would be larger than is "
         "allowed. What was finished before is safe: raise the limit (ulimit -f), then run the same command "
-        f"again. 1 episodes are safe in {tmp_path / '.set.staged'}; resume the recording (--resume)."
+        f"again. 1 episodes are safe in {tmp_path / '.set.staged'}: a recipe goes on with them by itself, "
+        "the command for a task with --resume."
     )
     with staged_writer(tmp_path / "set", resume=True) as writer:
         assert list(writer.staged) == [0]
