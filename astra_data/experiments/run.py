@@ -1,6 +1,5 @@
 """Run recipes: make every artefact that is not finished yet, for every row and seed."""
 
-import os
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
@@ -14,6 +13,7 @@ from rich.console import Console
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.cores import cores
+from astra_data.core.durable import make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
@@ -192,9 +192,7 @@ def make(
         for key, reason in again.items():
             line = f"{key} is made again: {reason}; the old one is in {_set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
-        partial_file = folder / ".recipe.json.partial"
-        partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
-        os.replace(partial_file, folder / "recipe.json")
+        write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
         # One thread for the networks: they are small, and idle threads would slow down other items.
         prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
         with show(len(items), console) as watch:
@@ -232,8 +230,8 @@ def _set_aside(folder: Path, key: str) -> Path:
     """Move the artefact `key` out of the way; return where it is now."""
     places = (folder / SET_ASIDE / str(number) / key for number in count(1))
     aside = next(place for place in places if not place.exists())
-    aside.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(folder / key, aside)
+    make_folder(aside.parent)
+    move(folder / key, aside)
     return aside
 
 
