@@ -52,6 +52,10 @@ RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDE
 """Columns filled in by the writer; all but the first are LeRobot's own."""
 
 DTYPES = ("float32", "int64", "bool")
+MOST_VALUES = 2**20
+"""Upper bound of the values of a column per step: beyond, a declared size is an error, and fills memories."""
+MOST_NAME_BYTES = 200
+"""Upper bound of a column's name, which also names files: file systems take 255 bytes."""
 ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 
@@ -101,8 +105,10 @@ class Column:
             faults.append("the name must not be empty or contain '/'")
         if self.dtype not in DTYPES:
             faults.append(f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}")
-        if self.size < 1:
-            faults.append(f"size {self.size} is less than 1")
+        if len(self.name.encode(errors="replace")) > MOST_NAME_BYTES:
+            faults.append(f"the name is longer than {MOST_NAME_BYTES} bytes")
+        if not 1 <= self.size <= MOST_VALUES:
+            faults.append(f"size {self.size}, expected 1 to {MOST_VALUES}")
         if self.names is not None and len(self.names) != self.size:
             faults.append(f"{len(self.names)} names for {self.size} values")
         for key, words in (self.astra or {}).items():
@@ -116,7 +122,7 @@ class Column:
         if not faults:
             faults = [*self._role_faults(), *self._mirror_faults()]
         if faults:
-            raise BadInputError(f"Column {self.name!r}: {'; '.join(faults)}.")
+            raise BadInputError(f"Column {self.name[:MOST_NAME_BYTES]!r}: {'; '.join(faults)}.")
 
     @property
     def roles(self) -> list[tuple[str, slice]]:

@@ -88,7 +88,7 @@ def read_contents(root: Path) -> Contents:
     index, lengths, chunks, files, starts = (
         to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
     )
-    uids = np.array(metadata.pop("episode_uid"), dtype=np.int64)
+    uids = _uids(metadata.pop("episode_uid"))
     metadata.pop("length")
     pattern = info["data_path"]
     rows: dict[Path, int] = {}
@@ -121,6 +121,12 @@ def read_contents(root: Path) -> Contents:
         task=tasks[0],
         paths=list(rows),
     )
+
+
+def _uids(values: Sequence[object]) -> Ints:
+    if not all(type(value) is int and 0 <= value < 2**63 for value in values):
+        raise CorruptDatasetError(f"{layout.METADATA_PATH} has an episode_uid that is none")
+    return np.array(values, dtype=np.int64)
 
 
 def _file_faults(root: Path, columns: Sequence[Column], rows: Mapping[Path, int]) -> Iterator[str]:

@@ -101,3 +101,19 @@ def test_a_missing_or_unreadable_recipe_is_one_line(tmp_path: Path) -> None:
 def test_names_without_a_close_match_are_all_listed() -> None:
     assert did_you_mean("nass", ("nas", "astra")) == ": did you mean 'nas'?"
     assert did_you_mean("x", ("nas", "astra")) == "; known: nas, astra"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x = " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
+        (".".join("a" * 5000) + " = 1", "is nested too deeply"),
+        ("x = " + "9" * 5000, "cannot be read as TOML: Exceeds the limit"),
+    ],
+)
+def test_hostile_toml_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    with pytest.raises(RecipeError, match=told) as error:
+        load_recipe(path, Experiment)
+    assert "\n" not in str(error.value)

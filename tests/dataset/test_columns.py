@@ -117,3 +117,17 @@ def test_a_mirror_image_is_a_swap_with_signs() -> None:
 def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match="Column 'x'"):
         Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
+
+
+@pytest.mark.parametrize(
+    ("column", "told"),
+    [
+        ({"name": "x" * 201}, "the name is longer than 200 bytes"),
+        ({"name": "\u4e16" * 67}, "the name is longer than 200 bytes"),
+        ({"name": "x", "size": 2**30}, "size 1073741824, expected 1 to 1048576"),
+    ],
+)
+def test_a_column_too_large_for_files_or_memories_is_refused(column: dict[str, Any], told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        Column(**column)
+    Column("x" * 200, size=2**20)
