@@ -122,8 +122,8 @@ def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> 
 @pytest.mark.parametrize(
     ("column", "told"),
     [
-        ({"name": "x" * 201}, "the name is longer than 200 bytes"),
-        ({"name": "\u4e16" * 67}, "the name is longer than 200 bytes"),
+        ({"name": "x" * 201}, "the name must have 1 to 200 bytes"),
+        ({"name": "\u4e16" * 67}, "the name must have 1 to 200 bytes"),
         ({"name": "x", "size": 2**30}, "size 1073741824, expected 1 to 1048576"),
     ],
 )
