@@ -43,10 +43,10 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
         raise CorruptDatasetError(f"expected {size} values in every row, some are missing")
     # Through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no packed bits.
     bits = dtype == "bool"
-    try:
-        values = [np.from_dlpack(part.cast(pa.uint8()) if bits else part) for part in parts]
-    except pa.ArrowException as error:
-        raise CorruptDatasetError(f"expected {dtype}, got {column.type}") from error
+    numeric = (pa.types.is_integer, pa.types.is_floating)
+    if not all(pa.types.is_boolean(p.type) if bits else any(k(p.type) for k in numeric) for p in parts):
+        raise CorruptDatasetError(f"expected {dtype}, got {column.type}")
+    values = [np.from_dlpack(part.cast(pa.uint8()) if bits else part) for part in parts]
     flat: Array = np.concatenate(values).astype(dtype, copy=False)
     return flat if size == 1 else flat.reshape(-1, size)
 

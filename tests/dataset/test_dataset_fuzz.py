@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES
 from fake_dataset import write_fake
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from astra_data.core.errors import AstraDataError
@@ -197,6 +197,8 @@ TYPES = (
     kind=st.sampled_from(TYPES),
     seed=st.integers(0, 60),
 )
+@example(EPISODES, 0.0, "retyped", pa.bool_(), 0)
+@example(PARQUET[3], 0.0, "retyped", pa.int8(), 0)
 @fuzzed
 def test_tables_of_other_columns(name: str, share: float, change: str, kind: pa.DataType, seed: int) -> None:
     with copied() as root:
