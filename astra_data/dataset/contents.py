@@ -94,7 +94,7 @@ def read_contents(root: Path) -> Contents:
     index, lengths, chunks, files, starts = (
         to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
     )
-    uids = np.array(metadata.pop("episode_uid"), dtype=np.int64)
+    uids = _uids(metadata.pop("episode_uid"))
     listed = metadata.pop("length")
     pattern = info["data_path"]
     rows: dict[Path, int] = {}
@@ -130,6 +130,12 @@ def read_contents(root: Path) -> Contents:
         paths=list(rows),
         file_starts=np.cumsum([0, *rows.values()])[:-1],
     )
+
+
+def _uids(values: Sequence[object]) -> Ints:
+    if not all(type(value) is int and 0 <= value < 2**63 for value in values):
+        raise CorruptDatasetError(f"{layout.METADATA_PATH} has an episode_uid that is none")
+    return np.array(values, dtype=np.int64)
 
 
 def _file_faults(root: Path, columns: Sequence[Column], rows: Mapping[Path, int]) -> Iterator[str]:

@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +22,15 @@ from astra_data.exchange.cutting import Cut, Cutter, Tally
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, find_sources, is_archive
+from astra_data.exchange.recording import (
+    MOST_UNPACKED,
+    SMALL_BYTES,
+    VALUE_BYTES,
+    Block,
+    Source,
+    find_sources,
+    is_archive,
+)
 from astra_data.exchange.restoring import read_record, restored, write_restored
 
 FORMATS: Mapping[str, ModuleType] = {
@@ -79,6 +87,7 @@ def import_dataset(
     name: str | None = None,
     fps: int | None = None,
     task: str | None = None,
+    max_bytes: int | None = None,
 ) -> ImportReport:
     """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
 
@@ -93,9 +102,12 @@ def import_dataset(
         name: of the dataset; like `fps` and `task`, it overrides the mapping.
         fps: steps per second.
         task: what the episodes do.
+        max_bytes: the most bytes of values that are taken from the recordings, eight a value; by default 100
+            times the size of the files, or 256 MiB if that is more.
 
     Raises:
-        BadInputError: a recording is malformed or does not fit the mapping; nothing is written.
+        BadInputError: a recording is malformed, unpacks to too much or does not fit the mapping; nothing is
+            written.
         CorruptDatasetError: an export of ours was altered; nothing is written.
         RecipeError: the mapping has faults.
     """
@@ -109,7 +121,7 @@ def import_dataset(
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
-    sources = [source for recording in recordings for source in _sources(recording, chosen)]
+    sources = _bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes)
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
@@ -123,7 +135,7 @@ def import_dataset(
         deque(episodes, maxlen=0)  # verifies the sums
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
-    cuts = _episodes(sources, chosen, settings, cutter)
+    cuts = _in_memory(_episodes(sources, chosen, settings, cutter))
     first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
@@ -186,6 +198,14 @@ def _format_of(recording: Path) -> str:
     )
 
 
+def _bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
+    """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
+    if max_bytes is None:
+        size = sum(file.stat().st_size for file in _files(sources))
+        max_bytes = max(SMALL_BYTES, MOST_UNPACKED * size)
+    return [replace(source, most_bytes=max_bytes) for source in sources]
+
+
 def _suffixes(module: ModuleType) -> tuple[str, ...]:
     return tuple(getattr(module, "SUFFIXES", ()))
 
@@ -216,15 +236,27 @@ def _episodes(
     sources: Sequence[Source], file_format: str, mapping: ImportMapping, cutter: Cutter
 ) -> Iterator[Cut]:
     recording = None
+    size = 0
     for source in sources:
         is_apart = mapping.split.files or source.recording != recording
         origin, row = "", 0
         for block in _blocks(source, file_format, mapping):
+            size += VALUE_BYTES * sum(values.size for values in block.values.values())
+            source.refuse_beyond(size)
             recording = source.recording
             row = row if block.origin == origin else 0
             yield from cutter.feed(block, row, is_apart=is_apart)
             is_apart, origin, row = False, block.origin, row + len(block)
     yield from cutter.finish()
+
+
+def _in_memory(episodes: Iterator[Cut]) -> Iterator[Cut]:
+    try:
+        yield from episodes
+    except MemoryError as error:
+        raise BadInputError(
+            f"an episode does not fit into memory ({first_line(error)}): cut it by [split] in the mapping"
+        ) from error
 
 
 def _blocks(source: Source, file_format: str, mapping: ImportMapping) -> Iterator[Block]:
@@ -266,7 +298,11 @@ def _last_rows(tally: Tally) -> str:
 
 def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Return name and sha256 of every file of the recordings."""
-    files = []
+    return [{"name": file.name, "sha256": file_digest(file)} for file in _files(sources)]
+
+
+def _files(sources: Sequence[Source]) -> list[Path]:
+    files: list[Path] = []
     for path in dict.fromkeys(source.path for source in sources):
         files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    return [{"name": file.name, "sha256": file_digest(file)} for file in files]
+    return files

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.checkpoint import finished_folder
-from astra_data.core.config import Count, NotNegative, Positive, as_json
+from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
@@ -30,9 +30,9 @@ class AlignConfig(DescentConfig):
 
     updates: Count = 600
     """Gradient updates in all."""
-    batch_windows: Count = 32
+    batch_windows: AtOnce = 32
     """Windows per update."""
-    window: Count = 100
+    window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
     """Of the MMD's kernels, in units of the square root of the latent's size."""

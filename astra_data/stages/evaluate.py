@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from astra_data.core.checkpoint import finished_folder, save_tensors
-from astra_data.core.config import Config, Count, Positive
+from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
@@ -47,7 +47,7 @@ Begin = Callable[[Tensor], Act]
 class EvaluateConfig(Config):
     """How policies are tested; the paper uses 100 episodes."""
 
-    episodes: Count = 100
+    episodes: AtOnce = 100
     """Run in one batch, in the target and in each simulator."""
     encoder: EncoderKind = "target"
     """Encoder with which an aligned policy is deployed for the headline figures; both are reported."""

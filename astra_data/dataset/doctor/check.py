@@ -78,7 +78,9 @@ def check(root: Path) -> Report:
         try:
             checks.run()
             checks.totals()
-            if is_ours:
+            if not report.frames:
+                report.fault("values", "there are no steps")
+            elif is_ours:
                 _global_statistics(root, columns, report)
                 _astra_faults(root, description, checks, report)
         except AstraDataError as error:
@@ -154,7 +156,7 @@ def _strangers(root: Path, report: Report) -> None:
     """Report unknown files: in data/ as faults, in meta/, where other tools may add some, as notes."""
     known = {root / path for path in _META_FILES} | {*data_files(root), *episodes_files(root)}
     for path in sorted([*(root / "data").rglob("*"), *(root / "meta").rglob("*")]):
-        if path.is_file() and path not in known:
+        if not path.is_dir() and path not in known:
             add = report.fault if path.is_relative_to(root / "data") else report.note
             add("files", f"{path.relative_to(root)} does not belong to it")
 

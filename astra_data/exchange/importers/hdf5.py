@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -11,14 +11,12 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import NEXT_STATE, STATE, TRUNCATED, Array
+from astra_data.exchange.hdf5_storage import check_storage, stored_datasets, unpacked_bytes
 from astra_data.exchange.layouts import D3RLPY, D4RL, NUMBERED, RECORD, ROBOMIMIC
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, natural, row_count
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
-
-MOST_COMPRESSED = 10_000
-"""Larger than the compression ratio of any filter; beyond it, the values were never written."""
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -36,7 +34,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             rowed = [field for field in mapping.all_fields if field not in single]
             n = row_count(origin, rowed, shapes)
             used = {field: datasets[field] for field in mapping.all_fields}
-            _check_storage(used, origin)
+            check_storage(used, origin)
+            source.refuse_beyond(unpacked_bytes(used))
             for first in range(0, n, BLOCK_ROWS):
                 rows = slice(first, min(first + BLOCK_ROWS, n))
                 values = {
@@ -76,7 +75,7 @@ def layout(source: Source) -> dict[str, Any]:
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
-        fields = _datasets(h5py, file)
+        fields = stored_datasets(h5py, file)
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
             return {"columns": columns}
@@ -89,7 +88,7 @@ def layout(source: Source) -> dict[str, Any]:
                 f"{source}: neither D4RL's layout (observations, actions) nor d3rlpy's (observations_0) nor "
                 "robomimic's (data/demo_0); pass --mapping"
             )
-        demo = _datasets(h5py, file[f"data/{demos[0]}"])
+        demo = stored_datasets(h5py, file[f"data/{demos[0]}"])
         columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
         for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
             found = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
@@ -112,10 +111,10 @@ def _episodes(
     """Yield the name of each episode's part of the file and its fields."""
     if pattern != NUMBERED:
         for group in _groups(h5py, file, pattern, origin):
-            yield f"{origin}{group.name}".rstrip("/"), _datasets(h5py, group)
+            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(h5py, group)
         return
     numbered: dict[int, dict[str, Any]] = {}
-    for name, dataset in _datasets(h5py, file).items():
+    for name, dataset in stored_datasets(h5py, file).items():
         if found := re.fullmatch(r"(.+)_([0-9]+)", name):
             numbered.setdefault(int(found[2]), {})[found[1]] = dataset
     for number in sorted(numbered):
@@ -152,26 +151,3 @@ def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN4
             f"{origin}{group.name.rstrip('/')}/{name} is a link; replace it by a copy of its target"
         )
     return group[name]
-
-
-def _check_storage(datasets: Mapping[str, Any], origin: str) -> None:
-    faults = []
-    for field, dataset in datasets.items():
-        if dataset.external or dataset.is_virtual:
-            faults.append(f"field '{field}' lies in another file; copy it into this one")
-        elif dataset.nbytes > MOST_COMPRESSED * (dataset.id.get_storage_size() + 2**10):
-            faults.append(f"field '{field}' claims the shape {dataset.shape}, but the file does not hold it")
-    if faults:
-        raise BadInputError(f"{origin}: {'; '.join(faults)}")
-
-
-def _datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py
-    """Map the path of each dataset below `group` to it; links into other files are not followed."""
-    found: dict[str, Any] = {}
-
-    def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset):
-            found[name] = item
-
-    group.visititems(visit)
-    return found

@@ -228,3 +228,26 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(BadInputError, match=r'h5py .*not installed: .* pip install "astra-data\[hdf5\]"'):
         imported(tmp_path, path)
+
+
+def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        for field in rows():
+            file.create_dataset(field, data=np.zeros(10**5), compression="gzip")
+    with pytest.raises(BadInputError, match=r"log.h5 holds values of 5600000 bytes or more.*--max-bytes"):
+        imported(tmp_path, path)
+
+
+def test_a_chunk_far_larger_than_its_rows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    path = write_table(tmp_path / "log.h5", rows())
+    with h5py.File(path, "a") as file:
+        values = file["x"][:]
+        del file["x"]
+        file.create_dataset("x", data=values, chunks=(2**22,), maxshape=(None,), compression="gzip")
+    with pytest.raises(BadInputError, match=r"holds values of 33\d+ bytes or more"):
+        imported(tmp_path, path)
