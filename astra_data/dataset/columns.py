@@ -247,16 +247,16 @@ class Episode:
 
     def __post_init__(self) -> None:
         """Convert numpy scalars and array layouts, and validate the episode."""
-        metadata = {
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in self.metadata.items()
-        }
-        columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
+        metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
+        given = self.columns.items()
+        masked = [name for name, a in given if isinstance(a, np.ma.MaskedArray) and a.mask.any()]
+        columns = {name: np.asarray(values, order="C") for name, values in given}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
         faults = []
         if type(self.uid) is not int or not 0 <= self.uid < 2**63:
             faults.append(f"uid {self.uid!r}, expected an int in [0, 2^63)")
+        faults += [f"{name}: masked values, expected a value for every step" for name in masked]
         faults += [fault for name, values in self.columns.items() for fault in _column_faults(name, values)]
         lengths = {name: len(values) for name, values in columns.items() if values.ndim}
         if not columns:

@@ -47,7 +47,8 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
         if sorted(parent) != ["hash", "name", "version"]:
             faults.append(f"parent {dict(parent)}, expected name, version and hash")
     try:
-        full = json.loads(json.dumps(full, allow_nan=False))
+        text = json.dumps(full, allow_nan=False, ensure_ascii=False)
+        full = json.loads(text.encode())
     except (TypeError, ValueError) as error:
         faults.append(f"expected plain JSON ({error})")
     if faults:

@@ -1,6 +1,7 @@
 """Parquet files: numpy columns in and out, and a writer that starts a new file when one is full."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -154,3 +155,11 @@ class RotatingWriter:
         """Write the footer."""
         self._writer.close()
         self._file.close()
+
+    def abandon(self) -> None:
+        """Close a file that is not wanted any more; if it is closed already, do nothing."""
+        with suppress(OSError):
+            self._writer.close()
+        self._writer.is_open = False  # or it would try again when it is collected
+        with suppress(OSError):
+            self._file.close()

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset.admission import Admission
+from astra_data.dataset.admission import Admission, is_text
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.column_statistics import episode_statistics, global_statistics
 from astra_data.dataset.columns import Column, Episode, Scalar
@@ -92,6 +92,8 @@ class DatasetWriter:
             faults.append(f"fps {fps!r}, expected a positive int")
         if compression not in layout.COMPRESSIONS:
             faults.append(f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}")
+        if not is_text(task):
+            faults.append(f"task {task!r}, expected text of valid characters")
         if faults:
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
         self.root = root
@@ -143,13 +145,17 @@ class DatasetWriter:
 
     def __enter__(self) -> "DatasetWriter":
         """Start the hidden folder."""
-        self._folder = self._exit.enter_context(atomic_folder(self.root))
-        encodings = layout.data_encodings(self._stored)
-        self._data = RotatingWriter(
-            self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
-        )
-        self._rows = EpisodeRows(self._folder, self._stored, self._task)
-        self._exit.push(self._finish)
+        with ExitStack() as stack:
+            self._folder = stack.enter_context(atomic_folder(self.root))
+            encodings = layout.data_encodings(self._stored)
+            self._data = RotatingWriter(
+                self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
+            )
+            stack.callback(self._data.abandon)
+            self._rows = EpisodeRows(self._folder, self._stored, self._task)
+            stack.callback(self._rows.abandon)
+            stack.push(self._finish)
+            self._exit = stack.pop_all()
         self._is_open = True
         return self
 
@@ -192,11 +198,11 @@ class DatasetWriter:
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the data files and, unless there was an error, write all other files and verify."""
-        self._data.close()
-        self._rows.close()
+        """Unless there was an error, close the data files, write all other files and verify."""
         if error is not None:
             return
+        self._data.close()
+        self._rows.close()
         if not self._lengths:
             raise BadInputError(f"{self.root}: no episodes were added; a dataset needs at least one.")
         episodes, uids = len(self._lengths), list(self._lengths)

@@ -12,6 +12,7 @@ from typing import Any
 from astra_data.core.config import did_you_mean, load_recipe, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
 from astra_data.dataset.parquet import first_line
 from astra_data.dataset.versions import place
@@ -102,6 +103,9 @@ def import_dataset(
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
     sources = [source for recording in recordings for source in _sources(recording, chosen)]
+    strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
+    if strange:
+        raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
     episodes = _episodes(sources, chosen, settings, cutter)

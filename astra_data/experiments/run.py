@@ -1,6 +1,5 @@
 """Run recipes: make every artefact that is not finished yet, for every row and seed."""
 
-import os
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
@@ -13,6 +12,7 @@ from rich.console import Console
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.cores import cores
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
@@ -169,9 +169,7 @@ def make(
         items = [item for item in items if not finished(item, experiment)]
         _check_inputs(experiment, items)
         experiment.link_borrowed()
-        partial_file = folder / ".recipe.json.partial"
-        partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
-        os.replace(partial_file, folder / "recipe.json")
+        write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
         # One thread for the networks: they are small, and idle threads would slow down other items.
         prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
         with show(len(items), Console()) as watch:

@@ -139,7 +139,6 @@ def collect(
         description=description,
         subset_seed=derive(seed, "subset"),
         resume=resume,
-        fsync=False,
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))

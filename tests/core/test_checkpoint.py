@@ -1,14 +1,19 @@
+import errno
+import os
 from collections.abc import Mapping
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from failing_disk import failing
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from astra_data.core.checkpoint import finished_folder, flatten, load_tensors, save_tensors, unflatten
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, DiskError
 
 
 def assert_same(actual: object, expected: object) -> None:
@@ -232,3 +237,57 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
         save_tensors(path, {"x": torch.arange(3.0), "y": torch.ones(2, 2)}, metadata)
     assert len({path.read_bytes() for path in paths}) == 1
     assert load_tensors(paths[0])[1] == metadata
+
+
+def test_a_disk_that_fails_at_any_operation_leaves_a_folder_to_go_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+
+    def make(out: Path) -> None:
+        with finished_folder(out, config="1") as folder:
+            save_tensors(folder / "model.safetensors", {"weight": torch.ones(2)}, {})
+
+    make(tmp_path / "whole")
+    whole = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()}
+    for at in count():
+        out = tmp_path / f"at_{at}" / "out"
+        with failing("mkdir rename replace unlink rmdir fsync", at, OSError(errno.ENOSPC, "")) as calls:
+            try:
+                make(out)
+            except DiskError as error:
+                assert "cannot be written: the disk is full" in str(error)
+        if not out.exists():
+            make(out)
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
+        if len(calls) <= at:
+            break
+    assert at > 15
+
+
+def test_a_disk_that_fails_while_a_folder_is_replaced_leaves_the_old_one_or_the_new_one(
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "out"
+    (out / "first").mkdir(parents=True)
+    for at in count():
+        with (
+            failing("rename replace", at, OSError(errno.EIO, "fault")) as calls,
+            suppress(DiskError),
+            finished_folder(out, replace=True) as folder,
+        ):
+            (folder / f"{at}").touch()
+        assert len(list(out.iterdir())) == 1
+        if len(calls) <= at:
+            break
+    assert [path.name for path in out.iterdir()] == [str(at)]
+    assert at > 1
+
+
+def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path) -> None:
+    partial = tmp_path / ".out.partial"
+    (partial / ".checkpoint.safetensors.tmp-7").mkdir(parents=True)
+    (partial / ".model.safetensors.partial").touch()
+    with finished_folder(tmp_path / "out", config="1") as folder:
+        (folder / "model").touch()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "model"]

@@ -117,3 +117,11 @@ def test_a_mirror_image_is_a_swap_with_signs() -> None:
 def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match="Column 'x'"):
         Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
+
+
+def test_masked_values_are_refused_and_a_mask_without_any_is_not() -> None:
+    values = np.ma.array(np.arange(6, dtype=np.float32).reshape(3, 2))  # type: ignore[no-untyped-call]
+    assert np.array_equal(Episode(0, {"action": values}).columns["action"], values.data)
+    values[1, 0] = np.ma.masked
+    with pytest.raises(BadInputError, match="action: masked values, expected a value for every step"):
+        Episode(0, {"action": values})

@@ -1,3 +1,4 @@
+import os
 import tarfile
 from pathlib import Path
 
@@ -118,3 +119,10 @@ def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
     dataset, report = imported(tmp_path, write_table(tmp_path / "log.csv", rows() | {"reward": reward}))
     assert dataset.columns([REWARD])[REWARD].sum() == 1
     assert "last rows without a next state: 2 (with them a reward of 1.5 in sum); rows" in str(report)
+
+
+def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.csv", rows())
+    os.rename(os.fsencode(path), os.fsencode(tmp_path) + b"/log\xff.csv")
+    with pytest.raises(BadInputError, match=r"'log\\udcff\.csv': expected a name in UTF-8; rename the file"):
+        imported(tmp_path, [tmp_path / os.fsdecode(b"log\xff.csv")], PER_FILE)
