@@ -1,6 +1,7 @@
 """Import recordings in other formats as datasets."""
 
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -18,9 +19,11 @@ from astra_data.dataset.parquet import first_line
 from astra_data.dataset.versions import place
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter, Tally
+from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block, Source, find_sources, is_archive
+from astra_data.exchange.restoring import read_record, restored, write_restored
 
 FORMATS: Mapping[str, ModuleType] = {
     "csv": csv,
@@ -79,9 +82,12 @@ def import_dataset(
 ) -> ImportReport:
     """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
 
+    Of our own exports the sums are verified; without a mapping, all that was exported comes back.
+
     Args:
         recordings: files, folders or archives of one format.
-        mapping: the file that says which fields become which columns; D4RL, robomimic and Minari need none.
+        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy and Minari
+            need none.
         out: the dataset's folder, by default its place at home.
         file_format: one of `FORMATS`, by default inferred from the recordings' names.
         name: of the dataset; like `fps` and `task`, it overrides the mapping.
@@ -90,6 +96,7 @@ def import_dataset(
 
     Raises:
         BadInputError: a recording is malformed or does not fit the mapping; nothing is written.
+        CorruptDatasetError: an export of ours was altered; nothing is written.
         RecipeError: the mapping has faults.
     """
     began = time.perf_counter()
@@ -106,10 +113,18 @@ def import_dataset(
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
+    records = {source: record for source in sources if (record := _record(source, chosen))}
+    for source, record in records.items():
+        episodes = _restored(source, chosen, record)
+        if settings is None:
+            root, frames = write_restored(sources, record, episodes, options, _identities(sources), out)
+            seconds = time.perf_counter() - began
+            return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
+        deque(episodes, maxlen=0)  # verifies the sums
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
-    episodes = _episodes(sources, chosen, settings, cutter)
-    first = next(episodes, None)
+    cuts = _episodes(sources, chosen, settings, cutter)
+    first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
         raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes ({_losses(cutter.tally)})")
@@ -124,7 +139,7 @@ def import_dataset(
     with DatasetWriter(
         root, cutter.columns, fps=settings.fps, task=settings.task, description=description
     ) as writer:
-        for count, (columns, metadata) in enumerate(chain([first], episodes), start=1):
+        for count, (columns, metadata) in enumerate(chain([first], cuts), start=1):
             writer.add(Episode(count - 1, columns, metadata))
             frames += len(columns[TRUNCATED])
         _refuse_rejected(cutter.tally, settings)
@@ -132,6 +147,16 @@ def import_dataset(
         seconds = time.perf_counter() - began
         writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
     return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began)
+
+
+def _record(source: Source, file_format: str) -> ExportRecord | None:
+    with _explained(source, file_format):
+        return read_record(FORMATS[file_format], source)
+
+
+def _restored(source: Source, file_format: str, record: ExportRecord) -> Iterator[Episode]:
+    with _explained(source, file_format):
+        yield from restored(FORMATS[file_format], source, record)
 
 
 def _common_format(recordings: Sequence[Path]) -> str:

@@ -4,6 +4,7 @@ Fields are `observations`, `next_observations`, `actions`, `rewards`, `terminati
 `infos`; where a space is a dictionary or a tuple, its parts: `observations/desired_goal`, `actions/0`.
 """
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -47,13 +48,19 @@ def layout(source: Source) -> dict[str, Any]:
     return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
 
 
+def record(source: Source) -> str | None:
+    """Return the record of an export of ours, None if it has none."""
+    metadata = json.loads((source.path / "data" / "metadata.json").read_text(encoding="utf-8"))
+    return json.dumps(metadata["astra_data"]) if "astra_data" in metadata else None
+
+
 def is_dataset(path: Path) -> bool:
     """Return whether `path` is the folder of a Minari dataset."""
     return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
 
 
 def _open(path: Path) -> Any:  # noqa: ANN401 - of minari
-    return optional("minari", "minari").MinariDataset(path / "data")
+    return optional("minari", "minari").MinariDataset(path.resolve() / "data")
 
 
 def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
