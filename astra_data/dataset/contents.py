@@ -15,6 +15,7 @@ from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
+from astra_data.dataset.seal import altered_files
 
 Ints = NDArray[np.int64]
 _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
@@ -36,6 +37,7 @@ class Contents:
         subset_seed: its seed.
         task: the task of all episodes.
         paths: the data files in order.
+        file_starts: first row of each file.
     """
 
     root: Path
@@ -49,6 +51,7 @@ class Contents:
     subset_seed: int
     task: str
     paths: list[Path]
+    file_starts: Ints
 
 
 def read_contents(root: Path) -> Contents:
@@ -89,7 +92,7 @@ def read_contents(root: Path) -> Contents:
         to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
     )
     uids = np.array(metadata.pop("episode_uid"), dtype=np.int64)
-    metadata.pop("length")
+    listed = metadata.pop("length")
     pattern = info["data_path"]
     rows: dict[Path, int] = {}
     for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
@@ -98,14 +101,16 @@ def read_contents(root: Path) -> Contents:
     faults = []
     if len(index) != info["total_episodes"] or (index != np.arange(len(index))).any():
         faults.append(f"meta/episodes has {len(index)} episodes, expected {info['total_episodes']}")
-    if len(uids) != len(index) or sorted(subsets["uids"]) != sorted(uids.tolist()):
+    if listed != lengths.tolist() or sorted(subsets["uids"]) != sorted(uids.tolist()):
         faults.append(
             f"{layout.METADATA_PATH} or {layout.SUBSETS_PATH} lists other episodes than meta/episodes"
         )
     if lengths.sum() != info["total_frames"] or (starts != np.cumsum(lengths) - lengths).any():
         faults.append(f"meta/episodes adds up to {lengths.sum()} frames, expected {info['total_frames']}")
     faults += _file_faults(root, columns, rows)
-    if faults:
+    # Without digests, the values can still be compared with the content hash.
+    altered = [path for path in altered_files(root, description) if path != layout.DIGESTS_PATH]
+    if faults := faults or [f"{path} was altered" for path in altered]:
         raise CorruptDatasetError("; ".join(faults))
     position = {uid: episode for episode, uid in enumerate(uids.tolist())}
     return Contents(
@@ -120,6 +125,7 @@ def read_contents(root: Path) -> Contents:
         subset_seed=subsets["seed"],
         task=tasks[0],
         paths=list(rows),
+        file_starts=np.cumsum([0, *rows.values()])[:-1],
     )
 
 

@@ -59,10 +59,12 @@ class Run:
 
     Attributes:
         path: the file.
+        row: the first of them there.
         columns: name to (T,) or (T, size).
     """
 
     path: Path
+    row: int
     columns: Mapping[str, Array]
 
     def __len__(self) -> int:
@@ -191,6 +193,7 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
         CorruptDatasetError: the file cannot be read, or values are missing.
     """
     rest: dict[str, Array] = {}
+    row = 0
     for table in tables:
         if faults := schema_faults(table.schema, columns):
             raise CorruptDatasetError(f"{path.parent.name}/{path.name}: {'; '.join(faults)}")
@@ -199,10 +202,11 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
         changes = np.diff(rest[names.EPISODE_INDEX]) != 0
         starts = [0, *(np.flatnonzero(changes & (rest[names.FRAME_INDEX][1:] == 0)) + 1).tolist()]
         for first, last in itertools.pairwise(starts):
-            yield Run(path, {name: values[first:last] for name, values in rest.items()})
+            yield Run(path, row + first, {name: values[first:last] for name, values in rest.items()})
+        row += starts[-1]
         rest = {name: values[starts[-1] :] for name, values in rest.items()}
     if rest and len(rest[names.EPISODE_INDEX]):
-        yield Run(path, rest)
+        yield Run(path, row, rest)
 
 
 def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str]:

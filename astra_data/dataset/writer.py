@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,10 +21,12 @@ from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.column_statistics import episode_statistics, global_statistics
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import ContentHash, complete_description, permutation
+from astra_data.dataset.digests import digests_of, write_digests
 from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, to_arrow
 from astra_data.dataset.plain import data_files
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.seal import sealed
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 
@@ -108,6 +111,7 @@ class DatasetWriter:
         self._subset_seed = subset_seed
         self._compression = compression
         self._hash = ContentHash()
+        self._digests = {column.name: array("Q") for column in self._stored}
         self._frames = 0
         self._lengths: dict[int, int] = {}
         self._metadata: list[Mapping[str, Scalar]] = []
@@ -188,8 +192,10 @@ class DatasetWriter:
         chunk, file = self._data.locate()
         arrays = [to_arrow(values[field.name], field.type) for field in self._schema]
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
-        for name, array in values.items():
-            self._hash.update(name, array)
+        for name, column in values.items():
+            self._hash.update(name, column)
+        for name, [digest] in digests_of(values, [length]).items():
+            self._digests[name].append(digest)
         self._rows.append(length, chunk, file, episode_statistics(values.values()))
         self._frames += length
         self._lengths[episode.uid] = length
@@ -212,13 +218,14 @@ class DatasetWriter:
         stats = global_statistics(self._stored, self._frames, data_files(self._folder))
         self._write_json(layout.STATS_PATH, stats)
         self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
-        contents = {"content_hash": self.content_hash}
-        self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
         metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}
         for key, kind_ in sorted(self._admission.metadata_types.items()):
             metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
+        write_digests(self._folder, self._digests)
+        description = self._description | self.made | {"content_hash": self.content_hash}
+        self._write_json(layout.DATASET_PATH, sealed(self._folder, description))
         if self.policy:
             shutil.copyfile(self.policy, self._folder / layout.POLICY_PATH)
         faults = Dataset.open(self._folder).verify()

@@ -164,8 +164,10 @@ def test_verify_finds_altered_values(tmp_path: Path) -> None:
     changed[9] = 7
     pq.write_table(table.set_column(frame, table.schema.field(frame), [changed]), path)
     faults = Dataset.open(dataset.root).verify()
-    assert len(faults) == 1
-    assert faults[0].endswith(f", expected {dataset.content_hash}")
+    [altered, content_hash] = faults
+    where = "data/chunk-000/file-000.parquet rows 8 to 19 (episode 2)"
+    assert altered == f"frame_index: other values than were written in {where}"
+    assert content_hash.endswith(f", expected {dataset.content_hash}")
 
 
 def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:

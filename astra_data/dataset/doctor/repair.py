@@ -1,7 +1,7 @@
 """Save the intact episodes of a damaged LeRobot dataset, ours or another tool's, into a new one."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Column, Episode, Scalar
+from astra_data.dataset.digests import Digests, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.format import (
     DATASET_PATH,
@@ -31,10 +32,19 @@ from astra_data.dataset.plain import (
     read_tasks,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.seal import altered_files
 from astra_data.dataset.versions import Version, successor
 from astra_data.dataset.writer import DatasetWriter
 
 _DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
+_LOST = "success, return and the like of the episodes are lost"
+_IF_ALTERED = {
+    INFO_PATH: "names, units and fps may be wrong",
+    TASKS_PATH: "the task may be wrong",
+    METADATA_PATH: _LOST,
+    SUBSETS_PATH: "the order of the subsets is that of seed 0",
+}
+"""What follows for the new dataset; statistics are rebuilt, and digests have notes of their own."""
 
 
 @dataclass
@@ -55,9 +65,9 @@ class Repaired:
 def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
     """Write the intact episodes of `folder` to a new dataset `out`.
 
-    Episodes with wrong values are left out, and all that follow once it is unclear where episodes begin, or a
-    file cannot be read. Data files without a footer, which a killed writer leaves, are read page by page.
-    Statistics and meta/episodes are rebuilt.
+    Episodes with wrong values, or with other values than were written, are left out, and all that follow once
+    it is unclear where episodes begin, or a file cannot be read. Data files without a footer, which a killed
+    writer leaves, are read page by page. Statistics and meta/episodes are rebuilt.
 
     Args:
         folder: the damaged dataset; it is not changed.
@@ -80,13 +90,21 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
     if isinstance(tasks, str):
         result.notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
-    metadata = _metadata(folder, result.notes) if like is None else _facts(like.uids.tolist(), like.metadata)
-    description = _description(folder, like, result.notes)
+    # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
+    old = _old_description(folder, result.notes) if like is None else {}
+    altered = set(_altered_files(folder, old, result.notes))
+    digests = _digests(folder, old, columns, result.notes) if like is None else {}
+    metadata = (
+        _metadata(folder, altered, result.notes)
+        if like is None
+        else _facts(like.uids.tolist(), like.metadata)
+    )
+    description = _description(folder, like, old)
     unknown = 0
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
-    seed = _subset_seed(folder if like is None else like.root)
+    seed = _subset_seed(folder, altered) if like is None else like.subset_seed
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
-        for uid, run in whole_runs(folder, columns, fps, result.notes):
+        for uid, run in whole_runs(folder, columns, digests, fps, result.notes):
             values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
             unknown += uid not in metadata
             facts = dict(metadata.get(uid, {}))
@@ -99,9 +117,8 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
         if isinstance(counted, int) and counted > result.episodes:
             lost = counted - result.episodes
             result.notes.append(f"{lost} of the {counted} episodes that {INFO_PATH} counts are lost")
-        written = read_object(folder / DATASET_PATH)
-        is_all = like is None and counted == result.episodes and len(columns) == len(info["features"])
-        if is_all and not isinstance(written, str) and written.get("content_hash") != writer.content_hash:
+        is_all = counted == result.episodes and len(columns) == len(info["features"])
+        if is_all and old and old["content_hash"] != writer.content_hash:
             result.notes.append(
                 "a value was altered after it was written, because the content hash differs; which one is "
                 "unknown"
@@ -155,13 +172,41 @@ def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> lis
     return notes
 
 
-def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
-    """Return the episodes' metadata by uid, empty where there is none."""
-    if not (folder / "meta/astra").is_dir():
+def _old_description(folder: Path, notes: list[str]) -> Mapping[str, Any]:
+    """Return meta/astra/dataset.json, empty if there is none to rely on."""
+    try:
+        return read_description(folder)
+    except CorruptDatasetError as error:
+        if (folder / DATASET_PATH).exists():
+            notes.append(f"{error}: the origin is unknown")
+        return {}
+
+
+def _altered_files(folder: Path, old: Mapping[str, Any], notes: list[str]) -> Iterator[str]:
+    for path in altered_files(folder, old):
+        if (folder / path).exists():  # a missing one is told where it is read
+            if path in _IF_ALTERED:
+                notes.append(f"{path} was altered after it was written: {_IF_ALTERED[path]}")
+            yield path
+
+
+def _digests(
+    folder: Path, old: Mapping[str, Any], columns: Sequence[PlainColumn], notes: list[str]
+) -> Digests:
+    try:
+        return read_digests(folder, old.get("sums", {}), [column.name for column in columns]) or {}
+    except CorruptDatasetError as error:
+        notes.append(f"{error}: the values were compared with the content hash only, as a whole")
+        return {}
+
+
+def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[int, dict[str, Scalar]]:
+    """Return the episodes' metadata by uid, empty where there is none to rely on."""
+    if METADATA_PATH in altered or not (folder / "meta/astra").is_dir():
         return {}
     table = read_small_table(folder / METADATA_PATH)
     if isinstance(table, str):
-        notes.append(f"{METADATA_PATH} {table}: success, return and the like of the episodes are lost")
+        notes.append(f"{METADATA_PATH} {table}: {_LOST}")
         return {}
     columns = table.to_pydict()
     uids = columns.pop(names.EPISODE_UID, [])
@@ -178,15 +223,11 @@ def _facts(
     }
 
 
-def _description(folder: Path, like: Dataset | None, notes: list[str]) -> dict[str, Any]:
+def _description(folder: Path, like: Dataset | None, old: Mapping[str, Any]) -> dict[str, Any]:
     config = {"folder": folder.name}
     if like is not None:
         return successor(like, "episodes", stage="repair", config=config, out=folder)[0]
-    try:
-        old = read_description(folder)
-    except CorruptDatasetError as error:
-        if (folder / DATASET_PATH).exists():
-            notes.append(f"{error}: the origin is unknown")
+    if not old:
         name = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name).lstrip("-._")
         return {"name": name or "repaired", "stage": "repair", "config": config}
     kept = {key: old[key] for key in ("name", "seeds", "environment", "simulator")}
@@ -196,7 +237,7 @@ def _description(folder: Path, like: Dataset | None, notes: list[str]) -> dict[s
     return {**kept, **changed, "stage": "repair", "config": config}
 
 
-def _subset_seed(folder: Path) -> int:
-    subsets = read_object(folder / SUBSETS_PATH)
+def _subset_seed(folder: Path, altered: Collection[str]) -> int:
+    subsets = "was altered" if SUBSETS_PATH in altered else read_object(folder / SUBSETS_PATH)
     seed = 0 if isinstance(subsets, str) else subsets.get("seed")
     return seed if isinstance(seed, int) else 0

@@ -53,7 +53,9 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
 
     Raises:
         DiskError: `out` cannot be written.
+        CorruptDatasetError: a value was altered: the card states the hash of all of them.
     """
+    dataset.require_whole()
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
     text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)

@@ -8,15 +8,16 @@ from damaged import DATA, EPISODES, alter, drop
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.dataset import Dataset
+from astra_data.dataset.digests import Digests
 from astra_data.dataset.doctor.check_episodes import ESTIMATED, EXACT, EpisodeChecks, is_close
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.plain import plain_columns
 
 
-def checked(root: Path, is_ours: bool = True) -> tuple[EpisodeChecks, Report]:
+def checked(root: Path, is_ours: bool = True, digests: Digests | None = None) -> tuple[EpisodeChecks, Report]:
     info = json.loads((root / "meta/info.json").read_text())
     report = Report()
-    checks = EpisodeChecks(root, info, plain_columns(info["features"])[0], is_ours, report)
+    checks = EpisodeChecks(root, info, plain_columns(info["features"])[0], digests or {}, is_ours, report)
     checks.run()
     checks.totals()
     return checks, report

@@ -8,20 +8,21 @@ from damaged import DATA, EPISODES, alter, drop
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.dataset.columns import STATE
+from astra_data.dataset.digests import Digests
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.plain import plain_columns, read_object
 
 UIDS = [episode.uid for episode in fake_episodes()]
 
 
-def salvaged(root: Path) -> tuple[list[int], list[str]]:
+def salvaged(root: Path, digests: Digests | None = None) -> tuple[list[int], list[str]]:
     """Return the uids of the intact episodes, whose states are compared, and the notes."""
     info = read_object(root / "meta/info.json")
     assert not isinstance(info, str)
     notes: list[str] = []
     states = {episode.uid: episode.columns[STATE] for episode in fake_episodes()}
     uids = []
-    for uid, run in whole_runs(root, plain_columns(info["features"])[0], 20, notes):
+    for uid, run in whole_runs(root, plain_columns(info["features"])[0], digests or {}, 20, notes):
         np.testing.assert_array_equal(run.columns[STATE], states[uid])
         uids.append(uid)
     return uids, notes

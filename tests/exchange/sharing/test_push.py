@@ -56,6 +56,6 @@ def test_altered_values_are_not_pushed(tmp_path: Path) -> None:
     description = json.loads((dataset.root / "meta/astra/dataset.json").read_text())
     text = json.dumps(description | {"content_hash": "0" * 64})
     (dataset.root / "meta/astra/dataset.json").write_text(text)
-    with pytest.raises(CorruptDatasetError, match="was altered: the content hash is"):
+    with pytest.raises(CorruptDatasetError, match=r"dataset\.json was altered"):
         push(dataset.root, f"file://{tmp_path}/shared")
     assert not (tmp_path / "shared").exists()
