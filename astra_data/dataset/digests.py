@@ -24,11 +24,16 @@ Digests = Mapping[str, NDArray[np.uint64]]
 """Column to the digest of each episode, (E,)."""
 
 
+def digest_of(values: Array) -> int:
+    """Return the digest of contiguous `values` (T,) or (T, size) of one episode."""
+    return xxh3_64_intdigest(values)
+
+
 def digests_of(columns: Mapping[str, Array], lengths: ArrayLike) -> dict[str, NDArray[np.uint64]]:
     """Return the digests of episodes of `lengths` (E,) steps in contiguous `columns` (n,) or (n, size)."""
     ends = [0, *np.cumsum(lengths).tolist()]
     return {
-        name: np.array([xxh3_64_intdigest(values[first:last]) for first, last in pairwise(ends)], np.uint64)
+        name: np.array([digest_of(values[first:last]) for first, last in pairwise(ends)], np.uint64)
         for name, values in columns.items()
     }
 

@@ -21,7 +21,7 @@ from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.column_statistics import episode_statistics, global_statistics
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import ContentHash, complete_description, permutation
-from astra_data.dataset.digests import digests_of, write_digests
+from astra_data.dataset.digests import digest_of, write_digests
 from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, to_arrow
 from astra_data.dataset.plain import data_files
@@ -194,8 +194,7 @@ class DatasetWriter:
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         for name, column in values.items():
             self._hash.update(name, column)
-        for name, [digest] in digests_of(values, [length]).items():
-            self._digests[name].append(digest)
+            self._digests[name].append(digest_of(column))
         self._rows.append(length, chunk, file, episode_statistics(values.values()))
         self._frames += length
         self._lengths[episode.uid] = length

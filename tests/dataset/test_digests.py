@@ -52,9 +52,9 @@ def test_an_altered_value_is_refused_before_it_is_seen(
         seen += list(dataset.episodes([ACTION, REWARD]))
     assert len(seen) <= 3
     assert str(caught.value) == (
-        f"{root} is incomplete or was altered: next.reward: other values than were written in {DATA} rows 20 to "
-        "49 (episode 3). Restore it from a copy, run the stage that wrote it again, or save what is whole of "
-        f"it: `astra-data repair {root} --out FOLDER`."
+        f"{root} is incomplete or was altered: next.reward: other values than were written in {DATA} rows "
+        "20 to 49 (episode 3). Restore it from a copy, run the stage that wrote it again, or save what is "
+        f"whole of it: `astra-data repair {root} --out FOLDER`."
     )
     with pytest.raises(CorruptDatasetError, match=r"next\.reward"):
         dataset.columns([REWARD])
@@ -66,10 +66,14 @@ def test_an_altered_value_is_refused_before_it_is_seen(
 
 
 def test_the_row_is_that_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 1)
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
     dataset = write_fake(tmp_path / "set")
-    alter("data/chunk-000/file-003.parquet", REWARD, 5, 9.0)(dataset.root)
-    with pytest.raises(CorruptDatasetError, match=r"chunk-000/file-003\.parquet rows 0 to 29 \(episode 3\)"):
+    path = dataset.paths[-1].relative_to(dataset.root)
+    rows = pq.read_metadata(dataset.root / path).num_rows
+    assert rows < dataset.lengths.sum()
+    alter(str(path), REWARD, rows - 1, 9.0)(dataset.root)
+    where = rf"{path} rows {rows - 5} to {rows - 1} \(episode 4\)"
+    with pytest.raises(CorruptDatasetError, match=where):
         Dataset.open(dataset.root).columns([REWARD])
 
 

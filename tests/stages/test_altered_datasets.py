@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, alter, as_in_0_1, drop, edit
+from numpy.typing import NDArray
 from small_run import TASK
 
 from astra_data.core.errors import CorruptDatasetError
@@ -27,6 +28,7 @@ from astra_data.stages.pair import PairConfig, pair
 
 Command = Callable[[Path, Path], object]
 """Read a dataset and write to a path."""
+Rows = NDArray[np.int64]
 
 
 def opened(root: Path) -> Dataset:
@@ -50,7 +52,7 @@ COMMANDS: dict[str, Command] = {
 }
 
 
-def reorder(rows: Callable[[Dataset], np.ndarray]) -> Callable[[Path], None]:
+def reorder(rows: Callable[[Dataset], Rows]) -> Callable[[Path], None]:
     """Move whole rows of the data file."""
 
     def change(root: Path) -> None:
@@ -64,13 +66,13 @@ def one_row_group(root: Path) -> None:
     pq.write_table(pq.read_table(root / DATA), root / DATA, compression="zstd")
 
 
-def reversed_first_episode(dataset: Dataset) -> np.ndarray:
+def reversed_first_episode(dataset: Dataset) -> Rows:
     order, length = np.arange(dataset.lengths.sum()), dataset.lengths[0]
     order[:length] = order[:length][::-1]
     return order
 
 
-def swapped_episodes(dataset: Dataset) -> np.ndarray:
+def swapped_episodes(dataset: Dataset) -> Rows:
     first, second = dataset.lengths[:2]
     order = np.arange(dataset.lengths.sum())
     return np.concatenate([order[first : first + second], order[:first], order[first + second :]])

@@ -215,9 +215,7 @@ def _digests(
         report.note("digests", f"{error}: it is not known which values were altered, if any")
         return {}
     if digests is None:
-        report.note(
-            "digests", "it was written without digests: it is not known which values were altered, if any"
-        )
+        report.note("digests", "it was written without digests, which tell what values were altered")
     return digests or {}
 
 

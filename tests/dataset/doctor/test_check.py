@@ -105,6 +105,39 @@ def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts
         assert part in faults
 
 
+@pytest.mark.parametrize(
+    ("damage", "faults"),
+    [
+        (
+            alter(DATA, "next.reward", 25, 9.0),
+            f"next.reward: other values than were written in {DATA} rows 20 to 49 (episode 3)",
+        ),
+        (
+            alter("meta/astra/episodes.parquet", "success", 1, True),
+            "meta/astra/episodes.parquet was altered after it was written, or is missing",
+        ),
+        (
+            alter("meta/astra/digests.parquet", "action", 1, 5),
+            "meta/astra/digests.parquet was altered after it was written, or is missing",
+        ),
+    ],
+)
+def test_what_was_altered_is_named(tmp_path: Path, damage: Callable[[Path], object], faults: str) -> None:
+    root = write_fake(tmp_path / "set").root
+    damage(root)
+    assert faults in check(root).faults
+    # Nothing else is named so.
+    assert sum("other values" in fault or "was altered" in fault for fault in check(root).faults) == 1
+
+
+def test_a_dataset_of_version_0_1_is_whole_too(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    as_in_0_1(root)
+    report = check(root)
+    assert report.faults == []
+    assert report.notes == ["it was written without digests, which tell what values were altered"]
+
+
 def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
     with writer(tmp_path / "set") as open_writer:
         for uid in range(12):

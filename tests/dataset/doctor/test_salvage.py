@@ -11,6 +11,7 @@ from astra_data.dataset.columns import STATE
 from astra_data.dataset.digests import Digests
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.plain import plain_columns, read_object
+from astra_data.dataset.values import measure
 
 UIDS = [episode.uid for episode in fake_episodes()]
 
@@ -75,3 +76,17 @@ def test_an_episode_that_may_be_incomplete_is_left_out(tmp_path: Path) -> None:
     uids, notes = salvaged(root)
     assert uids == UIDS[:4]
     assert notes[-1] == "the last 5 frames in file-000.parquet may be part of an episode and were left out"
+
+
+@pytest.mark.parametrize(
+    "damage", [alter(DATA, "index", 9, 70), alter(DATA, "action", 9, [0.5, 0]), alter(DATA, "mode", 19, 3)]
+)
+def test_with_digests_an_altered_episode_costs_no_other(
+    tmp_path: Path, damage: Callable[[Path], object]
+) -> None:
+    dataset = write_fake(tmp_path / "set")
+    _, digests = measure(dataset)
+    damage(dataset.root)
+    uids, [note] = salvaged(dataset.root, digests)
+    assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
+    assert f"other values than were written in {DATA} rows 8 to 19 (episode 2)" in note
