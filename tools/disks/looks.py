@@ -18,8 +18,10 @@ from astra_data.exchange.sharing.urls import UrlStore
 Look = Callable[[Path], str | None]
 """Describes what is at a path: None if there is nothing, and "damaged: ..." if it is not whole."""
 
-_OF_THE_MOMENT = re.compile(r"\w*(seconds|per_second|cost)|created|git_commit|packages|machine")
-"""Keys of JSON files that differ from run to run."""
+_OF_THE_MOMENT = re.compile(
+    r"\w*(seconds|per_second|cost)|created|git_commit|packages|machine|meta/astra/dataset.json"
+)
+"""Keys of JSON files whose values differ from run to run; the last one has the sum of the file itself."""
 
 
 def dataset(root: Path) -> str | None:
