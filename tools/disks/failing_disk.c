@@ -38,7 +38,7 @@ struct control { /* mirrored by failing_disk.Control */
 };
 
 struct record { /* mirrored by failing_disk._RECORD; followed by the path, the other path and the bytes */
-    uint32_t kind, path_length, other_length;
+    uint32_t kind, path_length, other_length, failed;
     int64_t offset;
     uint64_t length;
 };
@@ -109,10 +109,10 @@ static void finish(struct change *change, int64_t done) {
     int before = errno;
     if (change->halved && control->action == TEAR) kill(0, SIGKILL);
     if (!change->counted || control->action != COUNT) return;
-    if (control->journal[0] && done >= 0) {
-        if (change->kind == WRITE) change->length = (size_t)done;
+    if (control->journal[0]) {
+        if (change->kind == WRITE) change->length = done < 0 ? 0 : (size_t)done;
         struct record record = {change->kind, (uint32_t)strlen(change->path), (uint32_t)strlen(change->other),
-                                change->offset, change->kind == WRITE || change->bytes ? change->length : 0};
+                                done < 0, change->offset, change->kind == WRITE || change->bytes ? change->length : 0};
         void *copy = NULL;
         if (change->kind == WRITE && !change->bytes && change->length) { /* read back what the kernel copied */
             int file = (int)syscall(SYS_openat, AT_FDCWD, change->path, O_RDONLY | O_CLOEXEC);

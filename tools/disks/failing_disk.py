@@ -97,7 +97,7 @@ class _Control(ctypes.Structure):
     )
 
 
-_RECORD = struct.Struct("@IIIqQ")
+_RECORD = struct.Struct("@IIIIqQ")
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,7 @@ class Operation:
         other: the new name, or what a symlink points to.
         offset: of a write; the new size of a truncated file; 1 for opening that empties the file.
         data: the bytes written.
+        failed: it changed nothing, such as making a folder that exists.
     """
 
     kind: Kind
@@ -116,6 +117,7 @@ class Operation:
     other: str
     offset: int
     data: bytes
+    failed: bool = False
 
 
 class FailingDisk:
@@ -176,10 +178,12 @@ def read_journal(path: Path) -> Iterator[Operation]:
     """Yield what was written down since `arm`."""
     data, place = path.read_bytes(), 0
     while place < len(data):
-        kind, path_length, other_length, offset, length = _RECORD.unpack_from(data, place)
+        kind, path_length, other_length, failed, offset, length = _RECORD.unpack_from(data, place)
         place += _RECORD.size
         parts = []
         for size in (path_length, other_length, length):
             parts.append(data[place : place + size])
             place += size
-        yield Operation(Kind(kind), os.fsdecode(parts[0]), os.fsdecode(parts[1]), offset, parts[2])
+        yield Operation(
+            Kind(kind), os.fsdecode(parts[0]), os.fsdecode(parts[1]), offset, parts[2], bool(failed)
+        )

@@ -48,9 +48,10 @@ class Memory:
         self._top = _read(root)
 
     def replay(self, operations: Iterable[Operation]) -> None:
-        """Do `operations`; those outside of the root, or on files without a name, are left out."""
+        """Do `operations`; but not failed ones, nor those outside of the root or on nameless files."""
         for operation in operations:
-            self._do(operation)
+            if not operation.failed:
+                self._do(operation)
 
     def write(self, root: Path, outcome: Outcome | None) -> None:
         """Write to the empty folder `root` what a power failure leaves, or with None, what there was."""

@@ -1,6 +1,7 @@
 """One command, one failure, one moment: what was visible then, and what the same command made of it."""
 
 import hashlib
+import itertools
 import re
 import shutil
 from collections.abc import Callable
@@ -90,7 +91,7 @@ class Trials:
             kinds = FAILURES[failure].kinds
             counted = [operation for operation in operations if kinds >> operation.kind & 1]
             result = Result(self.name, failure, at, _told(counted[at - 1]))
-            before = operations[: operations.index(counted[at - 1])]
+            before = itertools.takewhile(lambda op: op is not counted[at - 1], operations)
             safe = {Path(op.other).name for op in before if op.kind is Kind.RENAME}
             self._begin()
             outcome = self._run(lambda: self._disk.arm(FAILURES[failure], at))
