@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from queue import SimpleQueue
 from typing import Annotated
 
 import typer
+from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import MutationVisitor
 from cosmic_ray.plugins import get_operator, operator_names
 from rich.console import Console
@@ -54,8 +54,8 @@ class Mutant:
         return "\n".join(list(lines)[2:])
 
 
-def mutants(path: Path) -> Iterator[Mutant]:
-    """Yield every mutant of a file, one per place and operator, but for those that no test could see."""
+def draw_mutants(path: Path, count: int, draw: random.Random) -> list[Mutant]:
+    """Draw mutants of a file, at most one per place and operator, but for those that no test could see."""
     source = (ROOT / path).read_text()
     settings = {
         line
@@ -65,20 +65,24 @@ def mutants(path: Path) -> Iterator[Mutant]:
         if isinstance(field, ast.AnnAssign)
         for line in range(field.lineno, (field.end_lineno or field.lineno) + 1)
     }
-    lines = source.splitlines()
-    for name in operator_names():
-        if any(skipped in name for skipped in SKIPPED):
-            continue
-        occurrence = 0
-        while (code := MutationVisitor.mutate_code(source, get_operator(name)(), occurrence)) is not None:
-            occurrence += 1
-            changed = {
-                number
-                for number, (old, new) in enumerate(zip(lines, code.splitlines(), strict=False), start=1)
-                if old != new
-            }
-            if changed and not changed & settings:
-                yield Mutant(path, name, code)
+    nodes = list(ast_nodes(get_ast(source)))
+    places = [
+        (name, occurrence)
+        for name in operator_names()
+        if not any(skipped in name for skipped in SKIPPED)
+        for occurrence in range(sum(len(list(get_operator(name)().mutation_positions(n))) for n in nodes))
+    ]
+    draw.shuffle(places)
+    found: list[Mutant] = []
+    for name, occurrence in places:
+        if len(found) == count:
+            break
+        code = MutationVisitor.mutate_code(source, get_operator(name)(), occurrence)
+        pairs = zip(source.splitlines(), code.splitlines(), strict=False)
+        changed = {number for number, (old, new) in enumerate(pairs, start=1) if old != new}
+        if changed and not changed & settings:
+            found.append(Mutant(path, name, code))
+    return found
 
 
 def tests_of(path: Path) -> list[str]:
@@ -105,8 +109,7 @@ def drawn_from(files: list[Path], count: int, draw: random.Random) -> list[Mutan
     shares = Counter(draw.choices(files, lengths, k=count))
     found = []
     for file, share in sorted(shares.items()):
-        every = list(mutants(file))
-        found += draw.sample(every, min(share, len(every)))
+        found += draw_mutants(file, share, draw)
     return found
 
 
