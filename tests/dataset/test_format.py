@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import COLUMNS
 
-from astra_data.dataset import Dataset
+from astra_data.dataset import Dataset, parquet
 from astra_data.dataset import format as layout
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
@@ -19,6 +19,7 @@ def test_constants_are_lerobots(lerobot: SimpleNamespace) -> None:
     assert layout.CODEBASE_VERSION == lerobot.package.CODEBASE_VERSION
     assert layout.CHUNK_SIZE == files.DEFAULT_CHUNK_SIZE
     assert layout.DATA_FILE_SIZE_MB == files.DEFAULT_DATA_FILE_SIZE_IN_MB
+    assert parquet.FILE_SIZE_LIMIT == files.DEFAULT_DATA_FILE_SIZE_IN_MB * 1024**2
     assert layout.VIDEO_FILE_SIZE_MB == files.DEFAULT_VIDEO_FILE_SIZE_IN_MB
     assert (layout.INFO_PATH, layout.STATS_PATH) == (files.INFO_PATH, files.STATS_PATH)
     assert layout.TASKS_PATH == files.DEFAULT_TASKS_PATH

@@ -27,6 +27,14 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
     assert (report.episodes, report.frames) == (5, 55)
 
 
+def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        for uid in range(30):
+            open_writer.add(Episode(uid, fake_columns(10, uid)))
+    report = check(tmp_path / "set")
+    assert (report.faults, report.frames) == ([], 300)
+
+
 @pytest.mark.parametrize(
     ("damage", "parts"),
     [
