@@ -98,7 +98,7 @@ def sketch(base: Path, monkeypatch: pytest.MonkeyPatch, *targets: str | None) ->
     """Write a recipe based on `base` of another task; both have these targets."""
     maze = TASKS["antmaze-umaze"]
     for name, target in zip(("maze", "sketch"), targets, strict=True):
-        monkeypatch.setitem(fake_stages.TASKS, name, replace(maze, name=name, target_id=target))
+        monkeypatch.setitem(TASKS, name, replace(maze, name=name, target_id=target))
     path = base.with_name("other.toml")
     path.write_text('based_on = "base"\ntask = "sketch"\nmethods = ["follower"]\nseeds = [1]\n')
     return path
