@@ -21,6 +21,7 @@ from astra_data.cli import (
     recipes,
     sharing,
     sweeping,
+    tasks,
 )
 from astra_data.core.errors import AstraDataError
 from astra_data.core.optional import explained
@@ -60,6 +61,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "evaluate": recipes.evaluate,
         "report": recipes.report,
         "gap": predicting.gap,
+        "tasks": tasks.tasks,
     },
     "Recipes or datasets": {
         "collect": building.collect,
@@ -67,6 +69,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "subset": editing.subset,
     },
     "Datasets": {
+        "label": tasks.label,
         "augment": augmenting.augment,
         "merge": editing.merge,
         "delete": editing.delete,

@@ -39,6 +39,16 @@ def task_named(name: str) -> Task:
     )
 
 
+def known_tasks() -> dict[str, Task]:
+    """Return the tasks of this package and of installed ones, by name.
+
+    Raises:
+        BadInputError: a package offers something else, or it fails.
+    """
+    installed = entry_points(group=ENTRY_POINTS)
+    return TASKS | {point.name: task_named(point.name) for point in installed if point.name not in TASKS}
+
+
 def _a_task(name: str, found: object) -> Task:
     if not isinstance(found, Task):
         raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
