@@ -39,6 +39,9 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
     monkeypatch.setattr(experiment, "Recipe", model)
+    condition = importlib.import_module("astra_data.experiments.condition")
+    monkeypatch.setattr(condition, "Dataset", fake_stages.FakeDataset)
+    monkeypatch.setattr(condition, "read_description", fake_stages.read_description)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
     monkeypatch.setattr("torch.set_num_threads", int)

@@ -7,6 +7,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH
+
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 
@@ -23,6 +25,15 @@ def alter_rows(path: Path, column: str, changes: Mapping[int, object]) -> None:
 
 def alter(name: str, column: str, row: int, value: object) -> Callable[[Path], None]:
     return lambda root: alter_rows(root / name, column, {row: value})
+
+
+def as_in_0_1(root: Path) -> None:
+    """Take digests and sums away, which version 0.1 did not write."""
+    path = root / DATASET_PATH
+    description = json.loads(path.read_text())
+    del description["sums"]
+    path.write_text(json.dumps(description))
+    (root / DIGESTS_PATH).unlink()
 
 
 def edit(name: str, **changes: object) -> Callable[[Path], object]:

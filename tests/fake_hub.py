@@ -183,7 +183,11 @@ class Handler(BaseHTTPRequestHandler):
 
     def _entry(self, name: str, content: bytes) -> dict[str, Any]:
         oid = hashlib.sha1(f"blob {len(content)}\0".encode() + content).hexdigest()
-        return {"type": "file", "path": name, "oid": oid, "size": len(content)}
+        entry = {"type": "file", "path": name, "oid": oid, "size": len(content)}
+        if not name.endswith((".parquet", ".png")):
+            return entry
+        large = {"oid": hashlib.sha256(content).hexdigest(), "size": len(content), "pointerSize": 130}
+        return entry | {"lfs": large}
 
     def preupload(self, repo: Repository) -> None:
         def mode(path: str) -> str:

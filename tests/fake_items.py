@@ -1,5 +1,6 @@
 """Items for the scheduler that import nothing slow; spawned processes find them by name."""
 
+import errno
 import os
 import signal
 import time
@@ -65,3 +66,7 @@ class Record:
 
     def failed(self, key: str) -> None:
         self.events.append(("failed", key))
+
+
+def fill_the_disk(*, progress: Progress) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")

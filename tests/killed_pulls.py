@@ -16,10 +16,10 @@ import fsspec.implementations.local  # noqa: F401 - here, so that no child spend
 from shared_files import contents
 
 from astra_data.dataset import Dataset
-from astra_data.exchange.sharing import fetch
+from astra_data.exchange.sharing import store
 from astra_data.exchange.sharing.pull import pull
 
-fetch.BLOCK_BYTES = 1024
+store.BLOCK_BYTES = 1024
 
 
 def forked(job: Callable[[], object], seconds: float | None = None) -> int:

@@ -23,6 +23,8 @@ from astra_data.cli import (
     sweeping,
     tasks,
 )
+from astra_data.core.disk import disk_error
+from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import AstraDataError
 from astra_data.core.optional import explained
 
@@ -46,8 +48,16 @@ def _options(
         bool,
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
+    no_fsync: Annotated[
+        bool,
+        typer.Option(
+            "--no-fsync", help="Faster, but what is written survives only kills, not a power failure."
+        ),
+    ] = False,
 ) -> None:
     """Options before any command."""
+    if no_fsync:
+        os.environ[NO_FSYNC] = "1"
 
 
 PANELS: dict[str, dict[str, Callable[..., None]]] = {
@@ -95,15 +105,22 @@ for panel, commands in PANELS.items():
 
 
 def main() -> None:
-    """Run the command line; print an `AstraDataError` as one line unless ASTRA_DATA_DEBUG is set."""
+    """Run the command line; print what is expected to happen as one line unless ASTRA_DATA_DEBUG is set."""
     try:
         app()
-    except (AstraDataError, ModuleNotFoundError) as error:
-        reported = explained(error) if isinstance(error, ModuleNotFoundError) else error
+    except Exception as error:
+        reported = _reported(error)
         if reported is None or os.environ.get("ASTRA_DATA_DEBUG"):
             raise
         typer.echo(f"error: {reported}", err=True)
         sys.exit(1)
+
+
+def _reported(error: Exception) -> AstraDataError | None:
+    """Return what to print of `error`; None if it is a fault of the program."""
+    if isinstance(error, ModuleNotFoundError):
+        return explained(error)
+    return error if isinstance(error, AstraDataError) else disk_error(error)
 
 
 if __name__ == "__main__":

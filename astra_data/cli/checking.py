@@ -41,20 +41,24 @@ def repair(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
     like: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
             metavar="DATASET",
             help="The dataset from which FOLDER was made by LeRobot's tools: its origin and its episodes' "
-            "metadata are copied, matched by uid.",
+            "metadata are copied, matched by uid. After a merge, once for each dataset merged.",
             show_default=False,
         ),
     ] = None,
+    new_uids: Annotated[
+        bool, typer.Option("--new-uids", help="Keep episodes whose uid is taken, under new ones.")
+    ] = False,
 ) -> None:
     """Save the intact episodes of a broken dataset, of astra-data or LeRobot, to a new one."""
     from astra_data.dataset.doctor.repair import repair as save
     from astra_data.dataset.versions import open_dataset
 
-    repaired = save(folder, out=out, like=open_dataset(like) if like else None)
+    sources = [open_dataset(dataset) for dataset in like or ()]
+    repaired = save(folder, out=out, like=sources, new_uids=new_uids)
     for note in repaired.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"finished: {out} ({repaired.episodes} episodes, {repaired.frames} steps)")

@@ -30,6 +30,14 @@ FileFormat = Annotated[
 Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
 Fps = Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")]
 Task = Annotated[str | None, typer.Option(help="What the episodes do.", show_default="the mapping's")]
+MaxBytes = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Refuse recordings that unpack to more values, of 8 bytes each.",
+        show_default="100 times their size, or 256 MB",
+    ),
+]
 
 
 def import_(
@@ -40,11 +48,19 @@ def import_(
     name: Name = None,
     fps: Fps = None,
     task: Task = None,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Minari, MCAP, JSON) to a dataset."""
     from astra_data.exchange.importing import import_dataset
 
     report = import_dataset(
-        recordings, mapping, out=out, file_format=file_format, name=name, fps=fps, task=task
+        recordings,
+        mapping,
+        out=out,
+        file_format=file_format,
+        name=name,
+        fps=fps,
+        task=task,
+        max_bytes=max_bytes,
     )
     typer.echo(f"finished: {report}")

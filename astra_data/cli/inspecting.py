@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 
 
@@ -35,18 +36,28 @@ def inspect(
         raise BadInputError(
             f"{inspection.reference}: its state has no column with the role position or velocity"
         )
-    try:
-        plot.mkdir(parents=True, exist_ok=True)
-        for planar, label, unit in found:
-            path = plot / f"{label}_coverage.png"
-            path.write_bytes(png(coverage(planar.counts, planar.extent, label, unit)))
-            typer.echo(f"written: {path}")
-    except OSError as error:
-        raise BadInputError(f"--plot {plot}: expected a folder to write to ({error.strerror})") from None
+    for planar, label, unit in found:
+        path = plot / f"{label}_coverage.png"
+        write_file(path, png(coverage(planar.counts, planar.extent, label, unit)))
+        typer.echo(f"written: {path}")
 
 
-def list_() -> None:
+def list_(
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Further folders to --clean, such as runs.", show_default=False),
+    ] = None,
+    clean: Annotated[
+        bool,
+        typer.Option("--clean", help="Remove instead what killed commands left at home and in FOLDERS."),
+    ] = False,
+) -> None:
     """List the datasets at home and their versions."""
+    if clean:
+        _clean(folders or [])
+        return
+    if folders:
+        raise BadInputError("list: folders are for --clean; the datasets that are listed are those at home")
     from rich.console import Console
     from rich.table import Table
 
@@ -60,3 +71,19 @@ def list_() -> None:
             facts = (found.description["stage"], f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
             table.add_row(found.reference, *facts)
     Console().print(table)
+
+
+def _clean(folders: list[Path]) -> None:
+    from astra_data.core.durable import clean
+    from astra_data.dataset.versions import home
+
+    notes = {
+        "removed": "",
+        "in use": ": another command is writing it",
+        "kept": ": the command that was interrupted goes on with it, or delete it",
+    }
+    found = dict(item for folder in (home(), *folders) for item in clean(folder))
+    for path, state in found.items():
+        typer.echo(f"{state}: {path}{notes[state]}")
+    if not found:
+        typer.echo("nothing was left by killed commands")

@@ -55,8 +55,14 @@ def run(
         typer.echo(f"finished: {folder}")
 
 
-def check(recipes: RecipePaths, root: Root = RUNS) -> None:
-    """Check recipes without running them, and list which artefacts are finished."""
+def check(
+    recipes: RecipePaths,
+    root: Root = RUNS,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Read every byte of the artefacts, not only their sizes.")
+    ] = False,
+) -> None:
+    """Check recipes without running them, and list which artefacts are finished, damaged or stale."""
     from astra_data.experiments.run import check as check_recipe
     from astra_data.studies.run import is_gap_recipe, load_gap_recipe
 
@@ -67,13 +73,19 @@ def check(recipes: RecipePaths, root: Root = RUNS) -> None:
                 load_gap_recipe(recipe)
                 typer.echo(f"{recipe}: for `astra-data gap`, without faults")
                 continue
-            finished = check_recipe(recipe, root=root)
+            conditions = check_recipe(recipe, root=root, verify=verify)
         except AstraDataError as error:
             faults.append(str(error))
             continue
-        typer.echo(f"{recipe}: {sum(finished.values())} of {len(finished)} items are finished")
-        for key, is_finished in finished.items():
-            typer.echo(f"  {'finished' if is_finished else 'to do   '}  {key}")
+        states = [found.state for found in conditions.values()]
+        typer.echo(f"{recipe}: {states.count('finished')} of {len(states)} items are finished")
+        for key, found in conditions.items():
+            why = f": {found.why}" if found.why else ""
+            typer.echo(f"  {'to do' if found.state == 'missing' else found.state:8}  {key}{why}")
+        spoilt = [f"{states.count(state)} {state}" for state in ("damaged", "stale") if state in states]
+        if spoilt:
+            again = f"`astra-data run {recipe}` makes again what the list does not ask you to remove"
+            faults.append(f"{recipe}: {' and '.join(spoilt)}: {again}")
     if faults:
         raise AstraDataError("\n".join(faults))
 

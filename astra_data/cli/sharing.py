@@ -70,11 +70,18 @@ def pull(
     ],
     out: Out = None,
     version: Annotated[str | None, typer.Option(help="Such as 1.2.0.", show_default="the newest")] = None,
+    max_bytes: Annotated[
+        int | None,
+        typer.Option(min=1, help="Refuse a dataset with larger files in all.", show_default="100 GB"),
+    ] = None,
 ) -> None:
-    """Download a shared dataset and verify it; run it again to continue."""
+    """Download a shared dataset and verify it; run it again to continue, or to verify the copy."""
+    from astra_data.exchange.sharing.pull import MOST_BYTES
     from astra_data.exchange.sharing.pull import pull as fetch
     from astra_data.experiments.display import shown
 
     with shown("pull") as progress:
-        dataset = fetch(source, out=out, version=version, progress=progress)
+        dataset = fetch(
+            source, out=out, version=version, max_bytes=max_bytes or MOST_BYTES, progress=progress
+        )
     typer.echo(f"{dataset.reference}: {dataset.root}")

@@ -3,9 +3,8 @@
 import json
 import os
 import re
-import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from astra_data.core.disk import writing
+from astra_data.core.durable import clean, discard, make_folder, move, sweep, sync_tree, write_file
 from astra_data.core.errors import BadInputError
 
 type Nested = (
@@ -27,15 +28,14 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
 
     Raises:
         BadInputError: there are no tensors.
+        DiskError: it cannot be written; an existing file stays.
     """
     if not tensors:
         raise BadInputError(f"{path}: expected at least one tensor to save")
-    partial = path.with_name(f".{path.name}.partial")
     # safetensors refuses tensors that share memory, such as tied weights or views.
     copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
     data = save(copies, {key: json.dumps(value) for key, value in metadata.items()})
-    partial.write_bytes(_with_sorted_metadata(data))
-    os.replace(partial, path)
+    write_file(path, _with_sorted_metadata(data))
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
@@ -100,8 +100,8 @@ def understood(
         device: torch device.
 
     Raises:
-        BadInputError: the file cannot be read, is of another kind, or lacks something that the block needs,
-            as one of an older version.
+        BadInputError: the file cannot be read, is of another kind, has values that are not finite, or lacks
+            something that the block needs, as one of an older version.
     """
     tensors, metadata = load_tensors(path)
     kind = metadata.get("kind")
@@ -109,6 +109,11 @@ def understood(
         found = "a file without a kind" if kind is None else f"kind {kind}"
         raise BadInputError(
             f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again"
+        )
+    if not_finite := [name for name, tensor in tensors.items() if not _is_usable(name, tensor)]:
+        raise BadInputError(
+            f"{path}: expected finite weights, found NaN or infinity in {', '.join(not_finite[:3])}"
+            f"{', …' if len(not_finite) > 3 else ''}: run that stage again"
         )
     moved = {name: tensor.to(device) for name, tensor in tensors.items()}
     try:
@@ -135,34 +140,56 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
 
     Raises:
         BadInputError: `out` exists and `replace` is not set, or was begun with other settings.
+        DiskError: it cannot be written; the working folder stays.
     """
     partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
-    if old.exists() and not out.exists():  # a kill came between the two renames below
-        os.replace(old, out)
-    if out.exists() and not replace:
-        raise BadInputError(f"{out} is finished already: remove it to run the stage again")
-    if replace:
-        _remove(partial, old)
-    partial.mkdir(parents=True, exist_ok=True)
-    if config is not None:
-        settings = partial / "config.json"
-        is_begun = any(partial.iterdir())
-        if is_begun and not (settings.exists() and settings.read_text() == config):
-            raise BadInputError(
-                f"{partial} was begun with other settings, see its config.json if it has one: remove it"
-            )
-        settings.write_text(config)
-    yield partial
+    with writing(out):
+        sweep(out)
+        if old.exists() and not out.exists():  # a kill came between the two renames below
+            move(old, out)
+        if out.exists() and not replace:
+            raise BadInputError(f"{out} is finished already: remove it to run the stage again")
+        for folder in (partial, old):
+            if replace and folder.exists():
+                discard(folder, out)
+        make_folder(partial)
+        clean(partial)
+        if config is not None:
+            _begin(partial, config)
+        yield partial
+        clean(partial)
+        sync_tree(partial)
+        _put(partial, out, old)
+
+
+def _put(partial: Path, out: Path, old: Path) -> None:
+    """Rename `partial` to `out`; an older `out` is `old` in between, and comes back after an error."""
     if out.exists():
-        os.replace(out, old)
-    os.replace(partial, out)
-    _remove(old)
+        move(out, old)
+    try:
+        move(partial, out)
+    finally:
+        with suppress(OSError):
+            if out.exists():
+                discard(old, out)
+            else:
+                os.replace(old, out)
 
 
-def _remove(*folders: Path) -> None:
-    for folder in folders:
-        if folder.exists():
-            shutil.rmtree(folder)
+def _is_usable(name: str, tensor: Tensor) -> bool:
+    # An infinite deviation is how networks leave out a part of their input.
+    return not (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
+
+
+def _begin(partial: Path, config: str) -> None:
+    """Write the settings to `partial`, unless it was begun with them."""
+    settings = partial / "config.json"
+    if not any(partial.iterdir()):
+        write_file(settings, config)
+    elif not (settings.exists() and settings.read_text() == config):
+        raise BadInputError(
+            f"{partial} was begun with other settings, see its config.json if it has one: remove it"
+        )
 
 
 def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:

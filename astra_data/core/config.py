@@ -13,10 +13,12 @@ from pydantic_core import ErrorDetails
 
 from astra_data.core.errors import BadInputError, RecipeError
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10**12)]
+AtOnce = Annotated[int, Field(ge=1, le=10**6)]
+"""A number of things that are in memory at the same time."""
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
-Number = Annotated[int, Field(ge=0)]
+Number = Annotated[int, Field(ge=0, le=10**12)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -88,6 +90,10 @@ def load_tables(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RecipeError(_syntax_fault(path, text, str(error))) from None
+    except ValueError as error:  # a number of more digits than Python takes
+        raise RecipeError(f"{path} cannot be read as TOML: {error}") from None
+    except RecursionError:
+        raise RecipeError(f"{path} is nested too deeply") from None
 
 
 def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: str) -> M:
@@ -98,6 +104,8 @@ def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: s
     """
     try:
         return model.model_validate(_with_tuples(dict(tables)))
+    except RecursionError:
+        raise RecipeError(f"{origin} is nested too deeply") from None
     except ValidationError as error:
         faults = [_fault(details, model) for details in error.errors(include_url=False)]
     if len(faults) == 1:

@@ -5,7 +5,8 @@ AstraDataError          all expected errors; the command line prints one line an
 ├── RecipeError         a recipe is missing, malformed or contradicts itself
 ├── MissingStageError   an earlier stage has not been run yet
 ├── CorruptDatasetError a dataset on disk is incomplete or was altered
-└── SharingError        a remote storage cannot be reached, refuses, or holds something else
+├── SharingError        a remote storage cannot be reached, refuses, or holds something else
+└── DiskError           a disk is full, read-only, failing or gone
 """
 
 
@@ -31,3 +32,7 @@ class CorruptDatasetError(AstraDataError):
 
 class SharingError(AstraDataError):
     """A remote storage cannot be reached, refuses, or holds something else."""
+
+
+class DiskError(AstraDataError):
+    """A disk is full, read-only, failing or gone; the message names the file and what to do."""

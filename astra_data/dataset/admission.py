@@ -3,8 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode
+from astra_data.dataset.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode, Scalar
 from astra_data.dataset.format import METADATA_KEYS
+
+MOST_CHARACTERS = 2**20
+"""Characters of a text in the metadata."""
 
 
 class Admission:
@@ -25,11 +28,19 @@ class Admission:
         Raises:
             BadInputError: it does not fit; lists every fault.
         """
+        self.check(episode)
+        self._uids.add(episode.uid)
+        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
+
+    def check(self, episode: Episode) -> None:
+        """Refuse `episode` as `admit` does, without accepting it otherwise.
+
+        Raises:
+            BadInputError: it does not fit; lists every fault.
+        """
         faults = self._faults(episode)
         if faults:
             raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
-        self._uids.add(episode.uid)
-        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
 
     def _faults(self, episode: Episode) -> list[str]:
         faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
@@ -42,10 +53,29 @@ class Admission:
                 faults.append(f"metadata {key}: {found.__name__}, earlier episodes have {known.__name__}")
             if key in METADATA_KEYS:
                 faults.append(f"metadata {key}: is filled in by the writer, leave it out")
+            faults += _metadata_faults(key, value)
         faults += _outcome_faults(episode.columns)
         if episode.uid in self._uids:
             faults.append("an earlier episode has the same uid")
         return faults
+
+
+def is_text(value: str) -> bool:
+    """Return whether `value` can be written as UTF-8; names of files that are not UTF-8 cannot."""
+    return not any("\ud800" <= character <= "\udfff" for character in value)
+
+
+def _metadata_faults(key: str, value: Scalar) -> list[str]:
+    """List why a value of the metadata cannot be stored."""
+    if not isinstance(key, str) or not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
+        return [f"metadata {key!r:.80}: expected a text of valid characters as its name"]
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return [f"metadata {key}: an integer of more than 64 bits"]
+    if isinstance(value, str) and len(value) > MOST_CHARACTERS:
+        return [f"metadata {key}: {len(value):,} characters, expected at most {MOST_CHARACTERS:,}"]
+    if isinstance(value, str) and not is_text(value):
+        return [f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"]
+    return []
 
 
 def _outcome_faults(columns: Mapping[str, Array]) -> list[str]:

@@ -58,13 +58,9 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
 
 def _write(dataset: Dataset, column: Column, folder: Path) -> None:
     shape = (int(dataset.lengths.sum()), column.size)[: 1 + (column.size > 1)]
-    with atomic_folder(folder) as unfinished:
-        values = np.lib.format.open_memmap(  # type: ignore[no-untyped-call]
-            unfinished / "values.npy", mode="w+", dtype=np.dtype(column.dtype), shape=shape
-        )
-        row = 0
+    header = {"descr": np.dtype(column.dtype).str, "fortran_order": False, "shape": shape}
+    # Not as a memory map: where the disk is full, that would end the process with a bus error.
+    with atomic_folder(folder) as unfinished, (unfinished / "values.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]
         for block in dataset.blocks([column.name]):
-            rows = block[column.name]
-            values[row : row + len(rows)] = rows
-            row += len(rows)
-        values.flush()
+            file.write(block[column.name].data)

@@ -1,6 +1,6 @@
 """Exact statistics of columns in float64, with LeRobot's names and shapes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,3 +71,19 @@ def global_statistics(
         named = dict(zip(STATISTICS, np.concatenate(part, axis=1).tolist(), strict=True))
         stats[name] = {key: named.get(key, [frames]) for key in STORED_STATISTICS}
     return stats
+
+
+def ranges(blocks: Iterable[Mapping[str, Array]]) -> dict[str, dict[str, Any]]:
+    """Return min, max and mean of each index of the columns in `blocks`, each (n,) or (n, size)."""
+    found: dict[str, dict[str, Any]] = {}
+    totals: dict[str, NDArray[np.float64]] = {}
+    rows = 0
+    for block in blocks:
+        for name, values in block.items():
+            table = values.reshape(len(values), -1).astype(np.float64)
+            low, high, total = table.min(axis=0), table.max(axis=0), table.sum(axis=0)
+            before = found.get(name, {"min": low, "max": high})
+            found[name] = {"min": np.minimum(before["min"], low), "max": np.maximum(before["max"], high)}
+            totals[name] = totals.get(name, np.zeros(len(total))) + total
+        rows += len(next(iter(block.values()), ()))
+    return {name: extremes | {"mean": totals[name] / rows} for name, extremes in found.items()}

@@ -52,6 +52,8 @@ RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDE
 """Columns filled in by the writer; all but the first are LeRobot's own."""
 
 DTYPES = ("float32", "int64", "bool")
+MOST_VALUES, MOST_NAME_BYTES = 2**20, 200
+"""Upper bounds of a column: its values per step, and the bytes of its name, which also names files."""
 ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
 
@@ -97,12 +99,12 @@ class Column:
             BadInputError: it contradicts itself; lists every fault.
         """
         faults = []
-        if not self.name or "/" in self.name:
-            faults.append("the name must not be empty or contain '/'")
+        if "/" in self.name or not 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES:
+            faults.append(f"the name must have 1 to {MOST_NAME_BYTES} bytes, without '/'")
         if self.dtype not in DTYPES:
             faults.append(f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}")
-        if self.size < 1:
-            faults.append(f"size {self.size} is less than 1")
+        if not 1 <= self.size <= MOST_VALUES:
+            faults.append(f"size {self.size}, expected 1 to {MOST_VALUES}")
         if self.names is not None and len(self.names) != self.size:
             faults.append(f"{len(self.names)} names for {self.size} values")
         for key, words in (self.astra or {}).items():
@@ -116,7 +118,7 @@ class Column:
         if not faults:
             faults = [*self._role_faults(), *self._mirror_faults()]
         if faults:
-            raise BadInputError(f"Column {self.name!r}: {'; '.join(faults)}.")
+            raise BadInputError(f"Column {self.name[:MOST_NAME_BYTES]!r}: {'; '.join(faults)}.")
 
     @property
     def roles(self) -> list[tuple[str, slice]]:
@@ -187,14 +189,13 @@ class Column:
         """
         try:
             astra = dict(feature.get("astra") or {})
-            meaning = astra.pop("meaning", "")
             names = feature.get("names")
             return cls(
                 name=name,
                 dtype=feature["dtype"],
                 size=feature["shape"][0],
                 names=None if names is None else tuple(names),
-                meaning=meaning,
+                meaning=astra.pop("meaning", ""),
                 astra=astra or None,
             )
         except (AttributeError, LookupError, TypeError, ValueError) as error:
@@ -247,16 +248,16 @@ class Episode:
 
     def __post_init__(self) -> None:
         """Convert numpy scalars and array layouts, and validate the episode."""
-        metadata = {
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in self.metadata.items()
-        }
-        columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
+        metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
+        given = self.columns.items()
+        masked = [name for name, a in given if isinstance(a, np.ma.MaskedArray) and a.mask.any()]
+        columns = {name: np.asarray(values, order="C") for name, values in given}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
         faults = []
         if type(self.uid) is not int or not 0 <= self.uid < 2**63:
             faults.append(f"uid {self.uid!r}, expected an int in [0, 2^63)")
+        faults += [f"{name}: masked values, expected a value for every step" for name in masked]
         faults += [fault for name, values in self.columns.items() for fault in _column_faults(name, values)]
         lengths = {name: len(values) for name, values in columns.items() if values.ndim}
         if not columns:

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
+from astra_data.dataset.lerobot_rows import RecordedFiles
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
+from astra_data.dataset.seal import altered_files
 
 Ints = NDArray[np.int64]
 _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
@@ -36,6 +38,8 @@ class Contents:
         subset_seed: its seed.
         task: the task of all episodes.
         paths: the data files in order.
+        file_starts: first row of each file.
+        recorded: its files, where LeRobot recorded it and rows have to be converted; None for ours.
     """
 
     root: Path
@@ -49,6 +53,8 @@ class Contents:
     subset_seed: int
     task: str
     paths: list[Path]
+    file_starts: Ints
+    recorded: RecordedFiles | None = None
 
 
 def read_contents(root: Path) -> Contents:
@@ -88,8 +94,8 @@ def read_contents(root: Path) -> Contents:
     index, lengths, chunks, files, starts = (
         to_numpy(pa.concat_tables(tables).column(name), 1, "int64") for name in _LOCATION
     )
-    uids = np.array(metadata.pop("episode_uid"), dtype=np.int64)
-    metadata.pop("length")
+    uids = _uids(metadata.pop("episode_uid"))
+    listed = metadata.pop("length")
     pattern = info["data_path"]
     rows: dict[Path, int] = {}
     for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
@@ -98,14 +104,16 @@ def read_contents(root: Path) -> Contents:
     faults = []
     if len(index) != info["total_episodes"] or (index != np.arange(len(index))).any():
         faults.append(f"meta/episodes has {len(index)} episodes, expected {info['total_episodes']}")
-    if len(uids) != len(index) or sorted(subsets["uids"]) != sorted(uids.tolist()):
+    if listed != lengths.tolist() or sorted(subsets["uids"]) != sorted(uids.tolist()):
         faults.append(
             f"{layout.METADATA_PATH} or {layout.SUBSETS_PATH} lists other episodes than meta/episodes"
         )
     if lengths.sum() != info["total_frames"] or (starts != np.cumsum(lengths) - lengths).any():
         faults.append(f"meta/episodes adds up to {lengths.sum()} frames, expected {info['total_frames']}")
     faults += _file_faults(root, columns, rows)
-    if faults:
+    # Without digests, the values can still be compared with the content hash.
+    altered = [path for path in altered_files(root, description) if path != layout.DIGESTS_PATH]
+    if faults := faults or [f"{path} was altered" for path in altered]:
         raise CorruptDatasetError("; ".join(faults))
     position = {uid: episode for episode, uid in enumerate(uids.tolist())}
     return Contents(
@@ -120,7 +128,14 @@ def read_contents(root: Path) -> Contents:
         subset_seed=subsets["seed"],
         task=tasks[0],
         paths=list(rows),
+        file_starts=np.cumsum([0, *rows.values()])[:-1],
     )
+
+
+def _uids(values: Sequence[object]) -> Ints:
+    if not all(type(value) is int and 0 <= value < 2**63 for value in values):
+        raise CorruptDatasetError(f"{layout.METADATA_PATH} has an episode_uid that is none")
+    return np.array(values, dtype=np.int64)
 
 
 def _file_faults(root: Path, columns: Sequence[Column], rows: Mapping[Path, int]) -> Iterator[str]:

@@ -10,8 +10,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import git_commit, package_versions
 from astra_data.dataset.columns import Array
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-"""Valid names of datasets."""
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+"""Valid names of datasets; they name folders, with some letters added, and file systems take 255."""
 
 _DEFAULTS: dict[str, Any] = {
     "name": None,
@@ -38,7 +38,7 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     full = _DEFAULTS | dict(description)
     faults = [f"unknown key {key!r}, expected {', '.join(_DEFAULTS)}" for key in full.keys() - _DEFAULTS]
     if not isinstance(full["name"], str) or not NAME.fullmatch(full["name"]):
-        faults.append(f"name {full['name']!r}, expected letters, digits, '.', '_' and '-'")
+        faults.append(f"name {full['name']!r}, expected up to 200 letters, digits, '.', '_' and '-'")
     if not isinstance(full["version"], str) or not re.fullmatch(r"\d+\.\d+\.\d+", full["version"]):
         faults.append(f"version {full['version']!r}, expected three numbers such as 1.0.0")
     if not isinstance(full["stage"], str) or not full["stage"]:
@@ -47,7 +47,8 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
         if sorted(parent) != ["hash", "name", "version"]:
             faults.append(f"parent {dict(parent)}, expected name, version and hash")
     try:
-        full = json.loads(json.dumps(full, allow_nan=False))
+        text = json.dumps(full, allow_nan=False, ensure_ascii=False)
+        full = json.loads(text.encode())
     except (TypeError, ValueError) as error:
         faults.append(f"expected plain JSON ({error})")
     if faults:

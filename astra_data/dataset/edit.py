@@ -219,9 +219,9 @@ def _write(
         raise BadInputError(f"{source.reference}: no episode would be left of its {len(source)}")
     description, folder = successor(source, "episodes", stage=stage, config=config, name=name, out=out)
     with DatasetWriter.like(source, folder, description, subset_seed=seed) as writer:
-        for episode in source.episodes():
-            if episode.uid in kept:
-                writer.add(episode)
+        chosen = [index for index, uid in enumerate(_uids(source)) if uid in kept]
+        for episode in source.episodes(episodes=chosen):
+            writer.add(episode)
     return folder
 
 

@@ -44,6 +44,10 @@ class EpisodeRows:
             self._flush()
         self._writer.close()
 
+    def abandon(self) -> None:
+        """Close a file that is not wanted any more."""
+        self._writer.abandon()
+
     def _flush(self) -> None:
         count = len(self._rows)
         chunk, file = self._writer.locate()

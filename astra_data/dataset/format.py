@@ -34,6 +34,7 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATASET_PATH = "meta/astra/dataset.json"
 METADATA_PATH = "meta/astra/episodes.parquet"
 SUBSETS_PATH = "meta/astra/subsets.json"
+DIGESTS_PATH = "meta/astra/digests.parquet"
 POLICY_PATH = "meta/astra/policy.safetensors"
 METADATA_KEYS = ("episode_uid", "length")
 """First columns of `METADATA_PATH`; the others are the episodes' own metadata."""

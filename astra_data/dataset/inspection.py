@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import STATE, Array, Column
 from astra_data.dataset.format import STATS_PATH
-from astra_data.dataset.plain import read_statistics
 from astra_data.dataset.reader import Dataset
 
 Floats = NDArray[np.float64]
@@ -128,7 +127,7 @@ def visited(dataset: Dataset, role: str = "position") -> Map | None:
 
 
 def _empty_spreads(dataset: Dataset, columns: list[Column]) -> list[Spread]:
-    ranges = read_statistics(dataset.root)
+    ranges = dataset.statistics()
     if isinstance(ranges, str):
         raise CorruptDatasetError(f"{dataset.root}: {STATS_PATH} {ranges}; {_REMEDY}")
     spreads = []

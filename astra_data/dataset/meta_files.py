@@ -12,6 +12,7 @@ from astra_data.dataset.columns import Column
 from astra_data.dataset.description import NAME
 from astra_data.dataset.format import DATASET_PATH, INFO_PATH, SUBSETS_PATH
 from astra_data.dataset.plain import MOST_FPS, read_object
+from astra_data.dataset.seal import is_description_sealed
 
 _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 
@@ -77,6 +78,7 @@ class _Description(_Open):
     packages: dict[str, str]
     git_commit: str | None
     content_hash: str
+    sums: dict[str, str] = Field(default_factory=dict)
 
 
 class _Subsets(_Open):
@@ -106,9 +108,12 @@ def read_description(root: Path) -> dict[str, Any]:
     """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more.
 
     Raises:
-        CorruptDatasetError: it is missing or malformed; lists every fault.
+        CorruptDatasetError: it is missing, malformed or altered; lists every fault.
     """
-    return _read(root / DATASET_PATH, DATASET_PATH, _Description)
+    description = _read(root / DATASET_PATH, DATASET_PATH, _Description)
+    if not is_description_sealed(description):
+        raise CorruptDatasetError(f"{DATASET_PATH} was altered")
+    return description
 
 
 def read_subsets(root: Path) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Parquet files: numpy columns in and out, and a writer that starts a new file when one is full."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -36,16 +37,36 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
     """Copy an Arrow column of n rows to a contiguous array (n,), or (n, size) if `size` > 1.
 
     Raises:
-        CorruptDatasetError: rows are missing values.
+        CorruptDatasetError: rows are missing values, or are no numbers.
     """
     parts = [chunk.flatten() if size > 1 else chunk for chunk in column.chunks]
     if any(part.null_count for part in parts) or sum(map(len, parts)) != len(column) * size:
         raise CorruptDatasetError(f"expected {size} values in every row, some are missing")
     # Through DLPack, because Arrow's own to_numpy imports pandas; DLPack has no packed bits.
     bits = dtype == "bool"
+    numeric = (pa.types.is_integer, pa.types.is_floating)
+    if not all(pa.types.is_boolean(p.type) if bits else any(k(p.type) for k in numeric) for p in parts):
+        raise CorruptDatasetError(f"expected {dtype}, got {column.type}")
     values = [np.from_dlpack(part.cast(pa.uint8()) if bits else part) for part in parts]
     flat: Array = np.concatenate(values).astype(dtype, copy=False)
     return flat if size == 1 else flat.reshape(-1, size)
+
+
+def open_parquet(path: Path) -> pq.ParquetFile:
+    """Open the parquet file at `path`, which is closed by `with`.
+
+    Raises:
+        OSError: it cannot be read, or is a device or a pipe, for which one would wait without end.
+        ValueError: it is damaged, or two of its columns have the same name.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError("it is a folder, a device or a pipe, expected a file")
+    file = pq.ParquetFile(path)
+    listed = file.schema_arrow.names
+    if doubled := sorted({name for name in listed if listed.count(name) > 1}):
+        file.close()
+        raise ValueError(f"it has the column {', '.join(doubled)} more than once")
+    return file
 
 
 def read_blocks(
@@ -64,7 +85,7 @@ def read_blocks(
     end = 0
     for path in paths:
         try:
-            with pq.ParquetFile(path) as file:
+            with open_parquet(path) as file:
                 metadata = file.metadata
                 groups: list[int] = []
                 masks: list[NDArray[np.bool_]] = []
@@ -154,3 +175,11 @@ class RotatingWriter:
         """Write the footer."""
         self._writer.close()
         self._file.close()
+
+    def abandon(self) -> None:
+        """Close a file that is not wanted any more; if it is closed already, do nothing."""
+        with suppress(OSError):
+            self._writer.close()
+        self._writer.is_open = False  # or it would try again when it is collected
+        with suppress(OSError):
+            self._file.close()

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import STATS_PATH, TASKS_PATH
-from astra_data.dataset.parquet import UNREADABLE, first_line, to_numpy
+from astra_data.dataset.parquet import UNREADABLE, first_line, open_parquet, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own."""
@@ -23,8 +22,6 @@ EPISODES_AT_ONCE = 100
 """Rows of meta/episodes held in memory."""
 MOST_FPS = 2**31
 """Upper bound of steps per second."""
-_MOST_VALUES = 2**31
-"""Upper bound of the values of a row, that of Arrow's lists."""
 _NUMBERS = (
     *("bool", "float16", "float32", "float64"),
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
@@ -59,10 +56,12 @@ class Run:
 
     Attributes:
         path: the file.
+        row: the first of them there.
         columns: name to (T,) or (T, size).
     """
 
     path: Path
+    row: int
     columns: Mapping[str, Array]
 
     def __len__(self) -> int:
@@ -80,7 +79,7 @@ def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[
         except (KeyError, TypeError, ValueError):
             others.append(name)
             continue
-        if dtype in _NUMBERS and type(size) is int and 0 < size < _MOST_VALUES:
+        if dtype in _NUMBERS and type(size) is int and 0 < size <= names.MOST_VALUES:
             columns.append(PlainColumn(name, dtype, size))
         else:
             others.append(name)
@@ -89,6 +88,8 @@ def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[
 
 def read_object(path: Path) -> dict[str, Any] | str:
     """Return the JSON object in the file at `path`, or what is wrong with it."""
+    if path.exists() and not path.is_file():
+        return "is a folder, a device or a pipe, expected a file"
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -134,7 +135,7 @@ def read_small_table(path: Path) -> pa.Table | str:
     """Return the parquet file at `path`, or what is wrong with it."""
     try:
         # Not with read_table, which imports pandas.
-        with pq.ParquetFile(path) as file:
+        with open_parquet(path) as file:
             table = file.read()
         table.validate(full=True)
         return table.select(table.column_names)  # raises where names are not valid UTF-8
@@ -147,7 +148,7 @@ def read_small_table(path: Path) -> pa.Table | str:
 def read_footer(path: Path) -> tuple[int, pa.Schema] | str:
     """Return the number of rows and the schema of the parquet file at `path`, or what is wrong with it."""
     try:
-        with pq.ParquetFile(path) as file:
+        with open_parquet(path) as file:
             return file.metadata.num_rows, file.schema_arrow
     except FileNotFoundError:
         return "is missing"
@@ -173,7 +174,7 @@ def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
     """
     for path in episodes_files(root):
         try:
-            with pq.ParquetFile(path) as file:
+            with open_parquet(path) as file:
                 # As Python objects, the statistics of an episode take tens of kilobytes.
                 for batch in file.iter_batches(EPISODES_AT_ONCE):
                     yield from batch.to_pylist()
@@ -191,6 +192,7 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
         CorruptDatasetError: the file cannot be read, or values are missing.
     """
     rest: dict[str, Array] = {}
+    row = 0
     for table in tables:
         if faults := schema_faults(table.schema, columns):
             raise CorruptDatasetError(f"{path.parent.name}/{path.name}: {'; '.join(faults)}")
@@ -199,10 +201,11 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
         changes = np.diff(rest[names.EPISODE_INDEX]) != 0
         starts = [0, *(np.flatnonzero(changes & (rest[names.FRAME_INDEX][1:] == 0)) + 1).tolist()]
         for first, last in itertools.pairwise(starts):
-            yield Run(path, {name: values[first:last] for name, values in rest.items()})
+            yield Run(path, row + first, {name: values[first:last] for name, values in rest.items()})
+        row += starts[-1]
         rest = {name: values[starts[-1] :] for name, values in rest.items()}
     if rest and len(rest[names.EPISODE_INDEX]):
-        yield Run(path, rest)
+        yield Run(path, row, rest)
 
 
 def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str]:

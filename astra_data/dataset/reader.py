@@ -1,7 +1,9 @@
 """Read a dataset: whole columns as contiguous arrays, or one episode at a time."""
 
+import logging
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
-from astra_data.dataset.contents import Contents, read_contents
-from astra_data.dataset.description import ContentHash
+from astra_data.dataset.contents import Contents, Ints, read_contents
+from astra_data.dataset.digests import Digests, altered_columns, digests_of, read_digests
 from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.parquet import read_arrays
+from astra_data.dataset.lerobot_recording import open_recording
+from astra_data.dataset.plain import read_statistics
+from astra_data.dataset.values import alterations, measure, read_values
+
+_LOG = logging.getLogger(__name__)
 
 
 class Dataset(Contents):
@@ -30,16 +37,17 @@ class Dataset(Contents):
 
     @classmethod
     def open(cls, root: Path | str) -> "Dataset":
-        """Open the dataset in folder `root`; `versions.open_dataset` also takes names.
+        """Open the dataset in folder `root`, ours or LeRobot's; `versions.open_dataset` also takes names.
 
         Raises:
-            BadInputError: there is no dataset, or a LeRobot dataset without our metadata.
+            BadInputError: there is no dataset, or one of LeRobot without states or actions.
             CorruptDatasetError: it is incomplete or was altered; lists every fault.
         """
         root = Path(root)
         _refuse_others(root)
         with _explained(root):
-            return cls(**vars(read_contents(root)))
+            is_ours = (root / "meta/astra").is_dir() or not (root / INFO_PATH).is_file()
+            return cls(**vars(read_contents(root) if is_ours else open_recording(root)))
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -105,15 +113,13 @@ class Dataset(Contents):
     def blocks(
         self, names: Sequence[str], episodes: Collection[int] | None = None
     ) -> Iterator[dict[str, Array]]:
-        """Yield the values of `columns` in blocks of rows; memory stays bounded."""
-        specs = self.specs(names)
-        wanted = None
-        if episodes is not None:
-            wanted = np.zeros(int(self.lengths.sum()), dtype=bool)
-            for episode in self.selected(episodes):
-                wanted[self.starts[episode] : self.starts[episode] + self.lengths[episode]] = True
-        with _explained(self.root):
-            yield from read_arrays(self.paths, specs, wanted)
+        """Yield the values of `columns` in blocks of whole episodes; memory stays bounded.
+
+        Raises:
+            CorruptDatasetError: a file cannot be read, or values of the block differ from their digests.
+        """
+        for block, _ in self._verified(self.specs(names), self.selected(episodes)):
+            yield block
 
     def selected(self, episodes: Collection[int] | None) -> NDArray[np.int64]:
         """Return the episode indices `episodes`, by default all, in the dataset's order.
@@ -135,23 +141,31 @@ class Dataset(Contents):
             raise BadInputError(f"{self.reference}: {'; '.join(faults)}.")
         return chosen
 
-    def episodes(self, names: Sequence[str] | None = None) -> Iterator[Episode]:
-        """Yield all episodes in order with the columns `names`, by default `schema`; memory stays bounded."""
+    def episodes(
+        self, names: Sequence[str] | None = None, episodes: Collection[int] | None = None
+    ) -> Iterator[Episode]:
+        """Yield episodes in order with the columns `names`, by default `schema`; memory stays bounded.
+
+        Args:
+            names: names of the columns.
+            episodes: indices of the episodes, by default all.
+
+        Raises:
+            BadInputError: a column or an episode does not exist, or an episode is listed twice.
+            CorruptDatasetError: a file cannot be read, or values differ from their digests.
+        """
         specs = self.schema if names is None else self.specs(names)
-        rest: dict[str, Array] = {}
-        episode = 0
-        for block in self.blocks([c.name for c in specs]):
-            rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
-            first, rows = 0, len(next(iter(rest.values())))
-            while episode < len(self) and (last := first + int(self.lengths[episode])) <= rows:
+        for block, indices in self._verified(specs, self.selected(episodes)):
+            first = 0
+            for episode in indices.tolist():
+                last = first + int(self.lengths[episode])
                 metadata = {key: values[episode] for key, values in self.metadata.items()}
                 yield Episode(
                     int(self.uids[episode]),
-                    {name: values[first:last] for name, values in rest.items()},
+                    {name: values[first:last] for name, values in block.items()},
                     {key: value for key, value in metadata.items() if value is not None},
                 )
-                first, episode = last, episode + 1
-            rest = {name: values[first:] for name, values in rest.items()} if first < rows else {}
+                first = last
 
     def successes(self) -> list[bool | None] | None:
         """Return whether each episode succeeded, None where unknown; None if unknown of all.
@@ -176,24 +190,70 @@ class Dataset(Contents):
             raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
         return self.order[:count]
 
-    def verify(self) -> list[str]:
-        """Read every value again and compare the content hash; return what is wrong, empty if nothing is.
+    def statistics(self) -> dict[str, dict[str, Any]] | str:
+        """Return meta/stats.json, column to statistic to values, or what is wrong with it.
 
-        The hash covers every column, LeRobot's own included. `doctor.check` finds the wrong value.
+        Of what LeRobot recorded, min, max and mean are computed from the values.
         """
-        running = ContentHash()
+        if self.recorded is None:
+            return read_statistics(self.root)
+        return ranges(self.blocks([column.name for column in self.schema]))
+
+    def verify(self) -> list[str]:
+        """Read every value again and compare content hash and digests; return what is wrong, if anything.
+
+        Both cover every column, LeRobot's own included.
+        """
         try:
-            for block in self.blocks(list(self.features)):
-                for name, values in block.items():
-                    running.update(name, values)
+            found, digests = measure(self)
+            stored = self._stored_digests()
         except CorruptDatasetError as error:
             return [str(error)]
-        found = running.hexdigest()
-        return (
-            []
-            if found == self.content_hash
-            else [f"the content hash is {found}, expected {self.content_hash}"]
-        )
+        altered = {} if stored is None else altered_columns(digests, stored)
+        faults = list(alterations(self, altered, self.selected(None)))
+        return faults if found == self.content_hash else [*faults, self._other_hash(found)]
+
+    def require_whole(self) -> None:
+        """Read every value, for what states something of all of them.
+
+        Raises:
+            CorruptDatasetError: a value was altered.
+        """
+        for _ in self.blocks(list(self.features)):
+            pass
+
+    @cached_property
+    def _digests(self) -> Digests:
+        """The stored digests; where there are none, those of the values, if these have the content hash."""
+        if self.recorded is not None:
+            return self.recorded.digests
+        try:
+            stored, lack = self._stored_digests(), "it was written without digests of its values"
+        except CorruptDatasetError as error:
+            stored, lack = None, str(error)
+        if stored is not None:
+            return stored
+        _LOG.warning("%s: %s; all values are compared with its content hash now", self.root, lack)
+        found, digests = measure(self)
+        if found != self.content_hash:
+            raise CorruptDatasetError(self._other_hash(found))
+        return digests
+
+    def _stored_digests(self) -> Digests | None:
+        return read_digests(self.root, self.description.get("sums", {}), self.features, len(self))
+
+    def _other_hash(self, found: str) -> str:
+        return f"the content hash is {found}, expected {self.content_hash}"
+
+    def _verified(self, columns: Sequence[Column], chosen: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
+        """Yield blocks of whole episodes and their indices; the first one with altered values raises."""
+        with _explained(self.root):
+            for block, indices in read_values(self, columns, chosen):
+                stored = {name: self._digests[name][indices] for name in block}
+                altered = altered_columns(digests_of(block, self.lengths[indices]), stored)
+                for fault in alterations(self, altered, indices):
+                    raise CorruptDatasetError(fault)
+                yield block, indices
 
     def specs(self, names: Sequence[str]) -> list[Column]:
         """Return the columns `names`.
@@ -214,11 +274,6 @@ def _refuse_others(root: Path) -> None:
         raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
     if not (root / "meta").is_dir():
         raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
-    if (root / INFO_PATH).is_file() and not (root / "meta/astra").is_dir():
-        raise BadInputError(
-            f"{root} is a LeRobot dataset without our metadata: `astra-data repair {root} --out FOLDER` "
-            "makes one of ours of it, and leaves it as it is."
-        )
 
 
 @contextmanager

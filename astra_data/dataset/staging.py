@@ -6,24 +6,25 @@
 """
 
 import json
-import os
-import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
-from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
+from astra_data.core.disk import writing
+from astra_data.core.durable import discard, make_folder, move, sweep, sync, write_file
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
-from astra_data.dataset.atomic import sync
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import changed_values
 from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
+from astra_data.dataset.plain import read_object
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 
@@ -66,7 +67,6 @@ class StagedWriter:
         description: Mapping[str, Any],
         subset_seed: int = 0,
         resume: bool = False,
-        fsync: bool = True,
     ) -> None:
         """Prepare to record; entering the block starts.
 
@@ -78,8 +78,6 @@ class StagedWriter:
             description: the dataset's provenance.
             subset_seed: of the permutation whose prefixes are the nested subsets.
             resume: continue an interrupted recording, if there is one.
-            fsync: flush every episode to the disk, so that it survives a power failure and not only a killed
-                process. Costs about 5 ms per episode.
 
         Raises:
             BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
@@ -102,20 +100,26 @@ class StagedWriter:
             "subset_seed": subset_seed,
         }
         self._resume = resume
-        self._fsync = fsync
         self._admission = Admission(columns)
         self._exit = ExitStack()
         self._is_open = False
 
     def __enter__(self) -> "StagedWriter":
-        """Start or resume the recording."""
+        """Start or resume the recording.
+
+        Raises:
+            BadInputError: what was staged belongs to another recording, or to one that is going on.
+            CorruptDatasetError: a staged episode is damaged.
+            DiskError: the folder cannot be written.
+        """
         if self._holds_work() and not self._resume and not self.root.exists():
             raise BadInputError(
                 f"{self.root}: an interrupted recording left {self._left()}; "
                 f"resume it (--resume), or delete {self.folder} to start again."
             )
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as stack:
+        with writing(self.folder), ExitStack() as stack:
+            make_folder(self.folder)
+            sweep(self.root)
             if not stack.enter_context(held(self.folder)):
                 raise BadInputError(
                     f"{self.root} is being recorded right now; wait or choose another folder."
@@ -124,9 +128,7 @@ class StagedWriter:
                 self._refuse_root()
             self._agree_on_the_plan()
             for path in sorted(self.folder.glob("*.arrow")):
-                episode = self._load(path)
-                self._admission.admit(episode)
-                self.staged[int(path.stem)] = episode.metadata
+                self.staged[int(path.stem)] = self._restore(path).metadata
             self._exit = stack.pop_all()
         self._is_open = True
         return self
@@ -137,16 +139,32 @@ class StagedWriter:
         """Write the dataset and remove the staged episodes; after an error, leave them to be resumed."""
         self._is_open = False
         with self._exit:
+            is_written = False
             try:
                 if error is None:
-                    self._writer.made, self._writer.policy = self.made, self.policy
-                    with self._writer:
-                        for position in sorted(self.staged):
-                            self._writer.add(self._load(self._path(position)))
-                    self.staged.clear()
+                    self._write()
+                    is_written = True
             finally:
-                if not self.staged and (error is None or not self._holds_work()):
-                    shutil.rmtree(self.folder)
+                with suppress(OSError):  # what stays is recognised by the next call
+                    if is_written or not self._holds_work():
+                        discard(self.folder, self.root)
+
+    def _write(self) -> None:
+        self._writer.made, self._writer.policy = self.made, self.policy
+        with self._keeping(), self._writer:
+            for position in sorted(self.staged):
+                self._writer.add(self._load(self._path(position)))
+
+    @contextmanager
+    def _keeping(self) -> Iterator[None]:
+        """Say how many episodes are safe if the disk fails."""
+        try:
+            yield
+        except DiskError as error:
+            raise DiskError(
+                f"{error} {len(self.staged)} episodes are safe in {self.folder}: a recipe goes on with them "
+                "by itself, the command for a task with --resume."
+            ) from error
 
     def add(self, episode: Episode, position: int | None = None) -> None:
         """Stage `episode`; a refused one changes nothing.
@@ -157,30 +175,31 @@ class StagedWriter:
 
         Raises:
             BadInputError: it does not fit the columns, or the position is taken.
+            DiskError: it cannot be written; it may be added again.
         """
         if not self._is_open:
             raise BadInputError(f"{self.root}: add episodes inside `with StagedWriter(...) as writer:`.")
         place = max(self.staged, default=-1) + 1 if position is None else position
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
-        self._admission.admit(episode)
+        self._admission.check(episode)
         metadata = json.dumps({"uid": episode.uid, "metadata": dict(episode.metadata)})
         schema = self._schema.with_metadata({"episode": metadata})
         arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]
         path = self._path(place)
         partial = path.with_suffix(".partial")
-        with pa.OSFile(str(partial), "wb") as sink, pa.ipc.new_file(sink, schema) as file:
-            file.write_table(pa.Table.from_arrays(arrays, schema=schema))
-        if self._fsync:
+        with self._keeping(), writing(path):
+            with partial.open("wb") as sink, pa.ipc.new_file(sink, schema) as file:
+                file.write_table(pa.Table.from_arrays(arrays, schema=schema))
             sync(partial)
-        os.replace(partial, path)
-        if self._fsync:
-            sync(self.folder)
+            move(partial, path)
+        self._admission.admit(episode)
         self.staged[place] = episode.metadata
 
     def _holds_work(self) -> bool:
         """Return whether there is anything to resume beside the plan."""
-        return any(path.name != _PLAN and path.suffix != ".partial" for path in self.folder.glob("*"))
+        kept = (path for path in self.folder.glob("*") if not path.name.startswith("."))
+        return any(path.name != _PLAN and path.suffix != ".partial" for path in kept)
 
     def _left(self) -> str:
         """Describe what can be resumed."""
@@ -188,27 +207,36 @@ class StagedWriter:
         return f"{waiting} episodes" if waiting else "an unfinished recording"
 
     def _refuse_root(self) -> None:
-        """Refuse an existing `root`; if it is this recording, finished, remove the staged episodes."""
-        staged = {
-            episode.uid: len(episode) for episode in map(self._load, sorted(self.folder.glob("*.arrow")))
-        }
-        if not self._holds_work() or self._is_finished(staged):
-            shutil.rmtree(self.folder)
+        """Refuse an existing `root`; if nothing is staged that is not in it, remove the staged episodes."""
+        if not self._holds_work() or self._is_written():
+            discard(self.folder, self.root)
             raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
         raise BadInputError(
             f"{self.root} exists already and is another dataset than the interrupted recording, which left "
             f"{self._left()} in {self.folder}: move one of the two away."
         )
 
-    def _is_finished(self, staged: Mapping[int, int]) -> bool:
-        """Return whether the dataset at `root` holds the episodes `staged`, uid to length."""
+    def _is_written(self) -> bool:
+        """Return whether the dataset at `root` holds every staged episode, value for value."""
+        paths = sorted(self.folder.glob("*.arrow"))
         try:
             dataset = Dataset.open(self.root)
+            if not paths:
+                return all(dataset.description.get(key) == value for key, value in self._described().items())
+            staged = {episode.uid: path for path in paths for episode in [self._load(path)]}
+            for stored in dataset.episodes([column.name for column in self._columns]):
+                path = staged.pop(stored.uid, None)
+                if path and not _is_same(self._load(path), stored):
+                    return False
         except AstraDataError:
             return False
-        stored = dict(zip(dataset.uids.tolist(), dataset.lengths.tolist(), strict=True))
-        same = all(dataset.description.get(key) == value for key, value in self._plan["description"].items())
-        return same and (not staged or stored == staged)
+        return not staged
+
+    def _described(self) -> Mapping[str, Any]:
+        """Return the description of the recording that was interrupted, by default of this one."""
+        plan = read_object(self.folder / _PLAN)
+        found = plan.get("description") if isinstance(plan, dict) else None
+        return found if isinstance(found, dict) else self._plan["description"]
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"
@@ -225,18 +253,36 @@ class StagedWriter:
             ) from error
         return Episode(metadata["uid"], values, metadata["metadata"])
 
+    def _restore(self, path: Path) -> Episode:
+        """Load an episode of the interrupted recording, as if it was added now."""
+        episode = self._load(path)
+        try:
+            self._admission.admit(episode)
+        except BadInputError as error:
+            raise BadInputError(f"{path}: {error} Delete it and resume the recording.") from error
+        return episode
+
     def _agree_on_the_plan(self) -> None:
-        path = self.folder / _PLAN
-        text = json.dumps(self._plan, indent=1, sort_keys=True)
-        if path.exists():
-            before, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
+        """Write the plan, or check that what was staged is of the same one."""
+        now = json.loads(json.dumps(self._plan))
+        before = read_object(self.folder / _PLAN)
+        if isinstance(before, dict):
             differing = [key for key, *_ in changed_values(before, now)]
             if differing:
                 raise BadInputError(
                     f"{self.root}: the interrupted recording differs in {', '.join(differing)}; "
                     f"resume it with the same settings, or delete {self.folder}."
                 )
-        partial = path.with_suffix(".partial")
-        partial.write_text(text, encoding="utf-8")
-        sync(partial)
-        os.replace(partial, path)
+        elif self._holds_work():
+            raise BadInputError(
+                f"{self.folder} holds {self._left()}, but {_PLAN} {before}, so that nobody knows of which "
+                f"recording: delete the folder to start again."
+            )
+        else:
+            write_file(self.folder / _PLAN, json.dumps(self._plan, indent=1, sort_keys=True))
+
+
+def _is_same(one: Episode, other: Episode) -> bool:
+    return one.metadata == other.metadata and all(
+        np.array_equal(values, other.columns[name]) for name, values in one.columns.items()
+    )

@@ -21,7 +21,7 @@ from astra_data.dataset.reader import Dataset
 
 Change = Literal["columns", "episodes", "description"]
 
-_REFERENCE = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*)(@(data-)?(?P<version>\d+\.\d+\.\d+))?")
+_REFERENCE = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9._-]{0,199})(@(data-)?(?P<version>\d+\.\d+\.\d+))?")
 
 
 @dataclass(frozen=True, order=True)
@@ -96,11 +96,13 @@ def locate(dataset: str | Path) -> Path:
     Raises:
         BadInputError: there is no such folder and no such name at home.
     """
-    if Path(dataset).is_dir():
+    if _is_folder(Path(dataset)):
         return Path(dataset)
     reference = _REFERENCE.fullmatch(str(dataset))
     if not reference:
-        raise BadInputError(f"{dataset}: no such folder; expected a folder, name or name@data-1.2.0")
+        raise BadInputError(
+            f"{str(dataset)[:300]}: no such folder; expected a folder, name or name@data-1.2.0"
+        )
     name, version = reference["name"], reference["version"]
     versions = versions_at_home(name)
     if not versions:
@@ -109,6 +111,13 @@ def locate(dataset: str | Path) -> Path:
         known = ", ".join(f"data-{known}" for known in versions)
         raise BadInputError(f"{name} has no version data-{version} in {home()}; it has {known}")
     return place({"name": name, "version": version or versions[-1]})
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # its name is too long for a file
+        return False
 
 
 def open_dataset(dataset: str | Path) -> Dataset:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,15 +16,17 @@ import pyarrow.parquet as pq
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset.admission import Admission
+from astra_data.dataset.admission import Admission, is_text
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.column_statistics import episode_statistics, global_statistics
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import ContentHash, complete_description, permutation
+from astra_data.dataset.digests import digest_of, write_digests
 from astra_data.dataset.episode_rows import EpisodeRows
 from astra_data.dataset.parquet import RotatingWriter, to_arrow
 from astra_data.dataset.plain import data_files
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.seal import sealed
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 
@@ -92,6 +95,8 @@ class DatasetWriter:
             faults.append(f"fps {fps!r}, expected a positive int")
         if compression not in layout.COMPRESSIONS:
             faults.append(f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}")
+        if not is_text(task):
+            faults.append(f"task {task!r}, expected text of valid characters")
         if faults:
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
         self.root = root
@@ -106,6 +111,7 @@ class DatasetWriter:
         self._subset_seed = subset_seed
         self._compression = compression
         self._hash = ContentHash()
+        self._digests = {column.name: array("Q") for column in self._stored}
         self._frames = 0
         self._lengths: dict[int, int] = {}
         self._metadata: list[Mapping[str, Scalar]] = []
@@ -143,13 +149,17 @@ class DatasetWriter:
 
     def __enter__(self) -> "DatasetWriter":
         """Start the hidden folder."""
-        self._folder = self._exit.enter_context(atomic_folder(self.root))
-        encodings = layout.data_encodings(self._stored)
-        self._data = RotatingWriter(
-            self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
-        )
-        self._rows = EpisodeRows(self._folder, self._stored, self._task)
-        self._exit.push(self._finish)
+        with ExitStack() as stack:
+            self._folder = stack.enter_context(atomic_folder(self.root))
+            encodings = layout.data_encodings(self._stored)
+            self._data = RotatingWriter(
+                self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
+            )
+            stack.callback(self._data.abandon)
+            self._rows = EpisodeRows(self._folder, self._stored, self._task)
+            stack.callback(self._rows.abandon)
+            stack.push(self._finish)
+            self._exit = stack.pop_all()
         self._is_open = True
         return self
 
@@ -182,8 +192,9 @@ class DatasetWriter:
         chunk, file = self._data.locate()
         arrays = [to_arrow(values[field.name], field.type) for field in self._schema]
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
-        for name, array in values.items():
-            self._hash.update(name, array)
+        for name, column in values.items():
+            self._hash.update(name, column)
+            self._digests[name].append(digest_of(column))
         self._rows.append(length, chunk, file, episode_statistics(values.values()))
         self._frames += length
         self._lengths[episode.uid] = length
@@ -192,11 +203,11 @@ class DatasetWriter:
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the data files and, unless there was an error, write all other files and verify."""
-        self._data.close()
-        self._rows.close()
+        """Unless there was an error, close the data files, write all other files and verify."""
         if error is not None:
             return
+        self._data.close()
+        self._rows.close()
         if not self._lengths:
             raise BadInputError(f"{self.root}: no episodes were added; a dataset needs at least one.")
         episodes, uids = len(self._lengths), list(self._lengths)
@@ -206,13 +217,14 @@ class DatasetWriter:
         stats = global_statistics(self._stored, self._frames, data_files(self._folder))
         self._write_json(layout.STATS_PATH, stats)
         self._write_json(layout.SUBSETS_PATH, {"seed": self._subset_seed, "uids": order})
-        contents = {"content_hash": self.content_hash}
-        self._write_json(layout.DATASET_PATH, self._description | self.made | contents)
         pq.write_table(layout.tasks_table(self._task), self._folder / layout.TASKS_PATH)
         metadata = {"episode_uid": pa.array(uids), "length": pa.array(list(self._lengths.values()))}
         for key, kind_ in sorted(self._admission.metadata_types.items()):
             metadata[key] = pa.array([row.get(key) for row in self._metadata], _METADATA_TYPES[kind_])
         pq.write_table(pa.table(metadata), self._folder / layout.METADATA_PATH)
+        write_digests(self._folder, self._digests)
+        description = self._description | self.made | {"content_hash": self.content_hash}
+        self._write_json(layout.DATASET_PATH, sealed(self._folder, description))
         if self.policy:
             shutil.copyfile(self.policy, self._folder / layout.POLICY_PATH)
         faults = Dataset.open(self._folder).verify()

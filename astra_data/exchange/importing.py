@@ -1,9 +1,10 @@
 """Import recordings in other formats as datasets."""
 
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -12,14 +13,25 @@ from typing import Any
 from astra_data.core.config import did_you_mean, load_recipe, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
 from astra_data.dataset.parquet import first_line
 from astra_data.dataset.versions import place
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter, Tally
+from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, find_sources, is_archive
+from astra_data.exchange.recording import (
+    MOST_UNPACKED,
+    SMALL_BYTES,
+    VALUE_BYTES,
+    Block,
+    Source,
+    find_sources,
+    is_archive,
+)
+from astra_data.exchange.restoring import read_record, restored, write_restored
 
 FORMATS: Mapping[str, ModuleType] = {
     "csv": csv,
@@ -75,20 +87,28 @@ def import_dataset(
     name: str | None = None,
     fps: int | None = None,
     task: str | None = None,
+    max_bytes: int | None = None,
 ) -> ImportReport:
     """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
 
+    Of our own exports the sums are verified; without a mapping, all that was exported comes back.
+
     Args:
         recordings: files, folders or archives of one format.
-        mapping: the file that says which fields become which columns; D4RL, robomimic and Minari need none.
+        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy and Minari
+            need none.
         out: the dataset's folder, by default its place at home.
         file_format: one of `FORMATS`, by default inferred from the recordings' names.
         name: of the dataset; like `fps` and `task`, it overrides the mapping.
         fps: steps per second.
         task: what the episodes do.
+        max_bytes: the most bytes of values that are taken from the recordings, eight a value; by default 100
+            times the size of the files, or 256 MiB if that is more.
 
     Raises:
-        BadInputError: a recording is malformed or does not fit the mapping; nothing is written.
+        BadInputError: a recording is malformed, unpacks to too much or does not fit the mapping; nothing is
+            written.
+        CorruptDatasetError: an export of ours was altered; nothing is written.
         RecipeError: the mapping has faults.
     """
     began = time.perf_counter()
@@ -101,11 +121,22 @@ def import_dataset(
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
-    sources = [source for recording in recordings for source in _sources(recording, chosen)]
+    sources = _bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes)
+    strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
+    if strange:
+        raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
+    records = {source: record for source in sources if (record := _record(source, chosen))}
+    for source, record in records.items():
+        episodes = _restored(source, chosen, record)
+        if settings is None:
+            root, frames = write_restored(sources, record, episodes, options, _identities(sources), out)
+            seconds = time.perf_counter() - began
+            return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
+        deque(episodes, maxlen=0)  # verifies the sums
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
-    episodes = _episodes(sources, chosen, settings, cutter)
-    first = next(episodes, None)
+    cuts = _in_memory(_episodes(sources, chosen, settings, cutter))
+    first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
         raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes ({_losses(cutter.tally)})")
@@ -120,7 +151,7 @@ def import_dataset(
     with DatasetWriter(
         root, cutter.columns, fps=settings.fps, task=settings.task, description=description
     ) as writer:
-        for count, (columns, metadata) in enumerate(chain([first], episodes), start=1):
+        for count, (columns, metadata) in enumerate(chain([first], cuts), start=1):
             writer.add(Episode(count - 1, columns, metadata))
             frames += len(columns[TRUNCATED])
         _refuse_rejected(cutter.tally, settings)
@@ -128,6 +159,16 @@ def import_dataset(
         seconds = time.perf_counter() - began
         writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
     return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began)
+
+
+def _record(source: Source, file_format: str) -> ExportRecord | None:
+    with _explained(source, file_format):
+        return read_record(FORMATS[file_format], source)
+
+
+def _restored(source: Source, file_format: str, record: ExportRecord) -> Iterator[Episode]:
+    with _explained(source, file_format):
+        yield from restored(FORMATS[file_format], source, record)
 
 
 def _common_format(recordings: Sequence[Path]) -> str:
@@ -155,6 +196,14 @@ def _format_of(recording: Path) -> str:
     raise BadInputError(
         f"{recording}: its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
     )
+
+
+def _bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
+    """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
+    if max_bytes is None:
+        size = sum(file.stat().st_size for file in _files(sources))
+        max_bytes = max(SMALL_BYTES, MOST_UNPACKED * size)
+    return [replace(source, most_bytes=max_bytes) for source in sources]
 
 
 def _suffixes(module: ModuleType) -> tuple[str, ...]:
@@ -187,15 +236,27 @@ def _episodes(
     sources: Sequence[Source], file_format: str, mapping: ImportMapping, cutter: Cutter
 ) -> Iterator[Cut]:
     recording = None
+    size = 0
     for source in sources:
         is_apart = mapping.split.files or source.recording != recording
         origin, row = "", 0
         for block in _blocks(source, file_format, mapping):
+            size += VALUE_BYTES * sum(values.size for values in block.values.values())
+            source.refuse_beyond(size)
             recording = source.recording
             row = row if block.origin == origin else 0
             yield from cutter.feed(block, row, is_apart=is_apart)
             is_apart, origin, row = False, block.origin, row + len(block)
     yield from cutter.finish()
+
+
+def _in_memory(episodes: Iterator[Cut]) -> Iterator[Cut]:
+    try:
+        yield from episodes
+    except MemoryError as error:
+        raise BadInputError(
+            f"an episode does not fit into memory ({first_line(error)}): cut it by [split] in the mapping"
+        ) from error
 
 
 def _blocks(source: Source, file_format: str, mapping: ImportMapping) -> Iterator[Block]:
@@ -237,7 +298,11 @@ def _last_rows(tally: Tally) -> str:
 
 def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Return name and sha256 of every file of the recordings."""
-    files = []
+    return [{"name": file.name, "sha256": file_digest(file)} for file in _files(sources)]
+
+
+def _files(sources: Sequence[Source]) -> list[Path]:
+    files: list[Path] = []
     for path in dict.fromkeys(source.path for source in sources):
         files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    return [{"name": file.name, "sha256": file_digest(file)} for file in files]
+    return files

@@ -128,7 +128,9 @@ class ImportMapping(Config):
     min_steps: Count = 1
     """Episodes with fewer steps are left out."""
     episodes: str | None = None
-    """HDF5: groups that are episodes, such as "data/demo_*"; fields are then relative to the group."""
+    """HDF5: groups that are episodes, such as "data/demo_*"; fields are then relative to the group. Or
+    "{field}_{number}", where the number of the episode ends the names of its fields, as d3rlpy writes them; a
+    single value is then that of the last row."""
     transposed: bool = False
     """HDF5: rows lie along the last dimension, as in MATLAB's files."""
 

@@ -15,6 +15,13 @@ from astra_data.dataset.columns import Array
 BLOCK_ROWS = 2**13
 """Rows that an importer reads at once, if the format allows it."""
 
+VALUE_BYTES = 8
+"""What a value is counted as, whatever its type: as much as it may take when it is converted."""
+SMALL_BYTES = 2**28
+"""Values of so many bytes are taken from recordings of any size."""
+MOST_UNPACKED = 100
+"""Larger than what logs of a robot are compressed by; files made to fill a memory are compressed by more."""
+
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 
 
@@ -26,11 +33,25 @@ class Source:
         path: the file, or the archive that holds it.
         member: its entry in the archive, None for a file of its own.
         recording: the file, folder or archive given by the user; its files follow one another.
+        most_bytes: most bytes of values that are taken from it.
     """
 
     path: Path
     member: tarfile.TarInfo | None
     recording: Path
+    most_bytes: int = SMALL_BYTES
+
+    def refuse_beyond(self, size: int) -> None:
+        """Refuse to take values of `size` bytes, if these are too many.
+
+        Raises:
+            BadInputError: they are; says how to take them.
+        """
+        if size > self.most_bytes:
+            raise BadInputError(
+                f"{self} holds values of {size} bytes or more, of which at most {self.most_bytes} are taken: "
+                "more than a robot's logs are packed by. If you trust it, pass a larger --max-bytes."
+            )
 
     def __str__(self) -> str:
         """Name the file for messages and for the episodes' metadata."""
@@ -81,6 +102,8 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
     """
     if not recording.exists():
         raise BadInputError(f"{recording} does not exist")
+    if not (recording.is_file() or recording.is_dir()):
+        raise BadInputError(f"{recording} is a device or a pipe, expected a file or a folder")
     if recording.is_dir():
         files = [path for path in recording.rglob("*") if path.is_file()]
         sources = [Source(path, None, recording) for path in files if _is_seen(path.relative_to(recording))]

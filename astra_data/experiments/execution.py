@@ -6,11 +6,12 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from astra_data.core.disk import disk_error
 from astra_data.core.errors import AstraDataError
 
 SECONDS_BETWEEN_NOTES = 0.1
@@ -97,18 +98,18 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
         send: sends a note, at most ten times a second.
     """
     began = time.perf_counter()
-    with _printing_to(log):
-        try:
+    try:
+        with _printing_to(log):
             prepare, call = pickle.loads(work)
             if prepare:
                 prepare()
             call(progress=Reporter(send))
-        except AstraDataError as error:
-            return type(error)(f"{key}: {error}")
-        except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
-            traceback.print_exc()
-            last = traceback.format_exception_only(error)[-1].strip()
-            return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
+    except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
+        expected = error if isinstance(error, AstraDataError) else disk_error(error)
+        if expected:
+            return type(expected)(f"{key}: {expected}")
+        last = traceback.format_exception_only(error)[-1].strip()
+        return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
     return time.perf_counter() - began
 
 
@@ -138,8 +139,16 @@ def _printing_to(log: Path) -> Iterator[None]:
             os.dup2(file.fileno(), stream)
     try:
         yield
-    finally:
         _flush()
+    except AstraDataError:
+        raise
+    except Exception:
+        with suppress(OSError):
+            traceback.print_exc()
+        raise
+    finally:
+        with suppress(OSError):
+            _flush()
         for stream, own in zip((1, 2), before, strict=True):
             os.dup2(own, stream)
             os.close(own)

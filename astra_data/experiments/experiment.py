@@ -107,22 +107,36 @@ class Experiment:
         """
         if self.base:
             self.base.check_unchanged()
+        changed, folders = self._outdated
+        if folders:
+            raise RecipeError(
+                f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
+                f"give the recipe another name, or remove {' '.join(map(str, folders))}"
+            )
+
+    def outdated(self, key: str) -> str:
+        """Return which settings changed since the artefact `key` was made, empty if none."""
+        changed, folders = self.maker(key.partition("/")[0])._outdated
+        place = self.place(key)
+        if not any(place.is_relative_to(folder) for folder in folders):
+            return ""
+        return f"{' and '.join(sorted(changed))} changed in the recipe since: rename it, or remove this"
+
+    @cached_property
+    def _outdated(self) -> tuple[set[str], list[Path]]:
+        """The settings that changed since the artefacts were made, and the folders made with the old ones."""
         record = self.folder / "recipe.json"
         if not record.is_file():
-            return
+            return set(), []
         changed = _differences(json.loads(record.read_text()), self.recipe)
         whole = _stale_stages(changed - _ROWS_TABLES)
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
         own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
-        present = [str(self.folder / stage) for stage in STAGES if stage in whole & own]
+        folders = [self.folder / stage for stage in STAGES if stage in whole & own]
         for table in sorted(changed & _ROWS_TABLES):
             for stage in sorted((_stale_stages({table}) - whole) & own):
-                present += map(str, self._rows_of(table, stage))
-        if present:
-            raise RecipeError(
-                f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
-                f"give the recipe another name, or remove {' '.join(dict.fromkeys(present))}"
-            )
+                folders += self._rows_of(table, stage)
+        return changed, list(dict.fromkeys(folders))
 
     @property
     def results(self) -> Path:

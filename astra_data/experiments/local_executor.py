@@ -3,11 +3,12 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Collection
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread
+from types import FrameType
 
 from astra_data.core.errors import AstraDataError
 from astra_data.experiments.execution import Item, Watcher, pickled, run_in_order, run_item
@@ -24,8 +25,8 @@ def execute(
     """Run `items` in up to `jobs` spawned processes, each as soon as its inputs are finished.
 
     Inputs that are not among `items` count as finished. What an item prints goes to `<logs>/<key>.txt`; the
-    file of an item that printed nothing is removed. When an item fails, at Ctrl-C, or when this process is
-    killed, the others are stopped.
+    file of an item that printed nothing is removed. When an item fails, at Ctrl-C or SIGTERM, or when this
+    process is killed, the others are stopped; their last checkpoints stay.
 
     Args:
         items: in order of preference.
@@ -37,6 +38,7 @@ def execute(
     Raises:
         AstraDataError: an item failed; its own error, with its key before the message, or where its
             traceback is when it crashed.
+        KeyboardInterrupt: at Ctrl-C or SIGTERM.
     """
     workers: list[_Worker] = []
 
@@ -54,11 +56,35 @@ def execute(
         keys = [worker.read(watch) for connection, worker in busy.items() if connection in ready]
         return [key for key in keys if key]
 
+    with _interruptible():
+        try:
+            run_in_order(items, jobs, begin, finished)
+        finally:
+            for worker in workers:
+                worker.terminate()
+            for worker in workers:
+                worker.stop()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Interrupt the block at SIGINT or SIGTERM, once.
+
+    Also where a shell that started the run in the background has it ignore SIGINT.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = [signal.signal(number, interrupt) for number in numbers]
     try:
-        run_in_order(items, jobs, begin, finished)
+        yield
     finally:
-        for worker in workers:
-            worker.stop()
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 class _Worker:
@@ -109,8 +135,10 @@ class _Worker:
         reason = ", often for want of memory" if -code == signal.SIGKILL else ""
         return f"was stopped by {signal.Signals(-code).name}{reason}"
 
-    def stop(self) -> None:
+    def terminate(self) -> None:
         self._process.terminate()
+
+    def stop(self) -> None:
         self._process.join(5)
         if self._process.exitcode is None:
             self._process.kill()

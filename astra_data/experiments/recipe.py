@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from astra_data.core.config import Config, Count, did_you_mean
+from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
@@ -31,7 +31,7 @@ WHOLE = 100
 class SweepConfig(Config):
     """The sizes of the dataset on which the rows are repeated."""
 
-    percent: tuple[Count, ...] = ()
+    percent: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
     """In per cent of `collect.episodes`; smaller ones lie inside larger ones. By default the whole."""
 
 

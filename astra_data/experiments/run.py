@@ -1,11 +1,11 @@
 """Run recipes: make every artefact that is not finished yet, for every row and seed."""
 
-import os
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import torch
@@ -13,9 +13,11 @@ from rich.console import Console
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.cores import cores
+from astra_data.core.durable import make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
+from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
 from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
@@ -27,6 +29,8 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.stages.registry import STAGES
 
 RUNS = Path("runs")
+SET_ASIDE = "set_aside"
+"""The folder of a run for artefacts that are made again: what took hours to make is not deleted."""
 CUDA_JOBS = 2
 """Items at a time on a CUDA device, where each process has its own context."""
 
@@ -121,12 +125,17 @@ def run_stage(
     return folder / stage
 
 
-def check(recipe_path: Path, *, root: Path = RUNS) -> dict[str, bool]:
-    """Validate a recipe without running it; return each planned artefact and whether it is finished."""
+def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict[str, Condition]:
+    """Validate a recipe without running it; return each planned artefact and its condition.
+
+    With `verify`, every byte of the artefacts is read; otherwise their sizes are compared.
+
+    Raises:
+        RecipeError: the recipe has faults.
+    """
     experiment = load_experiment(recipe_path, root)
-    experiment.check_unchanged()
     planned = plan(experiment.recipe, recipe_path, experiment.folder)
-    return {item.key: finished(item, experiment) for item in planned}
+    return {item.key: condition(item, experiment, verify=verify) for item in planned}
 
 
 Show = Callable[[int, Console], AbstractContextManager[Watcher]]
@@ -142,7 +151,9 @@ def make(
     cluster: str | None = None,
     show: Show = display,
 ) -> None:
-    """Make those of an experiment's `items` that are not finished yet.
+    """Make those of an experiment's `items` that are not finished yet, damaged or stale.
+
+    What is made again is set aside before, with a line that says why and where.
 
     Args:
         experiment: whose artefacts they are.
@@ -156,7 +167,8 @@ def make(
     Raises:
         MissingStageError: an artefact that an item reads is neither finished nor among them.
         RecipeError: the recipe differs from the one that made the existing artefacts.
-        BadInputError: another process runs in the recipe's folder, or the device or cluster is not available.
+        BadInputError: another process runs in the recipe's folder, the device or cluster is not available, or
+            a dataset is damaged that the recipe cannot make again.
         AstraDataError: an item failed.
     """
     _check_device(device, cluster)
@@ -166,15 +178,24 @@ def make(
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
-        items = [item for item in items if not finished(item, experiment)]
+        again = to_make_again(items, experiment)
+        for key, reason in again.items():
+            if not can_be_made_again(key, experiment):
+                raise BadInputError(
+                    f"{experiment.place(key)} is {reason}, and was not made by this recipe: restore it from "
+                    "a copy, save its whole episodes with `astra-data repair`, or remove it"
+                )
+        items = [item for item in items if item.key in again or not finished(item, experiment)]
         _check_inputs(experiment, items)
         experiment.link_borrowed()
-        partial_file = folder / ".recipe.json.partial"
-        partial_file.write_text(recipe.model_dump_json(indent=2) + "\n")
-        os.replace(partial_file, folder / "recipe.json")
+        console = Console()
+        for key, reason in again.items():
+            line = f"{key} is made again: {reason}; the old one is in {_set_aside(folder, key)}"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
         # One thread for the networks: they are small, and idle threads would slow down other items.
         prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
-        with show(len(items), Console()) as watch:
+        with show(len(items), console) as watch:
             if cluster is None:
                 jobs = jobs or _default_jobs(device)
                 execute(_share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
@@ -189,15 +210,29 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
     # The report uses the seeds that are finished, and itself lists rows without any.
     readers = [item for item in items if stage_of(item) not in ALWAYS_NEW]
     reads = [key for item in readers for key in item.inputs if key not in made]
-    missing = next((key for key in reads if not experiment.has(key)), None)
-    if missing:
-        stage, root = missing.partition("/")[0], experiment.folder.parent
+    for key in dict.fromkeys(reads):
+        stage, root = key.partition("/")[0], experiment.folder.parent
+        if not experiment.has(key):
+            fault = "missing"
+        elif why := damage(key, experiment, verify=not STAGES[stage].makes_dataset):
+            fault = f"damaged ({why})"
+        else:
+            continue
         maker = experiment.maker(stage)
         # Of the base, `run` makes what comes before the stage as well; the command `augment` takes no recipe.
         alone = stage != "augment" and (maker is experiment or not STAGES[stage].reads)
         command = f"astra-data {stage if alone else 'run'} {maker.path}"
         option = "" if root == RUNS else f" --root {root}"
-        raise MissingStageError(f"{experiment.place(missing)} is missing: run `{command}{option}` first")
+        raise MissingStageError(f"{experiment.place(key)} is {fault}: run `{command}{option}` first")
+
+
+def _set_aside(folder: Path, key: str) -> Path:
+    """Move the artefact `key` out of the way; return where it is now."""
+    places = (folder / SET_ASIDE / str(number) / key for number in count(1))
+    aside = next(place for place in places if not place.exists())
+    make_folder(aside.parent)
+    move(folder / key, aside)
+    return aside
 
 
 def _default_jobs(device: str) -> int:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from io import StringIO
-from os import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.experiments.board import board, progress_text
@@ -132,9 +132,7 @@ class PointTable:
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines.values())
-        partial_file = self.folder / ".sweep.csv.partial"
-        partial_file.write_text(text.getvalue())
-        replace(partial_file, self.folder / "sweep.csv")
+        write_file(self.folder / "sweep.csv", text.getvalue())
         return lines
 
     def message(self, point: RunPoint) -> str:

@@ -8,9 +8,11 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import Field
 
-from astra_data.core.config import Config, Count, Number, Positive, Share
+from astra_data.core.config import AtOnce, Config, Number, Positive, Share
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
+from astra_data.dataset.columns import REWARD
 from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -26,9 +28,9 @@ _KEEP_EVERY = 250
 class GroundConfig(DescentConfig):
     """How the grounding model is fitted."""
 
-    batch_windows: Count = 48
+    batch_windows: AtOnce = 48
     """Windows per update."""
-    window: Count = 100
+    window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     latent_weight: Positive = 0.1
     """λ1, of the loss of the next latent. At 1 it crowds out the correction: on the Long Maze held-out R²
@@ -40,12 +42,12 @@ class GroundConfig(DescentConfig):
     gradient ("detach") or with it ("online", the printed loss, which is unbounded below)."""
     ema_rate: Share = 0.01
     """Share by which the slow encoder of "ema" follows the encoder, per update."""
-    latent_size: Count = 64
+    latent_size: AtOnce = 64
     """Z, also the size of the encoder's hidden state."""
     position_octaves: Number = 4
     """Number of wavelengths, from 16 m down by halves, of sines and cosines of the position; 0 for none.
     Without effect where a task has no positions."""
-    correction_heads: Count = 1
+    correction_heads: AtOnce = 1
     """Heads that correct the state. Each learns from its own random half of every batch; their mean is the
     correction, and `disagreement_penalty` keeps policies away from where they disagree."""
     reward: Literal["whole", "correction"] = "whole"
@@ -109,9 +111,18 @@ class HistoryFit:
         )
 
     def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
-        """Return the grounding and its figures."""
+        """Return the grounding and its figures.
+
+        Raises:
+            BadInputError: the reward is to be predicted, and none was recorded.
+        """
         config = fitting.config
-        if config.reward == "correction":
+        if self.reward and not fitting.training.has_rewards:
+            raise BadInputError(
+                f"{fitting.training.reference} has no {REWARD}, which the method predicts: take one "
+                "that does not, such as nas"
+            )
+        if config.reward == "correction" and fitting.training.has_rewards:
             fitting = replace(
                 fitting,
                 training=residual_rewards(fitting.task, fitting.training),

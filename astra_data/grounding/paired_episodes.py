@@ -27,7 +27,7 @@ from astra_data.learning.recorded import draw_steps
 from astra_data.worlds.commands import Commands
 
 _COLUMNS = (
-    *(STATE, ACTION, REWARD, TERMINATED, SUCCESS),
+    *(STATE, ACTION, TERMINATED),
     *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE),
 )
 
@@ -46,6 +46,7 @@ class PairedEpisodes:
         held_out: the episodes that the dataset marks as held out, (E,) bool; None if it marks none.
         dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
         commands: the bounds of the commands, where these are not ±1 in their own units.
+        has_rewards: whether rewards were recorded; otherwise they are 0 here.
     """
 
     target_state: Tensor
@@ -57,6 +58,7 @@ class PairedEpisodes:
     held_out: Tensor | None = None
     dropped_place: tuple[int, ...] = ()
     commands: Commands | None = None
+    has_rewards: bool = True
 
     @property
     def named(self) -> dict[str, str]:
@@ -74,7 +76,7 @@ class PairedEpisodes:
         dataset = open_dataset(root)
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
-        names = [*_COLUMNS, *({GOAL} & dataset.features.keys())]
+        names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
         lengths = dataset.lengths.tolist()
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
@@ -87,8 +89,9 @@ class PairedEpisodes:
                 steps = commands.normal(steps)
             padded[name] = pad_sequence(steps.to(device).split(lengths), batch_first=True)
         mask = torch.arange(max(lengths), device=device) < torch.tensor(lengths, device=device)[:, None]
-        action, reward, terminated = padded[ACTION], padded[REWARD], padded[TERMINATED]
-        failed = terminated & ~padded[SUCCESS]
+        action, terminated = padded[ACTION], padded[TERMINATED]
+        reward = padded.get(REWARD, torch.zeros_like(terminated, dtype=action.dtype))
+        failed = terminated & ~padded.get(SUCCESS, terminated)
         held_out = [bool(flag) for flag in dataset.metadata.get("held_out", ())]
         return cls(
             target_state=padded[STATE],
@@ -110,6 +113,7 @@ class PairedEpisodes:
             held_out=torch.tensor(held_out, device=device) if any(held_out) else None,
             dropped_place=_dropped_place(dataset),
             commands=commands,
+            has_rewards=REWARD in padded,
         )
 
     def check(self, commands: Commands) -> None:

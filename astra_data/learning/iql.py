@@ -17,7 +17,7 @@ import torch
 from pydantic import model_validator
 from torch import Tensor, nn
 
-from astra_data.core.config import Config, Count, NotNegative, Number, Positive, Share
+from astra_data.core.config import AtOnce, Config, Count, NotNegative, Number, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.networks.history import mlp
@@ -34,9 +34,9 @@ class IqlConfig(Config):
 
     critic_updates: Count = 5_000
     """Gradient updates of the critics, before the first of the policy."""
-    critic_batch: Count = 256
+    critic_batch: AtOnce = 256
     """Transitions per update of the critics."""
-    critic_sizes: tuple[Count, ...] = (128, 128)
+    critic_sizes: tuple[AtOnce, ...] = (128, 128)
     """Hidden layers of each critic."""
     critic_learning_rate: Positive = 1e-3
     """Of the critics."""
@@ -57,9 +57,9 @@ class IqlConfig(Config):
     for sparse rewards rewards falling over where that ends the task."""
     policy_updates: Count = 600
     """Gradient updates of the policy."""
-    batch_windows: Count = 24
+    batch_windows: AtOnce = 24
     """Windows per update of the policy."""
-    window: Count = 100
+    window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     burn_in: Number = 20
     """Steps at the start of a window that only warm up the memory; none where the episode starts there."""

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.checkpoint import resumed, save_tensors
-from astra_data.core.config import Count, own_settings
+from astra_data.core.config import AtOnce, Count, own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
@@ -46,7 +46,7 @@ class CompassConfig(AnyVariation, CausalConfig):
     """Parameter sets with which every window is replayed, per iteration."""
     windows: Annotated[int, Field(ge=10)] = 500
     """Windows per iteration."""
-    window: Count = 25
+    window: AtOnce = 25
     """Steps per window."""
     outlier_share: Annotated[float, Field(ge=0, le=0.5)] = 0.05
     """Share of the windows left out, those with the largest gaps; as in the authors' code."""

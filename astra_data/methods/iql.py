@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from astra_data.core.config import own_settings
+from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive
+from astra_data.dataset.columns import REWARD
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.iql import FINE_TUNING, Experience, Iql, IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
@@ -41,8 +43,13 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
 
     Returns:
         the policy, which starts from `training.initial` if there is one, and the losses every few updates.
+
+    Raises:
+        BadInputError: no rewards were recorded; cloning needs none.
     """
     config, episodes = _config(training), training.episodes
+    if config.temperature and not episodes.has_rewards:
+        raise BadInputError(f"{episodes.reference} has no {REWARD}, from which the policy would be learned")
     experience = experience_of(training.task, episodes)
     torch.manual_seed(derive(training.seed, "policy"))
     if training.initial is None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from astra_data.core.config import Config, Count, Positive, own_settings
+from astra_data.core.config import AtOnce, Config, Count, Positive, own_settings
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.diagnostics import correction_r2
@@ -24,9 +24,9 @@ class GolemoConfig(Config):
 
     epochs: Count = 5
     """Passes over the training episodes; each update takes one whole episode."""
-    hidden_size: Count = 128
+    hidden_size: AtOnce = 128
     """Of each layer of the LSTM."""
-    layers: Count = 3
+    layers: AtOnce = 3
     """Of the LSTM."""
     learning_rate: Positive = 1e-3
     """Of Adam, constant."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizesResults
@@ -55,10 +56,10 @@ def write_results(
 ) -> None:
     """Write `stem`.json, `stem`.md and the PNG `images`, each with `prefix` before its name."""
     names = {name: f"{prefix}{name}.png" for name in images}
-    (folder / f"{stem}.json").write_text(_json(found), encoding="utf-8")
-    (folder / f"{stem}.md").write_text(page(names), encoding="utf-8")
+    write_file(folder / f"{stem}.json", _json(found))
+    write_file(folder / f"{stem}.md", page(names))
     for name, image in images.items():
-        (folder / names[name]).write_bytes(image)
+        write_file(folder / names[name], image)
 
 
 def _json(results: Found) -> str:

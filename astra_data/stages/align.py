@@ -9,8 +9,9 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.checkpoint import finished_folder
-from astra_data.core.config import Count, NotNegative, Positive, as_json
+from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
+from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -29,9 +30,9 @@ class AlignConfig(DescentConfig):
 
     updates: Count = 600
     """Gradient updates in all."""
-    batch_windows: Count = 32
+    batch_windows: AtOnce = 32
     """Windows per update."""
-    window: Count = 100
+    window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
     """Of the MMD's kernels, in units of the square root of the latent's size."""
@@ -84,9 +85,8 @@ def align(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
-    settings_text = as_json(
-        **episodes.named, grounding_sha256=file_digest(grounding_file), seed=seed, align=config
-    )
+    grounding_digest = file_digest(grounding_file)
+    settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
     with finished_folder(out, config=settings_text) as folder:
         checkpoint = folder / "checkpoint.safetensors"
         descent = Descent(encoder, config, checkpoint=checkpoint)
@@ -110,6 +110,7 @@ def align(
         }
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
         checkpoint.unlink(missing_ok=True)
+        write_manifest(folder, {"dataset": episodes.content_hash, "grounding": grounding_digest})
 
 
 def _losses(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
-from astra_data.core.config import Config, Count, NotNegative
+from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator
@@ -52,7 +52,7 @@ _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
 class AugmentConfig(Config):
     """How many copies, and how they may differ; the paper makes 200 episodes of 50 by turning and moving."""
 
-    copies: Count | None = None
+    copies: AtOnce | None = None
     """Copies of each training episode; by default 3, or as many as `episodes` needs."""
     episodes: Count | None = None
     """Episodes in all, originals and held-out ones included; instead of `copies`."""

@@ -10,7 +10,7 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
-from astra_data.core.config import Config, Count, NotNegative
+from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column
@@ -45,6 +45,9 @@ from astra_data.worlds.task import Task
 _TRAINING_SHARE = 0.8
 """Share of the progress bar for training the suboptimal policy."""
 
+MOST_STEPS = 10**10
+"""Upper bound of the steps of a dataset; it would take terabytes."""
+
 
 class CollectConfig(Config):
     """What to collect; the paper uses 200 episodes of random behaviour of up to 500 steps."""
@@ -57,7 +60,7 @@ class CollectConfig(Config):
     """Episodes in all."""
     max_steps: Count = 500
     """Longest episode, in control steps; longer ones are truncated."""
-    num_envs: Count = 200
+    num_envs: AtOnce = 200
     """Episodes recorded in one batch; also decides which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
     """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does."""
@@ -89,6 +92,11 @@ class CollectConfig(Config):
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
         if self.hold_s[0] > self.hold_s[1]:
             raise ValueError(f"hold_s: expected the shorter time first, got {list(self.hold_s)}")
+        if self.episodes * self.max_steps > MOST_STEPS:
+            raise ValueError(
+                f"episodes: {self.episodes} of up to {self.max_steps} steps take terabytes, expected at most "
+                f"{MOST_STEPS} steps in all"
+            )
         return self
 
 
@@ -140,7 +148,6 @@ def collect(
         description=description,
         subset_seed=derive(seed, "subset"),
         resume=resume,
-        fsync=False,
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))

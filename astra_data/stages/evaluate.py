@@ -18,8 +18,10 @@ import torch
 from torch import Tensor
 
 from astra_data.core.checkpoint import finished_folder, save_tensors
-from astra_data.core.config import Config, Count, Positive
+from astra_data.core.config import AtOnce, Config, Positive
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -45,7 +47,7 @@ Begin = Callable[[Tensor], Act]
 class EvaluateConfig(Config):
     """How policies are tested; the paper uses 100 episodes."""
 
-    episodes: Count = 100
+    episodes: AtOnce = 100
     """Run in one batch, in the target and in each simulator."""
     encoder: EncoderKind = "target"
     """Encoder with which an aligned policy is deployed for the headline figures; both are reported."""
@@ -140,6 +142,13 @@ def evaluate(
             simulators["simulated"] = _training_simulator(world, trained.simulation, model, config)
     if shown_abstract:
         simulators |= _shared_simulators(world, reference, config)
+    files = {
+        "policy": policy and policy / "policy.safetensors",
+        "grounding": grounding and grounding / "grounding.safetensors",
+        "target_encoder": target_encoder and target_encoder / "target_encoder.safetensors",
+        "reference": reference and reference / "grounding.safetensors",
+    }
+    read = {name: file_digest(file) for name, file in files.items() if file}
     outcomes, filmed = {}, {}
     for kind, robot in robots.items():
         outcomes[kind], filmed[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
@@ -163,6 +172,7 @@ def evaluate(
         results |= stopwatch.spent()
         (folder / "evaluation.json").write_text(json.dumps(results, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
+        write_manifest(folder, read)
     first = scores[0]
     progress(1.0, f"{first.title} in the target {first.text(fmean(results['target'][first.measure]))}")
 

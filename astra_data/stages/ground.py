@@ -6,6 +6,7 @@ from pathlib import Path
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
@@ -72,3 +73,4 @@ def ground(
         (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
+        write_manifest(folder, {"dataset": episodes.content_hash})

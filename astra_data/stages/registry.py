@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from astra_data.grounding.fit import GroundConfig
+from astra_data.reports.artefacts import EVALUATION
 from astra_data.stages.align import AlignConfig, align
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import CollectConfig, collect
@@ -29,6 +30,7 @@ class Stage:
         reads: the stages whose artefacts it may read.
         config: the type of its table in a recipe; None where it has no settings.
         is_optional: whether recipes without its table leave the stage out.
+        result: the file of its artefacts that other stages read; None for datasets and the report.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Stage:
     reads: tuple[str, ...] = ()
     config: Any = None
     is_optional: bool = False
+    result: str | None = None
 
     @property
     def makes_dataset(self) -> bool:
@@ -45,6 +48,7 @@ class Stage:
 
 
 _OF_DATASET = ("pair", "subset")
+_OF_GROUNDING = (*_OF_DATASET, "ground")
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -53,10 +57,10 @@ STAGES: dict[str, Stage] = {
         Stage("augment", augment, "seed", ("collect",), AugmentConfig, is_optional=True),
         Stage("pair", pair, "seed", ("collect", "augment"), PairConfig),
         Stage("subset", subset, "size", ("pair",)),
-        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig),
-        Stage("train", train, "policy", (*_OF_DATASET, "ground"), AnyTrainConfig),
-        Stage("align", align, "alignment", (*_OF_DATASET, "ground"), AlignConfig),
-        Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig),
+        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result="grounding.safetensors"),
+        Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result="policy.safetensors"),
+        Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result="target_encoder.safetensors"),
+        Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
         Stage("report", report, "recipe", ("evaluate",), ReportConfig),
     )
 }

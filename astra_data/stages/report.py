@@ -10,8 +10,12 @@ from pydantic import Field, JsonValue
 
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, Share
+from astra_data.core.digest import file_digest
+from astra_data.core.manifest import write_manifest
+from astra_data.core.naming import place
 from astra_data.core.progress import Progress
 from astra_data.methods import method_named
+from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.assembly import assemble
 from astra_data.reports.command_replay import replay_commands
 from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
@@ -97,6 +101,7 @@ def report(
 
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
+    evaluations = _evaluations(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
     sizes = _with_common_rows(
         assemble(
@@ -143,10 +148,23 @@ def report(
     progress(0.9, f"{len(images)} figures")
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
+        write_manifest(folder, evaluations)
     if publish is not None:
         kept = {} if add_to is None else published_figures(publish, recipe.name)
         publish_results(found, page, kept | images, publish)
     progress(1.0, _headline(sizes[-1]))
+
+
+def _evaluations(recipe: Reported, root: Path) -> dict[str, str]:
+    """Return the digest of each evaluation of the recipe that is finished, by its folder in `root`."""
+    folders = [
+        f"evaluate/{row}/{place(seed, percent)}"
+        for row in recipe.methods
+        for percent in recipe.percents or (None,)
+        for seed in recipe.seeds
+    ]
+    files = {folder: root / folder / EVALUATION for folder in folders}
+    return {folder: file_digest(file) for folder, file in files.items() if file.exists()}
 
 
 def _camera(task: Task) -> "Camera | None":

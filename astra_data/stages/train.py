@@ -7,6 +7,7 @@ from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
@@ -77,12 +78,14 @@ def train(
     initial_file = initial and initial / "policy.safetensors"
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
+    grounding_digest = file_digest(grounding_file) if grounding_file else None
+    initial_digest = file_digest(initial_file) if initial_file else None
     settings_text = as_json(
         task=world.name,
         method=method,
         **episodes.named,
-        grounding_sha256=file_digest(grounding_file) if grounding_file else None,
-        initial_sha256=file_digest(initial_file) if initial_file else None,
+        grounding_sha256=grounding_digest,
+        initial_sha256=initial_digest,
         seed=seed,
         train=config,
         settings=settings,
@@ -106,3 +109,5 @@ def train(
         (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
         for checkpoint in folder.glob("*checkpoint.safetensors"):
             checkpoint.unlink()
+        read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
+        write_manifest(folder, read)

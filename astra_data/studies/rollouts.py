@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from astra_data.core.config import Count, NotNegative, Positive
+from astra_data.core.config import AtOnce, Count, NotNegative, Positive
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
@@ -27,7 +27,7 @@ class FitConfig(DescentConfig):
 
     updates: Count = 400
     """Gradient updates in total."""
-    batch: Count = 64
+    batch: AtOnce = 64
     """Stretches per update."""
     steps: Count = 6
     """Steps of an open-loop prediction during fitting."""
@@ -37,11 +37,11 @@ class FitConfig(DescentConfig):
     """Weight decay of AdamW."""
     noise: NotNegative = 1.0
     """Standard deviation of noise on the history, in units of `NOISE`, against overfitting."""
-    latent_size: Count = 64
+    latent_size: AtOnce = 64
     """Z of ASTRA and NAS."""
-    head_sizes: tuple[Count, ...] = (64, 64)
+    head_sizes: tuple[AtOnce, ...] = (64, 64)
     """Hidden layers of their heads."""
-    hidden_sizes: tuple[Count, ...] = (128, 64)
+    hidden_sizes: tuple[AtOnce, ...] = (128, 64)
     """Hidden layers of the feed-forward network."""
 
 

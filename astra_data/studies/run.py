@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from astra_data.core.config import load_recipe, load_tables
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.display import shown
 from astra_data.studies.recordings import place_name, read_recordings
@@ -95,8 +96,7 @@ def measure_gap(
     )
     image = png(figure(found))
     for place, stem in [(folder, "results")] + ([(recipe_path.parent / "results", name)] if publish else []):
-        place.mkdir(parents=True, exist_ok=True)
-        (place / f"{stem}.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-        (place / f"{stem}.png").write_bytes(image)
-        (place / f"{stem}.md").write_text(render(found, name, command, f"{stem}.png"), encoding="utf-8")
+        write_file(place / f"{stem}.json", json.dumps(found, indent=1) + "\n")
+        write_file(place / f"{stem}.png", image)
+        write_file(place / f"{stem}.md", render(found, name, command, f"{stem}.png"))
     return folder / "results.md"

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.config import Config, Positive, did_you_mean
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.core.progress import Progress, part
@@ -175,7 +176,7 @@ def _check_same(path: Path, settings: dict[str, Any]) -> None:
             f"{path.parent} holds results of other settings or other recordings: remove it, or name another "
             "folder with --root"
         )
-    path.write_text(json.dumps(settings, indent=1))
+    write_file(path, json.dumps(settings, indent=1))
 
 
 def _described(recording: Recording) -> dict[str, Any]:

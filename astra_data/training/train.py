@@ -15,7 +15,7 @@ import torch
 from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
-from astra_data.core.config import Config, Count, Number, choice
+from astra_data.core.config import AtOnce, Config, Number, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
@@ -39,9 +39,9 @@ from astra_data.worlds.variation import Variation
 class TrainConfig(EnvConfig):
     """How policies are trained, but for the learner's own settings."""
 
-    num_envs: Count = 256
+    num_envs: AtOnce = 256
     """Environments stepped side by side."""
-    hidden_sizes: tuple[Count, ...] = (64, 64)
+    hidden_sizes: tuple[AtOnce, ...] = (64, 64)
     """Hidden layers of actor and critic."""
     memory_size: Number = 64
     """Size of the policy's own GRU, where no grounding provides a latent."""
@@ -78,7 +78,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
 
     learner: Literal["sac"]
     """Soft actor-critic."""
-    num_envs: Count = 32
+    num_envs: AtOnce = 32
     """Environments stepped side by side."""
 
     @property

@@ -1,12 +1,18 @@
+import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from failing_disk import small_files
+from fake_dataset import write_fake
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
+from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
 
 HEAVY = {"torch", "numpy", "pydantic", "lerobot", "mujoco", "matplotlib"}
 
@@ -59,3 +65,48 @@ def test_debugging_shows_the_traceback(
     monkeypatch.setenv("ASTRA_DATA_DEBUG", "1")
     with pytest.raises(BadInputError):
         cli.main()
+
+
+def test_a_full_disk_is_one_line_and_exit_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_fake(tmp_path / "fake").root
+    subset = ["astra-data", "subset", str(source), "--percent", "100", "--out", str(tmp_path / "half")]
+    monkeypatch.setattr(sys, "argv", subset)
+    with small_files(2000), pytest.raises(SystemExit, match="1"):
+        cli.main()
+    assert capsys.readouterr().err == (
+        f"error: {tmp_path / 'half'} cannot be written: a file would be larger than is allowed. What was "
+        "finished before is safe: raise the limit (ulimit -f), then run the same command again.\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["fake"]
+    with pytest.raises(SystemExit, match="0"):
+        cli.main()
+    assert Dataset.open(tmp_path / "half").verify() == []
+
+
+def test_no_error_of_a_disk_becomes_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(SystemExit, match="1"):
+        cli.main()
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: a file cannot be read or written: the disk is full.")
+    assert shown.count("\n") == 1
+
+
+def test_waiting_for_the_disk_can_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    monkeypatch.setenv(NO_FSYNC, "")
+    source = str(write_fake(tmp_path / "fake").root)
+    assert synced
+    for options, is_synced in (([], True), (["--no-fsync"], False)):
+        synced.clear()
+        arguments = ["subset", source, "--percent", "100", "--out", str(tmp_path / f"set_{is_synced}")]
+        assert CliRunner().invoke(cli.app, [*options, *arguments]).exit_code == 0
+        assert bool(synced) == is_synced

@@ -7,7 +7,7 @@ from fake_dataset import COLUMNS, write_fake
 from typer.testing import CliRunner, Result
 
 from astra_data.cli import app as cli
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import AstraDataError
 
 
 def call(*arguments: str) -> Result:
@@ -31,9 +31,28 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     for arguments, told in (
         ([str(tmp_path / "none")], "no such folder"),
         ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "no column with the role position"),
-        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "expected a folder to write to"),
+        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: a file is where"),
     ):
         error = call("inspect", *arguments).exception
-        assert isinstance(error, BadInputError)
-        with pytest.raises(BadInputError, match=told):
+        assert isinstance(error, AstraDataError)
+        with pytest.raises(AstraDataError, match=told):
             raise error
+
+
+def test_what_killed_commands_left_is_removed_on_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    dead, other = tmp_path / "home/ant/.data-1.0.0.tmp-7", tmp_path / "runs/.recipe.json.tmp-7"
+    staged = tmp_path / "home/.walks.staged"
+    for folder in (dead, other, staged):
+        folder.mkdir(parents=True)
+    assert call("list", "--clean").output.splitlines() == [
+        f"kept: {staged}: the command that was interrupted goes on with it, or delete it",
+        f"removed: {dead}",
+    ]
+    assert not dead.exists() and other.exists()
+    assert f"removed: {other}" in call("list", "--clean", str(tmp_path / "runs")).output
+    staged.rmdir()
+    assert call("list", "--clean").output == "nothing was left by killed commands\n"
+    assert "folders are for --clean" in str(call("list", str(tmp_path / "runs")).exception)

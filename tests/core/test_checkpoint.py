@@ -1,14 +1,26 @@
+import errno
+import os
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from failing_disk import failing
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from astra_data.core.checkpoint import finished_folder, flatten, load_tensors, save_tensors, unflatten
-from astra_data.core.errors import BadInputError
+from astra_data.core.checkpoint import (
+    finished_folder,
+    flatten,
+    load_tensors,
+    save_tensors,
+    understood,
+    unflatten,
+)
+from astra_data.core.errors import BadInputError, DiskError
 
 
 def assert_same(actual: object, expected: object) -> None:
@@ -65,6 +77,28 @@ def test_files_that_are_missing_damaged_or_foreign_are_refused(tmp_path: Path) -
     save_file({"a": torch.ones(1)}, path, {"format": "pt"})
     with pytest.raises(BadInputError, match="not written by astra-data"):
         load_tensors(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "is_refused"),
+    [
+        ("layer.weight", float("nan"), True),
+        ("layer.weight", float("inf"), True),
+        ("state_std", float("nan"), True),
+        ("state_std", float("inf"), False),
+        ("layer.weight", 1e30, False),
+    ],
+)
+def test_weights_that_are_not_finite_are_refused(
+    tmp_path: Path, name: str, value: float, is_refused: bool
+) -> None:
+    path = tmp_path / "a.safetensors"
+    save_tensors(path, {name: torch.tensor([1.0, value]), "whole": torch.ones(1)}, {"kind": "toy"})
+    refusal = pytest.raises(
+        BadInputError, match=rf"expected finite weights, found NaN or infinity in {name}: "
+    )
+    with refusal if is_refused else nullcontext(), understood(path, "a toy", ["toy"], "cpu") as (tensors, _):
+        assert tensors[name][0] == 1
 
 
 @pytest.mark.parametrize(
@@ -232,3 +266,57 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
         save_tensors(path, {"x": torch.arange(3.0), "y": torch.ones(2, 2)}, metadata)
     assert len({path.read_bytes() for path in paths}) == 1
     assert load_tensors(paths[0])[1] == metadata
+
+
+def test_a_disk_that_fails_at_any_operation_leaves_a_folder_to_go_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+
+    def make(out: Path) -> None:
+        with finished_folder(out, config="1") as folder:
+            save_tensors(folder / "model.safetensors", {"weight": torch.ones(2)}, {})
+
+    make(tmp_path / "whole")
+    whole = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()}
+    for at in count():
+        out = tmp_path / f"at_{at}" / "out"
+        with failing("mkdir rename replace unlink rmdir fsync", at, OSError(errno.ENOSPC, "")) as calls:
+            try:
+                make(out)
+            except DiskError as error:
+                assert "cannot be written: the disk is full" in str(error)
+        if not out.exists():
+            make(out)
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
+        if len(calls) <= at:
+            break
+    assert at > 15
+
+
+def test_a_disk_that_fails_while_a_folder_is_replaced_leaves_the_old_one_or_the_new_one(
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "out"
+    (out / "first").mkdir(parents=True)
+    for at in count():
+        with (
+            failing("rename replace", at, OSError(errno.EIO, "fault")) as calls,
+            suppress(DiskError),
+            finished_folder(out, replace=True) as folder,
+        ):
+            (folder / f"{at}").touch()
+        assert len(list(out.iterdir())) == 1
+        if len(calls) <= at:
+            break
+    assert [path.name for path in out.iterdir()] == [str(at)]
+    assert at > 1
+
+
+def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path) -> None:
+    partial = tmp_path / ".out.partial"
+    (partial / ".checkpoint.safetensors.tmp-7").mkdir(parents=True)
+    (partial / ".model.safetensors.partial").touch()
+    with finished_folder(tmp_path / "out", config="1") as folder:
+        (folder / "model").touch()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "model"]

@@ -111,3 +111,19 @@ def test_a_component_takes_its_own_settings_or_the_usual_ones() -> None:
     assert own_settings(None, usual) is usual and own_settings(given, usual) is given
     with pytest.raises(BadInputError, match="expected settings of Training, got Other"):
         own_settings(Other(), usual)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x = " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
+        (".".join("a" * 5000) + " = 1", "is nested too deeply"),
+        ("x = " + "9" * 5000, "cannot be read as TOML: Exceeds the limit"),
+    ],
+)
+def test_hostile_toml_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    with pytest.raises(RecipeError, match=told) as error:
+        load_recipe(path, Experiment)
+    assert "\n" not in str(error.value)

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 from fake_dataset import COLUMNS, fake_columns, fake_episode, writer
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.columns import ACTION, DONE, REWARD, TERMINATED, TRUNCATED, Episode
 
@@ -70,3 +72,38 @@ def test_a_refused_episode_leaves_no_trace() -> None:
     admission.admit(Episode(1, fake_columns(3, seed=1)))
     with pytest.raises(BadInputError, match="an earlier episode has the same uid"):
         admission.admit(Episode(1, fake_columns(4, seed=1)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "fault"),
+    [
+        ("serial", 2**63, "metadata serial: an integer of more than 64 bits"),
+        ("serial", -(2**63) - 1, "metadata serial: an integer of more than 64 bits"),
+        ("log", "a\ud800", r"metadata log: 'a\\ud800' has characters that are not valid Unicode"),
+        ("log", os.fsdecode(b"log\xff.csv"), r"metadata log: 'log\\udcff\.csv' has characters that are not"),
+        ("log", "x" * (2**20 + 1), r"metadata log: 1,048,577 characters, expected at most 1,048,576"),
+        ("", 1, "metadata '': expected a text of valid characters as its name"),
+        ("\udc80", 1, r"metadata '\\udc80': expected a text of valid characters as its name"),
+    ],
+)
+def test_metadata_that_no_file_can_hold_is_refused_when_it_is_added(
+    tmp_path: Path, key: str, value: int | str, fault: str
+) -> None:
+    with writer(tmp_path / "set") as open_writer:
+        with pytest.raises(BadInputError, match=fault) as caught:
+            open_writer.add(Episode(1, fake_columns(4, seed=1), {key: value}))
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 200
+        open_writer.add(Episode(1, fake_columns(4, seed=1), {"log": "x" * 2**20, "serial": 2**63 - 1}))
+    assert Dataset.open(tmp_path / "set").metadata["serial"] == [2**63 - 1]
+
+
+def test_checking_an_episode_leaves_no_trace() -> None:
+    admission = Admission(COLUMNS)
+    episode = Episode(1, fake_columns(3, seed=1), {"success": True})
+    admission.check(episode)
+    assert admission.metadata_types == {}
+    admission.check(episode)
+    admission.admit(episode)
+    with pytest.raises(BadInputError, match="an earlier episode has the same uid"):
+        admission.check(episode)

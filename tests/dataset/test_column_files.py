@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from failing_disk import small_files
 from fake_frames import NAMES, assert_equal, everything
 
-from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.errors import CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset, column_files
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.frames import Frames
@@ -56,11 +57,20 @@ def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
         Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
 
 
+def test_a_full_disk_ends_with_an_error_and_no_raw_file(fake: Dataset, tmp_path: Path) -> None:
+    with (
+        small_files(200),
+        pytest.raises(DiskError, match=f"{STATE} cannot be written: a file would be"),
+    ):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert not list(tmp_path.rglob("*.npy"))
+
+
 def test_a_failure_leaves_no_raw_file(
     fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(np.lib.format, "open_memmap", lambda *_, **__: 1 / 0)
+        patch.setattr(np.lib.format, "write_array_header_1_0", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
     assert not list(tmp_path.rglob("*.npy"))

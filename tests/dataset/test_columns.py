@@ -117,3 +117,25 @@ def test_a_mirror_image_is_a_swap_with_signs() -> None:
 def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match="Column 'x'"):
         Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
+
+
+def test_masked_values_are_refused_and_a_mask_without_any_is_not() -> None:
+    values = np.ma.array(np.arange(6, dtype=np.float32).reshape(3, 2))  # type: ignore[no-untyped-call]
+    assert np.array_equal(Episode(0, {"action": values}).columns["action"], values.data)
+    values[1, 0] = np.ma.masked
+    with pytest.raises(BadInputError, match="action: masked values, expected a value for every step"):
+        Episode(0, {"action": values})
+
+
+@pytest.mark.parametrize(
+    ("column", "told"),
+    [
+        ({"name": "x" * 201}, "the name must have 1 to 200 bytes"),
+        ({"name": "\u4e16" * 67}, "the name must have 1 to 200 bytes"),
+        ({"name": "x", "size": 2**30}, "size 1073741824, expected 1 to 1048576"),
+    ],
+)
+def test_a_column_too_large_for_files_or_memories_is_refused(column: dict[str, Any], told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        Column(**column)
+    Column("x" * 200, size=2**20)

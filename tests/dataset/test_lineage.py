@@ -9,6 +9,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.edit import delete, merge, subset
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.lineage import lineage, tree_lines
+from astra_data.dataset.seal import sealed
 
 pytestmark = pytest.mark.usefixtures("home")
 
@@ -41,15 +42,15 @@ def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
 def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "home/fake/data-1.0.0")
     made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
-    path = first.root / DATASET_PATH
-    path.write_text(json.dumps(first.description | {"parents": [made.identity]}))
+    changed = sealed(first.root, first.description | {"parents": [made.identity]})
+    (first.root / DATASET_PATH).write_text(json.dumps(changed))
     with pytest.raises(CorruptDatasetError, match=r"fake@data-1\.1\.0 is among its own ancestors"):
         lineage(made)
 
 
-def test_a_malformed_ancestor_is_not_found(tmp_path: Path) -> None:
+def test_an_altered_ancestor_is_not_found(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "home/fake/data-1.0.0")
     made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
-    (first.root / DATASET_PATH).write_text(json.dumps(first.description | {"parents": 3}))
+    (first.root / DATASET_PATH).write_text(json.dumps(first.description | {"seeds": {"collect": 7}}))
     [line] = list(tree_lines(lineage(made)))[1:]
     assert line.endswith("(not found here)")

@@ -160,7 +160,7 @@ def a_run(**changes: Array) -> Run:
         TIMESTAMP: (frame / 10).astype(np.float32),
         "state": np.zeros((4, 2), np.float32),
     }
-    return Run(Path("file.parquet"), columns | changes)
+    return Run(Path("file.parquet"), 0, columns | changes)
 
 
 @pytest.mark.parametrize(

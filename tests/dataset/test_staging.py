@@ -1,15 +1,30 @@
+import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack, suppress
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, fake_episodes, staged_writer, write_fake
+from failing_disk import Killed, failing, small_files
+from fake_dataset import (
+    COLUMNS,
+    DESCRIPTION,
+    fake_columns,
+    fake_episode,
+    fake_episodes,
+    staged_writer,
+    write_fake,
+)
 
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.durable import NO_FSYNC
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Episode
 
@@ -25,9 +40,8 @@ def leftovers(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
 
 
-@pytest.mark.parametrize("fsync", [True, False])
-def test_a_recording_is_the_dataset_that_is_written_at_once(tmp_path: Path, fsync: bool) -> None:
-    with staged_writer(tmp_path / "set", fsync=fsync) as writer:
+def test_a_recording_is_the_dataset_that_is_written_at_once(tmp_path: Path) -> None:
+    with staged_writer(tmp_path / "set") as writer:
         for episode in fake_episodes():
             writer.add(episode)
     assert files(tmp_path / "set") == files(write_fake(tmp_path / "whole").root)
@@ -129,7 +143,7 @@ def test_what_a_kill_after_the_end_left_is_cleared(tmp_path: Path) -> None:
 
 
 def test_another_dataset_in_its_place_does_not_cost_the_recording(tmp_path: Path) -> None:
-    interrupted(tmp_path / "set", fake_episodes()[:3])
+    interrupted(tmp_path / "set", [*fake_episodes()[:2], fake_episode(6, 31)])
     write_fake(tmp_path / "set")
     again = staged_writer(tmp_path / "set", resume=True)
     with pytest.raises(BadInputError, match="interrupted recording, which left 3 episodes in"), again:
@@ -168,14 +182,19 @@ def test_an_episode_is_on_the_disk_itself_before_it_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[str] = []
-    monkeypatch.setattr("astra_data.dataset.staging.sync", lambda path: synced.append(path.name))
-    with staged_writer(tmp_path / "set") as writer:
+    for module in ("dataset.staging", "core.durable"):
+        monkeypatch.setattr(f"astra_data.{module}.sync", lambda path: synced.append(path.name))
+    with staged_writer(tmp_path / "new" / "set") as writer:
+        assert {tmp_path.name, "new", "plan.json", ".set.staged"} <= {*synced}
         synced.clear()
         writer.add(fake_episode(1, 4))
         assert synced == ["000000.partial", ".set.staged"]
 
 
-def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
+def test_a_kill_at_any_moment_loses_no_finished_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(NO_FSYNC, "1")
     record(tmp_path / "whole")
     whole = files(tmp_path / "whole")
     rng = np.random.default_rng(0)
@@ -199,9 +218,189 @@ def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
         assert files(root) == whole
 
 
+def test_a_kill_in_any_operation_never_mixes_two_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    other = {**DESCRIPTION, "seeds": {"collect": 1}}
+    episodes, others = fake_episodes()[:2], [fake_episode(uid, 9) for uid in (20, 21, 22)]
+    whole = files(write_episodes(tmp_path / "whole", episodes))
+    second = files(write_episodes(tmp_path / "second", others, description=other))
+    for at in count():
+        root = tmp_path / f"at_{at}" / "set"
+        with suppress(Killed), failing("mkdir rename replace unlink rmdir", at, Killed(), Killed()) as calls:
+            write_episodes(root, episodes)
+        root.parent.mkdir(exist_ok=True)
+        shutil.copytree(root.parent, tmp_path / f"without_{at}")
+        without = tmp_path / f"without_{at}" / "set"
+        shutil.rmtree(without, ignore_errors=True)
+
+        if root.exists():
+            with pytest.raises(BadInputError, match="exists already; delete it"):
+                write_episodes(root, episodes)
+        else:
+            write_episodes(root, episodes)
+        assert files(root) == whole
+        assert leftovers(root.parent) == []
+
+        try:
+            write_episodes(without, others, description=other)
+        except BadInputError as error:
+            assert "differs in description.seeds.collect; resume it with the same settings" in str(error)
+            assert not without.exists()
+            shutil.rmtree(without.with_name(".set.staged"))
+            write_episodes(without, others, description=other)
+        assert files(without) == second
+        assert leftovers(without.parent) == []
+        if len(calls) <= at:
+            break
+    assert at > 15
+
+
+@pytest.mark.parametrize("gone", [["plan.json"], ["000000.arrow"], ["000000.arrow", "plan.json"]])
+def test_what_version_0_1_left_half_removed_is_recognised(tmp_path: Path, gone: list[str]) -> None:
+    interrupted(tmp_path / "set", fake_episodes())
+    write_fake(tmp_path / "set")
+    for name in gone:
+        (tmp_path / ".set.staged" / name).unlink()
+    again = staged_writer(tmp_path / "set", resume=True)
+    with pytest.raises(BadInputError, match="exists already; delete it"), again:
+        pass
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize("plan", [None, "", "{", "[]"])
+def test_staged_episodes_of_an_unknown_recording_are_refused(tmp_path: Path, plan: str | None) -> None:
+    interrupted(tmp_path / "set", fake_episodes()[:2])
+    path = tmp_path / ".set.staged" / "plan.json"
+    path.unlink()
+    if plan is not None:
+        path.write_text(plan)
+    again = staged_writer(tmp_path / "set", resume=True)
+    with (
+        pytest.raises(BadInputError, match=r"holds 2 episodes, but plan\.json is .*delete the folder"),
+        again,
+    ):
+        pass
+    assert len(list((tmp_path / ".set.staged").glob("*.arrow"))) == 2
+
+
+def test_on_a_full_disk_the_episodes_are_safe_and_the_recording_goes_on(tmp_path: Path) -> None:
+    episodes = fake_episodes()
+    long = fake_episode(99, 3000)
+    with pytest.raises(DiskError) as caught, staged_writer(tmp_path / "set") as writer:
+        writer.add(episodes[0])
+        with small_files(20_000):
+            writer.add(long)
+    assert str(caught.value) == (
+        f"{tmp_path / '.set.staged' / '000001.arrow'} cannot be written: a file would be larger than is "
+        "allowed. What was finished before is safe: raise the limit (ulimit -f), then run the same command "
+        f"again. 1 episodes are safe in {tmp_path / '.set.staged'}: a recipe goes on with them by itself, "
+        "the command for a task with --resume."
+    )
+    with staged_writer(tmp_path / "set", resume=True) as writer:
+        assert list(writer.staged) == [0]
+        with small_files(20_000), pytest.raises(DiskError):
+            writer.add(long)
+        writer.add(long)
+    assert Dataset.open(tmp_path / "set").uids.tolist() == [episodes[0].uid, 99]
+    assert leftovers(tmp_path) == []
+
+
+def test_a_disk_that_is_full_when_the_dataset_is_written_costs_no_episode(tmp_path: Path) -> None:
+    episodes = [fake_episode(uid, 200) for uid in range(4)]
+    with (
+        pytest.raises(DiskError, match=r"set cannot be written: .* 4 episodes are safe in"),
+        small_files(18_000),
+    ):
+        write_episodes(tmp_path / "set", episodes)
+    assert leftovers(tmp_path) == [".set.staged"]
+    assert files(write_episodes(tmp_path / "set", episodes)) == files(
+        write_episodes(tmp_path / "whole", episodes)
+    )
+
+
+def test_a_disk_that_fails_at_any_operation_loses_no_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    episodes = fake_episodes()[:2]
+    whole = files(write_episodes(tmp_path / "whole", episodes))
+    at = 0
+    while True:
+        root = tmp_path / f"at_{at}" / "set"
+        with failing("mkdir rename replace unlink rmdir fsync", at, OSError(errno.ENOSPC, "full")) as calls:
+            try:
+                write_episodes(root, episodes)
+            except AstraDataError as error:
+                assert isinstance(error, DiskError)
+                assert f"{root.parent}" in str(error)
+        if not root.exists():
+            write_episodes(root, episodes)
+        assert files(root) == whole
+        if len(calls) <= at:
+            break
+        at += 1 if calls[at] != "fsync" else 3  # most are the finished dataset's files, one after another
+
+
+@pytest.mark.parametrize("second", [OSError(errno.EIO, "fault"), KeyboardInterrupt()])
+def test_ctrl_c_and_a_second_error_in_the_clean_up_lose_no_episode(
+    tmp_path: Path, second: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    whole = files(write_episodes(tmp_path / "whole", [fake_episode(1, 4)]))
+    for at in count():
+        root = tmp_path / f"at_{at}" / "set"
+        with ExitStack() as stack, suppress(KeyboardInterrupt, DiskError), staged_writer(root) as writer:
+            writer.add(fake_episode(1, 4))
+            calls = stack.enter_context(
+                failing("mkdir rename replace unlink rmdir", at, KeyboardInterrupt(), second)
+            )
+        if not root.exists():
+            assert (root.parent / ".set.staged" / "000000.arrow").exists()
+            write_episodes(root, [fake_episode(1, 4)])
+        assert files(root) == whole
+        if len(calls) <= at:
+            break
+    assert at > 10
+
+
+def test_metadata_that_cannot_be_stored_is_refused_and_the_recording_goes_on(tmp_path: Path) -> None:
+    with staged_writer(tmp_path / "set") as writer:
+        for value, fault in (
+            (2**64, "metadata serial: an integer of more than 64 bits"),
+            ("log\udcff.csv", r"metadata serial: 'log\\udcff.csv' has characters that are not valid"),
+        ):
+            with pytest.raises(BadInputError, match=fault):
+                writer.add(Episode(1, fake_columns(4, 1), {"serial": value}))
+        writer.add(Episode(1, fake_columns(4, 1), {"serial": -(2**63)}))
+    assert Dataset.open(tmp_path / "set").metadata["serial"] == [-(2**63)]
+
+
+def test_an_episode_that_an_older_version_staged_with_such_metadata_is_named(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("astra_data.dataset.admission._metadata_faults", lambda key, value: [])
+        interrupted(tmp_path / "set", [Episode(1, fake_columns(4, 1), {"serial": 2**64})])
+    again = staged_writer(tmp_path / "set", resume=True)
+    with (
+        pytest.raises(BadInputError, match=r"000000\.arrow: Episode 1: .*64 bits\. Delete it and resume"),
+        again,
+    ):
+        pass
+
+
+def write_episodes(root: Path, episodes: list[Episode], **changes: Any) -> Path:  # noqa: ANN401
+    """Record `episodes`, or go on with it."""
+    with staged_writer(root, resume=True, **changes) as writer:
+        for position, episode in enumerate(episodes):
+            if position not in writer.staged:
+                writer.add(episode, position)
+    return root
+
+
 def record(root: Path) -> None:
     """Record, or go on with it, and print which episodes are safe."""
-    with staged_writer(root, resume=True, fsync=False) as writer:
+    with staged_writer(root, resume=True) as writer:
         for position in range(EPISODES_OF_THE_RECORDED):
             if position not in writer.staged:
                 writer.add(fake_episode(position, STEPS_OF_THE_RECORDED), position)

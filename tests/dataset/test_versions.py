@@ -77,3 +77,11 @@ def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> 
     folder.mkdir(parents=True)
     assert successor(source, "episodes", stage="subset", config={}, name="half")[0]["version"] == "1.1.0"
     assert names_at_home() == ["half"]
+
+
+def test_a_name_too_long_for_a_file_is_refused(home: Path, tmp_path: Path) -> None:
+    for name in ("x" * 300, str(tmp_path / ("x" * 300))):
+        with pytest.raises(BadInputError, match="no such folder"):
+            locate(name)
+    with pytest.raises(BadInputError, match="expected up to 200 letters"):
+        write_fake(tmp_path / "set", description={"name": "x" * 201, "stage": "collect"})

@@ -15,6 +15,7 @@ from fake_dataset import COLUMNS, fake_episode, fake_episodes, staged_writer, wr
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset, DatasetWriter, episode_rows, parquet
 from astra_data.dataset.columns import STATE, Column
+from astra_data.dataset.format import DATASET_PATH
 
 
 def files(root: Path) -> dict[str, bytes]:
@@ -28,6 +29,7 @@ def test_the_same_episodes_give_the_same_bytes_in_every_file(tmp_path: Path) -> 
     assert sorted(files(tmp_path / "one")) == [
         "data/chunk-000/file-000.parquet",
         "meta/astra/dataset.json",
+        "meta/astra/digests.parquet",
         "meta/astra/episodes.parquet",
         "meta/astra/subsets.json",
         "meta/episodes/chunk-000/file-000.parquet",
@@ -44,7 +46,9 @@ def test_how_it_was_made_is_told_beside_the_content_hash_only(tmp_path: Path) ->
             open_writer.add(episode)
         open_writer.made = {"wall_seconds": 2.5}
     timed = Dataset.open(tmp_path / "timed")
-    assert timed.description == plain.description | {"wall_seconds": 2.5}
+    sums = timed.description["sums"]
+    assert timed.description == plain.description | {"wall_seconds": 2.5, "sums": sums}
+    assert {path for path in sums if sums[path] != plain.description["sums"][path]} == {DATASET_PATH}
     before, after = files(plain.root), files(timed.root)
     assert {name for name in before if before[name] != after[name]} == {"meta/astra/dataset.json"}
 

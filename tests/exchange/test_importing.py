@@ -1,4 +1,6 @@
+import os
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
+from astra_data.exchange.cutting import Cutter
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -118,3 +121,22 @@ def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
     dataset, report = imported(tmp_path, write_table(tmp_path / "log.csv", rows() | {"reward": reward}))
     assert dataset.columns([REWARD])[REWARD].sum() == 1
     assert "last rows without a next state: 2 (with them a reward of 1.5 in sum); rows" in str(report)
+
+
+def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.csv", rows())
+    os.rename(os.fsencode(path), os.fsencode(tmp_path) + b"/log\xff.csv")
+    with pytest.raises(BadInputError, match=r"'log\\udcff\.csv': expected a name in UTF-8; rename the file"):
+        imported(tmp_path, [tmp_path / os.fsdecode(b"log\xff.csv")], PER_FILE)
+
+
+def test_an_episode_that_does_not_fit_into_memory_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_left(_: object) -> Iterator[object]:
+        raise MemoryError("Unable to allocate 3.3 GiB")
+        yield
+
+    monkeypatch.setattr(Cutter, "finish", none_left)
+    with pytest.raises(BadInputError, match=r"does not fit into memory \(Unable to .*\[split\]"):
+        imported(tmp_path, write_table(tmp_path / "log.npz", rows()))

@@ -4,9 +4,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from fake_items import crash, fail, touch
+from fake_items import crash, fail, fill_the_disk, touch
 
-from astra_data.core.errors import MissingStageError
+from astra_data.core.errors import DiskError, MissingStageError
 from astra_data.experiments.execution import Item, Reporter, pickled, run_in_order, run_item
 
 
@@ -98,3 +98,13 @@ def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) ->
         now = 5.0 + step * 0.03
         report(step / 10, "")
     assert [fraction for fraction, _ in sent] == [0.0, 0.4, 0.8]
+
+
+def test_a_full_disk_is_no_crash_and_a_full_log_hides_no_error(tmp_path: Path) -> None:
+    log = tmp_path / "logs/a.txt"
+    error = run_item("a", pickled(Item("a", (), fill_the_disk), None), log, lambda note: None)
+    assert isinstance(error, DiskError)
+    assert str(error).startswith("a: a file cannot be read or written: the disk is full.")
+    (tmp_path / "full").symlink_to("/dev/full")
+    error = run_item("b", pickled(Item("b", (), crash), None), tmp_path / "full", lambda note: None)
+    assert "b crashed: ValueError: a bug" in str(error)

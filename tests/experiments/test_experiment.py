@@ -147,7 +147,8 @@ def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
     run(base, root=tmp_path, jobs=2)
     made = attempts(tmp_path / "base")
     finished = check(longer, root=tmp_path)
-    assert finished["train/astra_plus/seed_1"] and not finished["evaluate/astra_plus/seed_1"]
+    assert finished["train/astra_plus/seed_1"].is_finished
+    assert finished["evaluate/astra_plus/seed_1"].state == "missing"
     assert not (tmp_path / "longer/train").exists()
 
     folder = run(longer, root=tmp_path, jobs=2)
@@ -160,7 +161,7 @@ def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
     assert told["policy"] == str(folder / "train/astra_plus/seed_1")
     assert told["steps"] == 3 and Path(str(told["policy"])).is_dir()
     assert json.loads((folder / "recipe.json").read_text())["evaluate"]["rate"] == 2.0
-    assert all(is_made for key, is_made in check(longer, root=tmp_path).items() if key != "report")
+    assert all(found.is_finished for found in check(longer, root=tmp_path).values())
     run(longer, root=tmp_path, jobs=1)
     assert (folder / "evaluate/astra/seed_0/attempts").read_text() == "."
     # Links and all, the runs may be moved.
@@ -185,15 +186,17 @@ def test_changes_are_told_in_the_base_and_here(base: Path, longer: Path, tmp_pat
     run(base, root=tmp_path, jobs=2)
     folder = run(longer, root=tmp_path, jobs=2)
     base.write_text(BASE + "[train]\nsteps = 9\n")
-    for action in (check, run):
-        with pytest.raises(
-            RecipeError, match=rf"^plus and train changed in the recipe since {tmp_path}/base was"
-        ):
-            action(longer, root=tmp_path)
+    with pytest.raises(
+        RecipeError, match=rf"^plus and train changed in the recipe since {tmp_path}/base was"
+    ):
+        run(longer, root=tmp_path)
+    found = check(longer, root=tmp_path)
+    assert found["train/astra/seed_0"].state == "stale" and found["ground/astra/seed_0"].is_finished
+    assert found["train/astra/seed_0"].why.startswith("plus and train changed in the recipe since")
     base.write_text(BASE)
     longer.write_text(LONGER.replace("2.0", "3.0"))
     with pytest.raises(RecipeError) as caught:
-        check(longer, root=tmp_path)
+        run(longer, root=tmp_path)
     assert str(caught.value) == (
         f"evaluate changed in the recipe since {folder} was made: give the recipe another name, or remove "
         f"{folder / 'evaluate'}"
@@ -206,7 +209,7 @@ def test_a_stage_that_is_borrowed_no_more_is_made_here(base: Path, longer: Path,
     shutil.rmtree(folder / "evaluate")
     longer.write_text(LONGER + "[train]\nsteps = 9\n")
     made = attempts(tmp_path / "base")
-    assert not check(longer, root=tmp_path)["train/astra/seed_0"]
+    assert check(longer, root=tmp_path)["train/astra/seed_0"].state == "missing"
     run(longer, root=tmp_path, jobs=2)
     assert asked(folder / "train/astra/seed_0")["steps"] == 9
     assert not (folder / "train").is_symlink() and (folder / "ground").is_symlink()
@@ -258,10 +261,10 @@ def test_a_table_that_the_folder_s_recipe_did_not_have_is_no_change(base: Path, 
     kept = json.loads(record.read_text())
     del kept["target"]
     record.write_text(json.dumps(kept))
-    assert check(base, root=tmp_path)["train/astra/seed_0"]
+    assert check(base, root=tmp_path)["train/astra/seed_0"].is_finished
     kept["collect"].pop("episodes")
     record.write_text(json.dumps(kept))
-    assert check(base, root=tmp_path)["train/astra/seed_0"]
+    assert check(base, root=tmp_path)["train/astra/seed_0"].is_finished
 
 
 def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_path: Path) -> None:
@@ -269,13 +272,13 @@ def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_
     folder = run(base, root=tmp_path, jobs=2)
     base.write_text(base.read_text() + "[target]\nnum_envs = 3\n")
     with pytest.raises(RecipeError) as caught:
-        check(base, root=tmp_path)
+        run(base, root=tmp_path)
     stale = f"{folder / 'evaluate/full_obs'} {folder / 'train/full_obs'}"
     assert str(caught.value).endswith(f"or remove {stale}")
     base.write_text(BASE + "[target]\nnum_envs = 3\n[iql]\ndiscount = 0.9\n")
     for stage in ("train", "evaluate"):
         shutil.rmtree(folder / stage / "full_obs")
-    assert check(base, root=tmp_path)["train/astra/seed_0"]
+    assert check(base, root=tmp_path)["train/astra/seed_0"].is_finished
 
 
 def test_recipes_are_read_without_what_only_trainings_and_tables_need() -> None:

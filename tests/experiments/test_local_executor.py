@@ -78,7 +78,20 @@ def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
     # As in a terminal, Ctrl-C reaches the whole process group.
     os.killpg(parent.pid, signal.SIGINT)
     _, errors = parent.communicate(timeout=PATIENCE_S)
-    assert errors.count(b"KeyboardInterrupt") == 1
+    assert errors.splitlines().count(b"KeyboardInterrupt") == 1
+    assert _is_gone(int((tmp_path / "pid").read_text()))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_run_in_the_background_stops_its_processes(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    # A shell that starts a run with "&" has it ignore Ctrl-C.
+    parent = _hanging_run(tmp_path, handler="SIG_IGN")
+    parent.send_signal(number)
+    parent.send_signal(number)
+    _, errors = parent.communicate(timeout=PATIENCE_S)
+    assert errors.splitlines().count(b"KeyboardInterrupt") == 1
     assert _is_gone(int((tmp_path / "pid").read_text()))
 
 
@@ -95,7 +108,7 @@ def test_no_process_outlives_a_killed_run(tmp_path: Path) -> None:
             pass
 
 
-def _hanging_run(folder: Path) -> subprocess.Popen[bytes]:
+def _hanging_run(folder: Path, handler: str = "default_int_handler") -> subprocess.Popen[bytes]:
     """Start a process whose one item hangs, holding the lock of `folder`."""
     pid_file, script = folder / "pid", folder / "script.py"
     script.write_text(
@@ -105,8 +118,7 @@ def _hanging_run(folder: Path) -> subprocess.Popen[bytes]:
         "from astra_data.experiments.execution import Item\n"
         "from astra_data.experiments.local_executor import execute\n"
         "if __name__ == '__main__':\n"
-        # A shell that starts these tests in the background has it ignored.
-        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"    signal.signal(signal.SIGINT, signal.{handler})\n"
         f"    here = Path({str(folder)!r})\n"
         "    execute([Item('a', (), partial(hang, here / 'pid'))], jobs=1, logs=here, watch=Record())\n"
     )

@@ -120,6 +120,12 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
             {"collect": {"start": "task", "hold_s": [3.0, 0.5]}},
             "collect: hold_s: expected the shorter time first, got [3.0, 0.5]",
         ),
+        ({"collect": {"start": "task", "episodes": 10**18}}, "collect.episodes: expected less than or equal"),
+        ({"collect": {"start": "task", "episodes": 10**10}}, "collect: episodes: 10000000000 of up to 500"),
+        ({"sweep": {"percent": [10**9]}}, "sweep.percent.0: expected less than or equal to 10000"),
+        ({"train": {"num_envs": 10**9}}, "train.num_envs: expected less than or equal to 1000000"),
+        ({"train": {"hidden_sizes": [10**9]}}, "train.hidden_sizes.0: expected less than or equal to"),
+        ({"evaluate": {"episodes": 10**9}}, "evaluate.episodes: expected less than or equal to 1000000"),
         ({"task": "antmaze-umaze", "collect": {"behavior": "suboptimal_sac"}}, "take 'suboptimal_ppo'"),
     ],
 )

@@ -1,9 +1,14 @@
 """Whatever a recipe holds: a model, or one clear message. ASTRA_DATA_FUZZ is how many examples are tried."""
 
+import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -62,3 +67,49 @@ def test_tables_of_anything(tables: dict[str, object]) -> None:
         validated(tables, Recipe, "recipe")
     except RecipeError as error:
         assert str(error).startswith("recipe")
+
+
+HOSTILE: st.SearchStrategy[object] = st.one_of(
+    st.sampled_from([-1, 0, 1, 2**31, 2**63, 10**18, 10**300, 1e308, -1e308, 1e-308, 0.5, float("nan")]),
+    st.sampled_from([True, "", "..", "x" * 300, "\0", [], {}, [[]], [0] * 50, ["nas"] * 3, {"x": 1}]),
+    VALUES,
+)
+
+
+def places(value: object, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if path:
+        yield path
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        yield from places(value[key], (*path, key))  # type: ignore[index]
+
+
+def without_none(value: object) -> Any:  # noqa: ANN401 - JSON
+    """Leave out what has no value, as TOML does."""
+    if isinstance(value, dict):
+        return {key: without_none(item) for key, item in value.items() if item is not None}
+    return [without_none(item) for item in value] if isinstance(value, list) else value
+
+
+@cache
+def settings_of(path: Path) -> str:
+    """Return all settings of a recipe, defaults as well, as JSON."""
+    return json.dumps(without_none(load_experiment(path, path.parent).recipe.settings))
+
+
+@fuzzed
+@given(path=st.sampled_from(RECIPES[:4]), share=st.floats(0, 1, exclude_max=True), value=HOSTILE)
+def test_a_hostile_value_at_any_key(path: Path, share: float, value: object) -> None:
+    tables = json.loads(settings_of(path))
+    every = list(places(tables))
+    *keys, last = every[int(share * len(every))]
+    inner = tables
+    for key in keys:
+        inner = inner[key]
+    inner[last] = value
+    with suppress(RecipeError):
+        assert validated(tables, Recipe, "recipe").settings
+
+
+def test_the_settings_of_the_recipes_are_valid() -> None:
+    for path in RECIPES[:4]:
+        validated(json.loads(settings_of(path)), Recipe, "recipe")

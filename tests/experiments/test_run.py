@@ -42,8 +42,8 @@ def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.Captur
     lines = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"report  finished in [\d.]+ s  \(9 of 9\)", lines[-1])
 
-    unfinished = [key for key, is_finished in check(recipe, root=tmp_path).items() if not is_finished]
-    assert unfinished == ["report"]
+    unfinished = [key for key, found in check(recipe, root=tmp_path).items() if not found.is_finished]
+    assert unfinished == []
     run(recipe, root=tmp_path, jobs=1)
     assert (folder / "train/astra/seed_0/attempts").read_text() == "."
 
@@ -153,8 +153,13 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     text, folder = recipe.read_text(), tmp_path / "r"
     run(recipe, root=tmp_path, jobs=2)
     recipe.write_text(text.replace("steps = 5", "steps = 6"))
+    stale = {key: found.why for key, found in check(recipe, root=tmp_path).items() if found.state == "stale"}
+    assert stale == dict.fromkeys(
+        ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0"),
+        "plus changed in the recipe since: rename it, or remove this",
+    )
     with pytest.raises(RecipeError) as caught:
-        check(recipe, root=tmp_path)
+        run(recipe, root=tmp_path)
     assert str(caught.value) == (
         f"plus changed in the recipe since {folder} was made: "
         "give the recipe another name, or remove "
@@ -162,13 +167,12 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     )
     shutil.rmtree(folder / "train/astra_plus")
     shutil.rmtree(folder / "evaluate/astra_plus")
-    assert sorted(key for key, is_finished in check(recipe, root=tmp_path).items() if not is_finished) == [
+    assert sorted(key for key, found in check(recipe, root=tmp_path).items() if not found.is_finished) == [
         "evaluate/astra_plus/seed_0",
-        "report",
         "train/astra_plus/seed_0",
     ]
     recipe.write_text(text.replace("seeds = [0]", "seeds = [0, 1]"))
-    assert check(recipe, root=tmp_path)["collect/seed_1"] is False
+    assert check(recipe, root=tmp_path)["collect/seed_1"].state == "missing"
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from astra_data.stages.align import align
 def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
     assert {file.name for file in aligned.iterdir()} == {
         "config.json",
+        "manifest.json",
         "metrics.json",
         "target_encoder.safetensors",
     }

@@ -10,7 +10,9 @@ from small_run import TRAIN
 from torch import Tensor
 
 from astra_data.core.checkpoint import load_tensors
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.rma import RmaConfig
@@ -70,6 +72,10 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert told["dataset_version"] == "antmaze-short-random-seed0@data-2.0.0"
     check_outcome(told["target"], paths["target.position"])
     check_outcome(told["simulated"], paths["simulated.position"])
+    manifest = read_manifest(tmp_path / "astra")
+    assert manifest and manifest.made_from == {
+        name: file_digest(next(folder.glob("*.safetensors"))) for name, folder in inputs.items()
+    }
     with_source = CONFIG.model_copy(update={"encoder": "source"})
     source, other = make(task, "astra", tmp_path / "source", inputs, with_source)
     assert source["encoder"] == "source"

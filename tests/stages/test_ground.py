@@ -55,7 +55,7 @@ def stop_after(updates: int) -> Progress:
 
 
 def test_the_artefact_is_complete(task: str, grounded: Path) -> None:
-    files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}
+    files = {"config.json", "gap.json", "grounding.safetensors", "manifest.json", "metrics.json"}
     assert {file.name for file in grounded.iterdir()} == files
     told = json.loads((grounded / "config.json").read_text())
     assert len(told.pop("hash")) == 64
@@ -172,6 +172,7 @@ def test_whole_episodes_go_on_after_an_interruption(
         "config.json",
         "gap.json",
         "grounding.safetensors",
+        "manifest.json",
         "metrics.json",
     }
     for name in ("grounding.safetensors", "gap.json", "config.json"):
@@ -205,7 +206,7 @@ def test_identified_parameters_are_an_artefact_that_policies_are_trained_with(
     )
     given = {"dataset": paired, "seed": 0, "device": "cpu", "progress": silent}
     ground(task, "compass", GROUND, settings=settings, out=tmp_path / "ground", **given)  # type: ignore[arg-type]
-    files = {"config.json", "gap.json", "grounding.safetensors", "metrics.json"}
+    files = {"config.json", "gap.json", "grounding.safetensors", "manifest.json", "metrics.json"}
     assert {file.name for file in (tmp_path / "ground").iterdir()} == files
     found = load_grounding(tmp_path / "ground" / "grounding.safetensors")
     assert isinstance(found, IdentifiedParameters)

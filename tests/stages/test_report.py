@@ -23,7 +23,9 @@ from fake_runs import (
     write_runs,
 )
 
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
+from astra_data.core.manifest import read_manifest
 from astra_data.core.naming import place
 from astra_data.reports.page import render
 from astra_data.reports.schema import Results
@@ -76,6 +78,14 @@ def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN
     assert set(row["summary"]["success"]) == {"mean", "std", "iqm", "low", "high"}
     learning = {"steps": [0.0, 1000.0, 2000.0], "score": [None, 0.5, 0.75]}
     assert row["learning"] == [learning] * 3
+
+
+def test_the_manifest_names_the_evaluations(folder: Path) -> None:
+    manifest = read_manifest(folder)
+    assert manifest and manifest.faults(folder, verify=True) == manifest.foreign(folder) == []
+    evaluations = {path.parent: path for path in folder.parent.glob("evaluate/*/*/evaluation.json")}
+    digests = {str(key.relative_to(folder.parent)): file_digest(path) for key, path in evaluations.items()}
+    assert evaluations and manifest.made_from == digests
 
 
 def test_a_paper_figure_of_no_row_is_refused(root: Path) -> None:

@@ -8,6 +8,7 @@ from small_run import TRAIN
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.learning.networks.adaptation import Student
 from astra_data.learning.networks.soft_actor import SoftActor
@@ -46,8 +47,16 @@ def stop(fraction: float, note: str) -> None:
 
 
 def test_the_artefact_is_complete(task: str, grounded: Path, trained: Path) -> None:
-    assert {file.name for file in trained.iterdir()} == {"config.json", "curve.json", "policy.safetensors"}
+    assert {file.name for file in trained.iterdir()} == {
+        "config.json",
+        "curve.json",
+        "manifest.json",
+        "policy.safetensors",
+    }
     told = json.loads((trained / "config.json").read_text())
+    manifest = read_manifest(trained)
+    assert manifest and manifest.faults(trained, verify=True) == manifest.foreign(trained) == []
+    assert manifest.made_from == {"dataset": told["hash"], "grounding": told["grounding_sha256"]}
     assert len(told.pop("hash")) == 64
     assert told == {
         **{"task": task, "method": "astra", "dataset": "antmaze-short-random-seed0@data-2.0.0", "seed": 0},
@@ -203,6 +212,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
     assert {file.name for file in (tmp_path / "train").iterdir()} == {
         "config.json",
         "curve.json",
+        "manifest.json",
         "policy.safetensors",
     }
     told = json.loads((tmp_path / "train" / "config.json").read_text())

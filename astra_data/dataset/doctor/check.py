@@ -10,6 +10,7 @@ from astra_data.core.errors import AstraDataError, BadInputError, CorruptDataset
 from astra_data.dataset.column_statistics import global_statistics
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import permutation
+from astra_data.dataset.digests import Digests, read_digests
 from astra_data.dataset.doctor.check_episodes import EXACT, EpisodeChecks, is_close
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.format import (
@@ -17,6 +18,7 @@ from astra_data.dataset.format import (
     DATA_PATH,
     DATASET_PATH,
     DEFAULT_COLUMNS,
+    DIGESTS_PATH,
     INFO_PATH,
     METADATA_PATH,
     POLICY_PATH,
@@ -38,8 +40,18 @@ from astra_data.dataset.plain import (
     schema_faults,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.seal import altered_files
 
-_META_FILES = (INFO_PATH, STATS_PATH, TASKS_PATH, DATASET_PATH, METADATA_PATH, SUBSETS_PATH, POLICY_PATH)
+_META_FILES = (
+    INFO_PATH,
+    STATS_PATH,
+    TASKS_PATH,
+    DATASET_PATH,
+    METADATA_PATH,
+    SUBSETS_PATH,
+    DIGESTS_PATH,
+    POLICY_PATH,
+)
 
 
 def check(root: Path) -> Report:
@@ -60,13 +72,17 @@ def check(root: Path) -> Report:
         report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset of unknown provenance")
     columns = _info_faults(info, report)
     if columns and _files_are_readable(root, info, columns, report):
-        checks = EpisodeChecks(root, info, columns, is_ours, report)
+        description = _description(root, report) if is_ours else {}
+        digests = _digests(root, description, columns, report) if is_ours else {}
+        checks = EpisodeChecks(root, info, columns, digests, is_ours, report)
         try:
             checks.run()
             checks.totals()
-            if is_ours:
+            if not report.frames:
+                report.fault("values", "there are no steps")
+            elif is_ours:
                 _global_statistics(root, columns, report)
-                _astra_faults(root, checks, report)
+                _astra_faults(root, description, checks, report)
         except AstraDataError as error:
             report.fault("values", str(error))
     if is_ours and not report.faults:
@@ -140,7 +156,7 @@ def _strangers(root: Path, report: Report) -> None:
     """Report unknown files: in data/ as faults, in meta/, where other tools may add some, as notes."""
     known = {root / path for path in _META_FILES} | {*data_files(root), *episodes_files(root)}
     for path in sorted([*(root / "data").rglob("*"), *(root / "meta").rglob("*")]):
-        if path.is_file() and path not in known:
+        if not path.is_dir() and path not in known:
             add = report.fault if path.is_relative_to(root / "data") else report.note
             add("files", f"{path.relative_to(root)} does not belong to it")
 
@@ -158,14 +174,10 @@ def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -
                 report.fault(STATS_PATH, f"{STATS_PATH}: {key} of {name} is {found}, expected {values}")
 
 
-def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
-    try:
-        description = read_description(root)
-        if (content := checks.hash.hexdigest()) != (stored := description["content_hash"]):
-            report.fault("origin", f"the content hash is {content}, expected {stored}")
-        _policy_faults(root, description.get("behavior"), report)
-    except CorruptDatasetError as error:
-        report.fault("origin", str(error))
+def _astra_faults(root: Path, description: Mapping[str, Any], checks: EpisodeChecks, report: Report) -> None:
+    if description and (content := checks.hash.hexdigest()) != (stored := description["content_hash"]):
+        report.fault("origin", f"the content hash is {content}, expected {stored}")
+    _policy_faults(root, description.get("behavior"), report)
     table = read_small_table(root / METADATA_PATH)
     if isinstance(table, str):
         report.fault(METADATA_PATH, f"{METADATA_PATH} {table}")
@@ -182,6 +194,31 @@ def _astra_faults(root: Path, checks: EpisodeChecks, report: Report) -> None:
             report.fault(SUBSETS_PATH, f"{SUBSETS_PATH}: the uids are not in the order of their seed")
     except CorruptDatasetError as error:
         report.fault(SUBSETS_PATH, str(error))
+
+
+def _description(root: Path, report: Report) -> Mapping[str, Any]:
+    """Return meta/astra/dataset.json, empty if it is malformed; report which sealed files were altered."""
+    try:
+        description = read_description(root)
+    except CorruptDatasetError as error:
+        report.fault("origin", str(error))
+        return {}
+    for path in altered_files(root, description):
+        report.fault("sums", f"{path} was altered after it was written, or is missing")
+    return description
+
+
+def _digests(
+    root: Path, description: Mapping[str, Any], columns: list[PlainColumn], report: Report
+) -> Digests:
+    try:
+        digests = read_digests(root, description.get("sums", {}), [column.name for column in columns])
+    except CorruptDatasetError as error:
+        report.note("digests", f"{error}: it is not known which values were altered, if any")
+        return {}
+    if digests is None:
+        report.note("digests", "it was written without digests, which tell what values were altered")
+    return digests or {}
 
 
 def _policy_faults(root: Path, behavior: object, report: Report) -> None:

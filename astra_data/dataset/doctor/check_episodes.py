@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from astra_data.dataset import columns as names
 from astra_data.dataset.column_statistics import episode_statistics
 from astra_data.dataset.description import ContentHash
+from astra_data.dataset.digests import Digests, run_alterations
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.format import STATISTICS, STATS_PATH, TASKS_PATH
 from astra_data.dataset.parquet import read_blocks
@@ -46,16 +47,21 @@ class EpisodeChecks:
         root: Path,
         info: Mapping[str, Any],
         columns: Sequence[PlainColumn],
+        digests: Digests,
         is_ours: bool,
         report: Report,
     ) -> None:
-        """Prepare; the stored statistics are exact if the dataset `is_ours`, else estimates."""
+        """Prepare; the stored statistics are exact if the dataset `is_ours`, else estimates.
+
+        The values of all columns, or of none, are compared with `digests`.
+        """
         self.hash = ContentHash()
         self.uids: list[int] = []
         self.lengths: list[int] = []
         self._root = root
         self._info = info
         self._columns = columns
+        self._digests = digests
         self._is_ours = is_ours
         self._report = report
         self._tasks = self._read_tasks()
@@ -87,6 +93,8 @@ class EpisodeChecks:
                 self._report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
             for name, values in run.columns.items():
                 self.hash.update(name, values)
+            for fault in run_alterations(run, number, self._digests):
+                self._report.fault("values", fault)
             if row is None:
                 self._report.fault("meta/episodes", f"meta/episodes lacks episode {number}")
             else:

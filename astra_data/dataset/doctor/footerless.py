@@ -98,6 +98,8 @@ def _leaf(field: pa.Field) -> _Leaf:
 
 def _pages(path: Path) -> list[_Page]:
     pages: list[_Page] = []
+    if not path.is_file():
+        return pages
     with path.open("rb") as file:
         if file.read(4) != b"PAR1":
             return pages

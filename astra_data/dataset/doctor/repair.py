@@ -1,7 +1,6 @@
 """Save the intact episodes of a damaged LeRobot dataset, ours or another tool's, into a new one."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,13 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
-from astra_data.dataset.columns import Column, Episode, Scalar
+from astra_data.dataset.columns import Episode, Scalar
+from astra_data.dataset.declared import DTYPES, declared_columns, name_of
+from astra_data.dataset.digests import Digests, read_digests
+from astra_data.dataset.doctor.joining import Joined, join
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.format import (
     DATASET_PATH,
-    DEFAULT_COLUMNS,
     INFO_PATH,
     METADATA_PATH,
     POLICY_PATH,
@@ -23,18 +24,24 @@ from astra_data.dataset.format import (
 )
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.plain import (
-    MOST_FPS,
     PlainColumn,
-    plain_columns,
     read_object,
     read_small_table,
     read_tasks,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.seal import altered_files
 from astra_data.dataset.versions import Version, successor
 from astra_data.dataset.writer import DatasetWriter
 
-_DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
+_LOST = "success, return and the like of the episodes are lost"
+_IF_ALTERED = {
+    INFO_PATH: "names, units and fps may be wrong",
+    TASKS_PATH: "the task may be wrong",
+    METADATA_PATH: _LOST,
+    SUBSETS_PATH: "the order of the subsets is that of seed 0",
+}
+"""What follows for the new dataset; statistics are rebuilt, and digests have notes of their own."""
 
 
 @dataclass
@@ -52,18 +59,23 @@ class Repaired:
     notes: list[str] = field(default_factory=list)
 
 
-def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
+def repair(
+    folder: Path, *, out: Path, like: Dataset | Sequence[Dataset] | None = None, new_uids: bool = False
+) -> Repaired:
     """Write the intact episodes of `folder` to a new dataset `out`.
 
-    Episodes with wrong values are left out, and all that follow once it is unclear where episodes begin, or a
-    file cannot be read. Data files without a footer, which a killed writer leaves, are read page by page.
-    Statistics and meta/episodes are rebuilt.
+    Episodes with wrong values, or with other values than were written, are left out, and all that follow once
+    it is unclear where episodes begin, or a file cannot be read. Data files without a footer, which a killed
+    writer leaves, are read page by page. Statistics and meta/episodes are rebuilt.
 
     Args:
         folder: the damaged dataset; it is not changed.
         out: folder of the new one.
         like: the dataset from which LeRobot's tools made `folder`, dropping our metadata: provenance and the
-            episodes' metadata are taken from it, joined by episode_uid.
+            episodes' metadata are taken from it, joined by episode_uid. Or several, of which the first gives
+            the provenance: metadata is then joined by uid and values, as it is with `new_uids`.
+        new_uids: give an episode whose uid an earlier one has a new one, the same in every run, and keep the
+            old one as "merged_uid"; otherwise it is left out.
 
     Raises:
         CorruptDatasetError: meta/info.json is missing, or no episode is intact.
@@ -72,36 +84,56 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
     info = read_object(folder / INFO_PATH)
     if isinstance(info, str):
         raise CorruptDatasetError(f"{folder}: {INFO_PATH} {info}; without it columns and fps are unknown")
-    columns, specs, fps = _declared(folder, info)
-    if like is not None and names.EPISODE_UID not in info["features"]:
-        raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {like.reference}")
+    columns, specs, fps = declared_columns(folder, info)
+    sources = [like] if isinstance(like, Dataset) else list(like or ())
+    first = sources[0] if sources else None
+    if first is not None and names.EPISODE_UID not in info["features"]:
+        raise BadInputError(
+            f"{folder} has no column {names.EPISODE_UID}, by which it joins {first.reference}"
+        )
     result = Repaired(notes=_conversions(info, columns))
     tasks = read_tasks(folder)
     if isinstance(tasks, str):
         result.notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
-    metadata = _metadata(folder, result.notes) if like is None else _facts(like.uids.tolist(), like.metadata)
-    description = _description(folder, like, result.notes)
+    # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
+    old = _old_description(folder, result.notes) if first is None else {}
+    altered = set(_altered_files(folder, old, result.notes))
+    digests = _digests(folder, old, columns, result.notes) if first is None else {}
+    metadata = (
+        _metadata(folder, altered, result.notes)
+        if first is None
+        else _facts(first.uids.tolist(), first.metadata)
+    )
+    description = _description(folder, sources, old)
     unknown = 0
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
-    seed = _subset_seed(folder if like is None else like.root)
+    seed = _subset_seed(folder, altered) if first is None else first.subset_seed
+    joined: list[Joined] = []
+    if new_uids or len(sources) > 1:
+        whole = whole_runs(folder, columns, digests, fps, [], repeated=new_uids)
+        joined = join(((uid, run.columns) for uid, run in whole), specs, sources)
+        renamed = sum("merged_uid" in episode.metadata for episode in joined)
+        result.notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
-        for uid, run in whole_runs(folder, columns, fps, result.notes):
+        for uid, run in whole_runs(folder, columns, digests, fps, result.notes, repeated=new_uids):
             values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
-            unknown += uid not in metadata
-            facts = dict(metadata.get(uid, {}))
+            known = Joined(uid, dict(metadata.get(uid, {})), uid in metadata)
+            if joined:
+                known = joined[result.episodes]
+            unknown += not known.is_known
+            facts = known.metadata
             if len(tasks) > 1:
                 facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
-            writer.add(Episode(uid, values, facts))
+            writer.add(Episode(known.uid, values, facts))
             result.episodes += 1
             result.frames += len(run)
         counted = info.get("total_episodes")
         if isinstance(counted, int) and counted > result.episodes:
             lost = counted - result.episodes
             result.notes.append(f"{lost} of the {counted} episodes that {INFO_PATH} counts are lost")
-        written = read_object(folder / DATASET_PATH)
-        is_all = like is None and counted == result.episodes and len(columns) == len(info["features"])
-        if is_all and not isinstance(written, str) and written.get("content_hash") != writer.content_hash:
+        is_all = counted == result.episodes and len(columns) == len(info["features"])
+        if is_all and old and old["content_hash"] != writer.content_hash:
             result.notes.append(
                 "a value was altered after it was written, because the content hash differs; which one is "
                 "unknown"
@@ -111,36 +143,12 @@ def repair(folder: Path, *, out: Path, like: Dataset | None = None) -> Repaired:
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
     if metadata and unknown:
-        result.notes.append(f"{unknown} episodes have no metadata: their uids are not among the known ones")
+        result.notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
     if len(tasks) > 1:
         result.notes.append(
             f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'"
         )
     return result
-
-
-def _declared(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
-    """Return the readable columns, those to be written, and the fps, from info.json."""
-    features, fps = info.get("features"), info.get("fps")
-    columns = plain_columns(features)[0] if isinstance(features, dict) else []
-    missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
-    if missing or not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
-        raise CorruptDatasetError(
-            f"{folder}: {INFO_PATH} has fps {fps!r} and lacks the columns {', '.join(missing) or 'none'}; "
-            "expected a whole number of frames per second and all of LeRobot's own columns"
-        )
-    assert isinstance(features, dict)
-    specs = []
-    for column in columns:
-        if column.name in names.RESERVED:
-            continue
-        feature = features[column.name]
-        labels = feature.get("names")
-        fits = isinstance(labels, list) and [type(label) for label in labels] == [str] * column.size
-        kind = _DTYPES[np.dtype(column.dtype).kind]
-        known = feature | {"dtype": kind, "names": labels if fits else None}
-        specs.append(Column.from_feature(column.name, known))
-    return columns, specs, int(fps)
 
 
 def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> list[str]:
@@ -149,19 +157,47 @@ def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> lis
     if others:
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     for column in columns:
-        kind = _DTYPES[np.dtype(column.dtype).kind]
+        kind = DTYPES[np.dtype(column.dtype).kind]
         if column.dtype != kind:
             notes.append(f"{column.name} was {column.dtype} and is now {kind}")
     return notes
 
 
-def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
-    """Return the episodes' metadata by uid, empty where there is none."""
-    if not (folder / "meta/astra").is_dir():
+def _old_description(folder: Path, notes: list[str]) -> Mapping[str, Any]:
+    """Return meta/astra/dataset.json, empty if there is none to rely on."""
+    try:
+        return read_description(folder)
+    except CorruptDatasetError as error:
+        if (folder / DATASET_PATH).exists():
+            notes.append(f"{error}: the origin is unknown")
+        return {}
+
+
+def _altered_files(folder: Path, old: Mapping[str, Any], notes: list[str]) -> Iterator[str]:
+    for path in altered_files(folder, old):
+        if (folder / path).exists():  # a missing one is told where it is read
+            if path in _IF_ALTERED:
+                notes.append(f"{path} was altered after it was written: {_IF_ALTERED[path]}")
+            yield path
+
+
+def _digests(
+    folder: Path, old: Mapping[str, Any], columns: Sequence[PlainColumn], notes: list[str]
+) -> Digests:
+    try:
+        return read_digests(folder, old.get("sums", {}), [column.name for column in columns]) or {}
+    except CorruptDatasetError as error:
+        notes.append(f"{error}: the values were compared with the content hash only, as a whole")
+        return {}
+
+
+def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[int, dict[str, Scalar]]:
+    """Return the episodes' metadata by uid, empty where there is none to rely on."""
+    if METADATA_PATH in altered or not (folder / "meta/astra").is_dir():
         return {}
     table = read_small_table(folder / METADATA_PATH)
     if isinstance(table, str):
-        notes.append(f"{METADATA_PATH} {table}: success, return and the like of the episodes are lost")
+        notes.append(f"{METADATA_PATH} {table}: {_LOST}")
         return {}
     columns = table.to_pydict()
     uids = columns.pop(names.EPISODE_UID, [])
@@ -178,17 +214,13 @@ def _facts(
     }
 
 
-def _description(folder: Path, like: Dataset | None, notes: list[str]) -> dict[str, Any]:
+def _description(folder: Path, sources: Sequence[Dataset], old: Mapping[str, Any]) -> dict[str, Any]:
     config = {"folder": folder.name}
-    if like is not None:
-        return successor(like, "episodes", stage="repair", config=config, out=folder)[0]
-    try:
-        old = read_description(folder)
-    except CorruptDatasetError as error:
-        if (folder / DATASET_PATH).exists():
-            notes.append(f"{error}: the origin is unknown")
-        name = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name).lstrip("-._")
-        return {"name": name or "repaired", "stage": "repair", "config": config}
+    if sources:
+        first, *others = sources
+        return successor(first, "episodes", stage="repair", config=config, out=folder, parents=others)[0]
+    if not old:
+        return {"name": name_of(folder), "stage": "repair", "config": config}
     kept = {key: old[key] for key in ("name", "seeds", "environment", "simulator")}
     version = Version.parse(old["version"])
     parent = {"name": old["name"], "version": old["version"], "hash": old["content_hash"]}
@@ -196,7 +228,7 @@ def _description(folder: Path, like: Dataset | None, notes: list[str]) -> dict[s
     return {**kept, **changed, "stage": "repair", "config": config}
 
 
-def _subset_seed(folder: Path) -> int:
-    subsets = read_object(folder / SUBSETS_PATH)
+def _subset_seed(folder: Path, altered: Collection[str]) -> int:
+    subsets = "was altered" if SUBSETS_PATH in altered else read_object(folder / SUBSETS_PATH)
     seed = 0 if isinstance(subsets, str) else subsets.get("seed")
     return seed if isinstance(seed, int) else 0

@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
+from astra_data.dataset.digests import Digests, run_alterations
 from astra_data.dataset.doctor.footerless import rebuilt_metadata
 from astra_data.dataset.parquet import UNREADABLE, read_blocks
 from astra_data.dataset.plain import (
@@ -22,19 +23,27 @@ from astra_data.dataset.plain import (
 )
 
 _STRUCTURE = {*(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX), *(names.TIMESTAMP, names.EPISODE_UID)}
-"""Columns that locate episodes: after a fault in one, no later episode can be trusted."""
+"""Columns that locate episodes: after a fault in one, no later episode can be trusted without digests."""
 
 
 def whole_runs(
-    folder: Path, columns: Sequence[PlainColumn], fps: int, notes: list[str]
+    folder: Path,
+    columns: Sequence[PlainColumn],
+    digests: Digests,
+    fps: int,
+    notes: list[str],
+    *,
+    repeated: bool = False,
 ) -> Iterator[tuple[int, Run]]:
     """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
 
     Args:
         folder: the damaged dataset.
         columns: the columns to read, LeRobot's own among them.
+        digests: those of the values, empty if they are not known; they tell altered episodes from whole ones.
         fps: steps per second.
         notes: a sentence is added for each loss.
+        repeated: also yield episodes whose uid an earlier one has.
     """
     lengths = _lengths(folder, notes)
     episode = row = 0
@@ -43,15 +52,16 @@ def whole_runs(
     try:
         for run in every:
             found = list(run_faults(run, number=episode, row=row, fps=fps))
-            structural = [fault for name, fault in found if name in _STRUCTURE]
+            structural = [] if digests else [fault for name, fault in found if name in _STRUCTURE]
             if lengths.get(episode, len(run)) != len(run):
                 structural.append(f"episode {episode} has {len(run)} frames, expected {lengths[episode]}")
             if structural:
                 notes.append(f"stopped before episode {episode}: {'; '.join(structural)}")
                 return
             faults = [*(fault for _, fault in found), *flag_faults(run, episode)]
+            faults += run_alterations(run, episode, digests)
             uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
-            if uid in uids or uid < 0:
+            if uid < 0 or (uid in uids and not repeated):
                 faults.append(f"its uid {uid} is taken or negative")
             if faults:
                 notes.append(f"left out episode {episode}: {'; '.join(faults)}")

@@ -4,28 +4,39 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.core.optional import optional
-from astra_data.dataset.atomic import atomic_file
 from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, TERMINATED
 from astra_data.dataset.reader import Dataset
+from astra_data.exchange.export_record import Export
+from astra_data.exchange.hdf5_file import hdf5_file
+from astra_data.exchange.layouts import D3RLPY, NUMBERED, RECORD, extra_fields
 
 VERSION = "2.1"
 
 
-def export(dataset: Dataset, out: Path) -> None:
+def write(dataset: Dataset, path: Path, out: Path) -> None:
     """Write per episode i observations_i (T, S + G), actions_i (T, A), rewards_i (T, 1) and terminated_i.
 
-    Its algorithms take one observation, so the goal, where there is one, follows the state.
+    Its algorithms take one observation, so the goal, where there is one, follows the state. Other columns
+    become infos/<name>_i, which it leaves alone.
     """
-    h5py = optional("h5py", "hdf5")
-    observed = [STATE, GOAL] if GOAL in dataset.features else [STATE]
-    with atomic_file(out) as path, h5py.File(path, "w") as file:
-        file["columns"] = ["observations", "actions", "rewards", "terminated"]
+    names = [column.name for column in dataset.schema]
+    own = {name: field for name, field in D3RLPY.items() if name != TERMINATED} | {GOAL: D3RLPY[STATE]}
+    fields = extra_fields(names, own) | {name: field for name, field in own.items() if name in names}
+    [state] = dataset.specs([STATE])
+    exported = Export(dataset, fields, groups=NUMBERED, first={GOAL: state.size})
+    observed = [STATE, GOAL] if GOAL in names else [STATE]
+    apart = [name for name in names if name not in (*observed, ACTION, REWARD)]
+    with hdf5_file(path) as (file, disk):
+        file["columns"] = list(D3RLPY.values())
         file["num_episodes"] = len(dataset)
         file["version"] = VERSION
-        for number, episode in enumerate(dataset.episodes([*observed, ACTION, REWARD, TERMINATED])):
-            parts = [episode.columns[name].reshape(len(episode), -1) for name in observed]
+        for number, episode in enumerate(disk.until_it_fails(exported.episodes())):
+            values, length = episode.columns, len(episode)
+            parts = [values[name].reshape(length, -1) for name in observed]
             file[f"observations_{number}"] = np.concatenate(parts, axis=1)
-            file[f"actions_{number}"] = episode.columns[ACTION].reshape(len(episode), -1)
-            file[f"rewards_{number}"] = episode.columns[REWARD][:, None]
-            file[f"terminated_{number}"] = bool(episode.columns[TERMINATED][-1])
+            file[f"actions_{number}"] = values[ACTION].reshape(length, -1)
+            file[f"rewards_{number}"] = values.get(REWARD, np.zeros(length, np.float32))[:, None]
+            file[f"terminated_{number}"] = bool(values[TERMINATED][-1])
+            for name in apart:
+                file[f"{fields[name]}_{number}"] = values[name]
+        file[RECORD] = exported.text()

@@ -1,46 +1,105 @@
 """Minari: a folder that `minari.load_dataset` reads once it lies in $MINARI_DATASETS_PATH."""
 
-from collections.abc import Iterator
+import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import (
     ACTION,
     GOAL,
     NEXT_STATE,
     REWARD,
     STATE,
-    TERMINATED,
-    TRUNCATED,
     Array,
     Episode,
 )
 from astra_data.dataset.reader import Dataset
+from astra_data.exchange.export_record import Export
+from astra_data.exchange.hdf5_file import hdf5_file
+from astra_data.exchange.layouts import MINARI, extra_fields
 
-if TYPE_CHECKING:
-    from minari.data_collector import EpisodeBuffer
 
-
-def export(dataset: Dataset, out: Path) -> None:
+def write(dataset: Dataset, path: Path, out: Path) -> None:
     """Write observations (T + 1, S), actions (T, A), rewards, terminations and truncations (T,) per episode.
 
-    With goals, observations are a dict of "observation" and "desired_goal" (T + 1, G). The id is the path of
-    `out` in Minari's folder, or its name if it lies elsewhere.
+    With goals, observations are a dict of "observation" and "desired_goal" (T + 1, G). Other columns become
+    infos/<name> (T, ...), the episodes' uids and metadata their attributes "astra_data/...". The files are
+    those that Minari's own storage makes, which does not notice a full disk.
+
+    Args:
+        dataset: any whose next states are the states of the following steps.
+        path: the new folder.
+        out: where it will lie, whose end is the id: its path in Minari's folder, or its name elsewhere.
 
     Raises:
-        BadInputError: next states are not the states of the following steps, as Minari assumes, or the name
-            of `out` is not a valid id.
+        BadInputError: a next state is not the state of the following step, as Minari assumes, or the name of
+            `out` is not a valid id.
     """
     minari = optional("minari", "minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
-    from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415
-    from minari.dataset.minari_storage import MinariStorage  # noqa: PLC0415
-    from minari.storage.datasets_root_dir import get_dataset_path  # noqa: PLC0415
+    from minari.serialization import serialize_space  # noqa: PLC0415 - an extra
+
+    identity = _dataset_id(out)
+
+    def box(column: str) -> Box:
+        shape = tuple(dataset.features[column]["shape"])
+        return Box(-np.inf, np.inf, shape, np.float32)
+
+    names = [column.name for column in dataset.schema]
+    has_goal = GOAL in names
+    observations = "observations/observation" if has_goal else "observations"
+    own = {
+        **MINARI,
+        STATE: observations,
+        NEXT_STATE: f"next_{observations}",
+        GOAL: "observations/desired_goal",
+    }
+    fields = extra_fields(names, own) | {name: field for name, field in own.items() if name in names}
+    exported = Export(dataset, fields)
+    data = path / "data"
+    data.mkdir()
+    with hdf5_file(data / "main_data.hdf5", track_order=True) as (file, disk):
+        for number, episode in enumerate(disk.until_it_fails(exported.episodes())):
+            group = file.create_group(f"episode_{number}")
+            group.attrs.update(_attributes(number, episode))
+            values = episode.columns
+            arrays = {fields[name]: values[name] for name in names if name != NEXT_STATE}
+            arrays[fields[STATE]] = _with_last(episode, values[NEXT_STATE][-1:])
+            arrays[fields[ACTION]] = values[ACTION].reshape(len(episode), -1)
+            if REWARD not in fields:
+                arrays[MINARI[REWARD]] = np.zeros(len(episode), np.float32)
+            if has_goal:
+                arrays[fields[GOAL]] = np.concatenate([values[GOAL], values[GOAL][-1:]])
+            for field, array in arrays.items():
+                group.create_dataset(field, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
+    goal = {"desired_goal": box(GOAL)} if has_goal else {}
+    metadata: Mapping[str, Any] = {
+        "total_episodes": len(dataset),
+        "total_steps": int(dataset.lengths.sum()),
+        "data_format": "hdf5",
+        "jpeg_encoding": True,
+        "observation_space": serialize_space(
+            Dict({"observation": box(STATE), **goal}) if goal else box(STATE)
+        ),
+        "action_space": serialize_space(box(ACTION)),
+        "dataset_id": identity,
+        "minari_version": minari.__version__,
+        "description": f"{dataset.reference}, content hash {dataset.content_hash}",
+        "dataset_size": round((data / "main_data.hdf5").stat().st_size / 1e6, 1),
+        "astra_data": exported.record(),
+    }
+    (data / "metadata.json").write_text(json.dumps(metadata, ensure_ascii=False), encoding="utf-8")
+
+
+def _dataset_id(out: Path) -> str:
+    """Return the id of a dataset in folder `out`: its path in Minari's folder, or its name elsewhere."""
+    from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415 - an extra
+    from minari.storage.datasets_root_dir import get_dataset_path  # noqa: PLC0415 - an extra
 
     shelf, place = get_dataset_path().resolve(), out.resolve()
     name = str(place.relative_to(shelf)) if place.is_relative_to(shelf) else place.name
@@ -51,41 +110,14 @@ def export(dataset: Dataset, out: Path) -> None:
         raise BadInputError(
             f"{out}: '{name}' is not a Minari id; end --out with a name and a version, such as maze/random-v0"
         ) from error
-
-    def box(column: str) -> Box:
-        shape = tuple(dataset.features[column]["shape"])
-        return Box(-np.inf, np.inf, shape, np.float32)
-
-    goal = {"desired_goal": box(GOAL)} if GOAL in dataset.features else {}
-    observed = Dict({"observation": box(STATE), **goal}) if goal else box(STATE)
-    # Minari does not handle relative paths.
-    with atomic_folder(place) as folder:
-        storage = MinariStorage.new(folder / "data", observed, box(ACTION), data_format="hdf5")
-        description = f"{dataset.reference}, content hash {dataset.content_hash}"
-        about = {"dataset_id": name, "minari_version": minari.__version__, "description": description}
-        storage.update_metadata(about)
-        storage.update_episodes(_buffers(dataset))
+    return name
 
 
-def _buffers(dataset: Dataset) -> "Iterator[EpisodeBuffer]":
-    from minari.data_collector import EpisodeBuffer  # noqa: PLC0415 - an extra
-
-    goal = {GOAL: "desired_goal"} if GOAL in dataset.features else {}
-    columns = [STATE, *goal, ACTION, REWARD, TERMINATED, TRUNCATED, NEXT_STATE]
-    for number, episode in enumerate(dataset.episodes(columns)):
-        values = episode.columns
-        states = _with_last(episode, values[NEXT_STATE][-1:])
-        goals = {key: np.concatenate([values[GOAL], values[GOAL][-1:]]) for key in goal.values()}
-        seed = episode.metadata.get("seed")
-        yield EpisodeBuffer(
-            id=number,
-            seed=seed if isinstance(seed, int) else None,
-            observations={"observation": states, **goals} if goal else states,
-            actions=values[ACTION].reshape(len(episode), -1),
-            rewards=values[REWARD],
-            terminations=values[TERMINATED],
-            truncations=values[TRUNCATED],
-        )
+def _attributes(number: int, episode: Episode) -> dict[str, Any]:
+    seed = episode.metadata.get("seed")
+    facts = {f"astra_data/{key}": fact for key, fact in episode.metadata.items()}
+    known = {"id": number, "total_steps": len(episode), "astra_data/episode_uid": episode.uid, **facts}
+    return known | ({"seed": seed} if isinstance(seed, int) else {})
 
 
 def _with_last(episode: Episode, last: Array) -> Array:

@@ -1,21 +1,22 @@
-"""HDF5: one dataset per field; the layouts of D4RL and robomimic are known. Read block by block."""
+"""HDF5: one dataset per field; the layouts of D4RL, robomimic and d3rlpy are known. Read block by block."""
 
 import json
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from typing import Any
 
+import numpy as np
+
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.dataset.columns import NEXT_STATE, STATE, TRUNCATED
-from astra_data.exchange.layouts import D4RL, ROBOMIMIC
+from astra_data.dataset.columns import NEXT_STATE, STATE, TRUNCATED, Array
+from astra_data.exchange.hdf5_storage import check_storage, stored_datasets, unpacked_bytes
+from astra_data.exchange.layouts import D3RLPY, D4RL, NUMBERED, RECORD, ROBOMIMIC
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, natural, row_count
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
-
-MOST_COMPRESSED = 10_000
-"""Larger than the compression ratio of any filter; beyond it, the values were never written."""
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -26,46 +27,68 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
-        for group in _groups(h5py, file, mapping.episodes, str(source)):
-            origin = f"{source}{group.name}".rstrip("/")
-            datasets = _datasets(h5py, group)
+        for origin, datasets in _episodes(h5py, file, mapping.episodes, str(source)):
             order = slice(None, None, -1 if mapping.transposed else 1)
             shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
-            n = row_count(origin, mapping.all_fields, shapes)
+            single = [name for name, shape in shapes.items() if not shape and mapping.episodes == NUMBERED]
+            rowed = [field for field in mapping.all_fields if field not in single]
+            n = row_count(origin, rowed, shapes)
             used = {field: datasets[field] for field in mapping.all_fields}
-            _check_storage(used, origin)
+            check_storage(used, origin)
+            source.refuse_beyond(unpacked_bytes(used))
             for first in range(0, n, BLOCK_ROWS):
                 rows = slice(first, min(first + BLOCK_ROWS, n))
                 values = {
-                    field: dataset[..., rows].T if mapping.transposed else dataset[rows]
+                    field: _at_the_end(dataset[()], rows, n)
+                    if field in single
+                    else dataset[..., rows].T
+                    if mapping.transposed
+                    else dataset[rows]
                     for field, dataset in used.items()
                 }
                 yield Block(values, origin, starts=mapping.episodes is not None and first == 0)
 
 
+def record(source: Source) -> str | None:
+    """Return the record of an export of ours, None if it has none."""
+    h5py = optional("h5py", "hdf5")
+    with h5py.File(source.path, "r") as file:
+        found = file
+        for part in RECORD.split("/"):
+            is_here = isinstance(found, h5py.Group) and part in found
+            if not is_here or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+                return None
+            found = found[part]
+        is_text = isinstance(found, h5py.Dataset) and h5py.check_string_dtype(found.dtype) is not None
+        return str(found.asstr()[()]) if is_text and found.shape == () else None
+
+
 def layout(source: Source) -> dict[str, Any]:
-    """Return the keys of a mapping for a file in the layout of D4RL or of robomimic.
+    """Return the keys of a mapping for a file in the layout of D4RL, d3rlpy or robomimic.
 
     Of robomimic, the state is all of `obs` with one or two dimensions (images are left out), in the order of
     their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set while
     success lasts: rows after its first are episodes of one step, left out unless truncation is recorded too.
 
     Raises:
-        BadInputError: it is neither.
+        BadInputError: it is none of them.
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
-        fields = _datasets(h5py, file)
+        fields = stored_datasets(h5py, file)
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
             return {"columns": columns}
+        if {"num_episodes", "observations_0", "actions_0"} <= fields.keys():
+            columns = {name: {"fields": [field]} for name, field in D3RLPY.items() if f"{field}_0" in fields}
+            return {"columns": columns, "episodes": NUMBERED}
         demos = sorted({name.split("/")[1] for name in fields if name.startswith("data/demo_")}, key=natural)
         if not demos:
             raise BadInputError(
-                f"{source}: neither D4RL's layout (observations, actions) nor robomimic's (data/demo_0); "
-                "pass --mapping"
+                f"{source}: neither D4RL's layout (observations, actions) nor d3rlpy's (observations_0) nor "
+                "robomimic's (data/demo_0); pass --mapping"
             )
-        demo = _datasets(h5py, file[f"data/{demos[0]}"])
+        demo = stored_datasets(h5py, file[f"data/{demos[0]}"])
         columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
         for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
             found = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
@@ -77,6 +100,32 @@ def layout(source: Source) -> dict[str, Any]:
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
         fps = env_args.get("env_kwargs", {}).get("control_freq")
         return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
+
+
+def _episodes(
+    h5py: Any,  # noqa: ANN401 - a module
+    file: Any,  # noqa: ANN401 - of h5py
+    pattern: str | None,
+    origin: str,
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the name of each episode's part of the file and its fields."""
+    if pattern != NUMBERED:
+        for group in _groups(h5py, file, pattern, origin):
+            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(h5py, group)
+        return
+    numbered: dict[int, dict[str, Any]] = {}
+    for name, dataset in stored_datasets(h5py, file).items():
+        if found := re.fullmatch(r"(.+)_([0-9]+)", name):
+            numbered.setdefault(int(found[2]), {})[found[1]] = dataset
+    for number in sorted(numbered):
+        yield f"{origin}/{number}", numbered[number]
+
+
+def _at_the_end(value: Array, rows: slice, n: int) -> Array:
+    """Return the values of `rows` of n: `value` in the last, and 0 before it."""
+    values = np.zeros(n, np.asarray(value).dtype)
+    values[-1] = value
+    return values[rows]
 
 
 def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
@@ -102,26 +151,3 @@ def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN4
             f"{origin}{group.name.rstrip('/')}/{name} is a link; replace it by a copy of its target"
         )
     return group[name]
-
-
-def _check_storage(datasets: Mapping[str, Any], origin: str) -> None:
-    faults = []
-    for field, dataset in datasets.items():
-        if dataset.external or dataset.is_virtual:
-            faults.append(f"field '{field}' lies in another file; copy it into this one")
-        elif dataset.nbytes > MOST_COMPRESSED * (dataset.id.get_storage_size() + 2**10):
-            faults.append(f"field '{field}' claims the shape {dataset.shape}, but the file does not hold it")
-    if faults:
-        raise BadInputError(f"{origin}: {'; '.join(faults)}")
-
-
-def _datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py
-    """Map the path of each dataset below `group` to it; links into other files are not followed."""
-    found: dict[str, Any] = {}
-
-    def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset):
-            found[name] = item
-
-    group.visititems(visit)
-    return found

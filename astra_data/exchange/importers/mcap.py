@@ -21,6 +21,9 @@ from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
 
 SUFFIXES = (".mcap",)
 
+MOST_HELD_ROWS = 10**6
+"""Most rows in which the same values may be held: five hours at 50 Hz."""
+
 
 class Resampler:
     """Holds the last values of all topics and samples rows from them.
@@ -30,8 +33,9 @@ class Resampler:
         times: topic to the time of its last message, in ns.
     """
 
-    def __init__(self, mapping: ImportMapping) -> None:
-        """Sample the fields of `mapping`."""
+    def __init__(self, mapping: ImportMapping, origin: str) -> None:
+        """Sample the fields of `mapping` from the file `origin`."""
+        self._origin = origin
         self.topics: dict[str, list[str]] = {}
         self.times: dict[str, int] = {}
         for field in mapping.all_fields:
@@ -52,7 +56,12 @@ class Resampler:
             self._start, self._row = time, 0
 
     def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode."""
+        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode.
+
+        Raises:
+            BadInputError: these are more than `MOST_HELD_ROWS`.
+        """
+        self._refuse_gap(time)
         while self._start is not None:
             moment = self._start + self._row * 10**9 // self._fps
             if moment >= time:
@@ -62,6 +71,17 @@ class Resampler:
                 return
             yield self._row == 0, dict(self._values)
             self._row += 1
+
+    def _refuse_gap(self, time: int) -> None:
+        if self._start is None:
+            return
+        moment = self._start + self._row * 10**9 // self._fps
+        end = min(time, *(self.times[topic] + self._gap_ns for topic in self._expiring))
+        if (rows := (end - moment) * self._fps // 10**9) > MOST_HELD_ROWS:
+            raise BadInputError(
+                f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
+                f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
+            )
 
     def _is_complete(self, time: int) -> bool:
         return self.times.keys() == self.topics.keys() and all(
@@ -95,7 +115,7 @@ def _rows(source: Source, mapping: ImportMapping) -> Iterator[tuple[bool, dict[s
         optional("mcap_protobuf.decoder", "mcap").DecoderFactory(),
         optional("mcap_ros2.decoder", "mcap").DecoderFactory(),
     ]
-    resampler, time = Resampler(mapping), 0
+    resampler, time = Resampler(mapping, str(source)), 0
     sizes: dict[str, tuple[int, ...]] = {}
     with source.open() as stream:
         reader = reading.make_reader(stream, validate_crcs=True, decoder_factories=factories)

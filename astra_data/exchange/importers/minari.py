@@ -4,14 +4,22 @@ Fields are `observations`, `next_observations`, `actions`, `rewards`, `terminati
 `infos`; where a space is a dictionary or a tuple, its parts: `observations/desired_goal`, `actions/0`.
 """
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.exchange.hdf5_storage import (
+    check_storage,
+    refuse_links,
+    stored_datasets,
+    unpacked_bytes,
+)
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block, Source, row_count
 
@@ -22,9 +30,10 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield each episode as one block.
 
     Raises:
-        BadInputError: fields are missing or differ in length.
+        BadInputError: fields are missing or differ in length, or the files lead elsewhere or unpack to too
+            much.
     """
-    for episode in _open(source.path).iterate_episodes():
+    for episode in _open(source).iterate_episodes():
         fields = _fields(episode)
         origin = f"{source}/episode_{episode.id}"
         shapes = {name: values.shape for name, values in fields.items()}
@@ -34,7 +43,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 def layout(source: Source) -> dict[str, Any]:
     """Return the keys of a mapping: the state is every part of the observation but the desired goal."""
-    fields = _fields(next(iter(_open(source.path).iterate_episodes([0]))))
+    fields = _fields(next(iter(_open(source).iterate_episodes([0]))))
     state = [f for f in fields if f.split("/")[0] == "observations" and f != GOAL_FIELD]
     columns = {
         STATE: {"fields": state},
@@ -47,13 +56,29 @@ def layout(source: Source) -> dict[str, Any]:
     return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
 
 
+def record(source: Source) -> str | None:
+    """Return the record of an export of ours, None if it has none."""
+    metadata = json.loads((source.path / "data" / "metadata.json").read_text(encoding="utf-8"))
+    return json.dumps(metadata["astra_data"]) if "astra_data" in metadata else None
+
+
 def is_dataset(path: Path) -> bool:
     """Return whether `path` is the folder of a Minari dataset."""
     return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
 
 
-def _open(path: Path) -> Any:  # noqa: ANN401 - of minari
-    return optional("minari", "minari").MinariDataset(path / "data")
+def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
+    """Open the dataset; Minari itself reads whole episodes, and follows links into other files."""
+    h5py = optional("h5py", "minari")
+    for path in (source.path / "data").rglob("*.hdf5"):
+        if not path.is_file():
+            raise BadInputError(f"{path} is a device or a pipe, expected a file")
+        with h5py.File(path, "r") as file:
+            refuse_links(h5py, file, str(source))
+            datasets = stored_datasets(h5py, file)
+            check_storage(datasets, str(source))
+            source.refuse_beyond(unpacked_bytes(datasets))
+    return optional("minari", "minari").MinariDataset(source.path / "data")
 
 
 def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari

@@ -24,6 +24,9 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     with source.open() as stream, ZipFile(stream) as archive, ExitStack() as exits:
         known = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        source.refuse_beyond(
+            sum(archive.getinfo(known[field]).file_size for field in mapping.all_fields if field in known)
+        )
         files = {
             field: exits.enter_context(archive.open(known[field]))
             for field in mapping.all_fields

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.durable import write_file
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import RESERVED, Column
@@ -52,18 +52,17 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
         the files written.
 
     Raises:
-        BadInputError: `out` cannot be written.
+        DiskError: `out` cannot be written.
+        CorruptDatasetError: a value was altered: the card states the hash of all of them.
     """
+    dataset.require_whole()
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
     text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)
-    try:
-        out.write_text(text, encoding="utf-8")
-        if positions is None or figure is None:
-            return [out]
-        figure.write_bytes(png(coverage(positions.counts, positions.extent, "position", "m")))
-    except OSError as error:
-        raise BadInputError(f"{out} cannot be written: {error.strerror}; choose another file.") from error
+    write_file(out, text)
+    if positions is None or figure is None:
+        return [out]
+    write_file(figure, png(coverage(positions.counts, positions.extent, "position", "m")))
     return [out, figure]
 
 

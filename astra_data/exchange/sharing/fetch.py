@@ -1,44 +1,48 @@
-"""Resumable download of one file, verified by its checksum."""
+"""Resumable download of one file, bounded, and verified by its checksum."""
 
+import os
 from pathlib import Path
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import SharingError
 from astra_data.exchange.sharing.store import RemoteFolder
-
-BLOCK_BYTES = 2**24
-"""Bytes per request."""
+from astra_data.exchange.sharing.sums import Listed, altered
 
 
-def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str) -> None:
+def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed, most: int) -> None:
     """Download the file `path` into `folder`, continuing where an earlier call stopped.
 
     Args:
         remote: where it is.
         path: relative to it and to `folder`; already checked to stay inside them.
-        folder: an unfinished download is kept in it as <path>.part.
-        digest: the file's sha256.
+        folder: an unfinished download is kept in it as <path>.part; `refuse_planted` has looked at it.
+        listed: the file's sha256, and its size if that is known.
+        most: the most bytes that it may have, if its size is not known.
 
     Raises:
-        SharingError: it cannot be read or written, or its checksum is another.
+        SharingError: it cannot be read or written, is larger, or its checksum is another.
     """
     target = folder / path
-    if target.is_file() and file_digest(target) == digest:
+    if not altered(folder, {path: listed}):
         return
+    most = most if listed.size is None else listed.size
     part = target.with_name(f"{target.name}.part")
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
         resumed = part.exists()
-        _append(remote, path, part)
-        if resumed and file_digest(part) != digest:
+        _append(remote, path, part, most)
+        if resumed and file_digest(part) != listed.digest:
             part.unlink()
-            _append(remote, path, part)
+            _append(remote, path, part, most)
     except Exception as error:
         raise SharingError(
             f"{remote.name}: {path} cannot be downloaded ({type(error).__name__}: {error}); "
             "run the same command again to continue."
         ) from error
-    if file_digest(part) != digest:
+    if part.stat().st_size > most:
+        part.unlink()
+        raise SharingError(f"{remote.name}: {path} is larger than {most} bytes, as which it was taken.")
+    if file_digest(part) != listed.digest:
         part.unlink()
         raise SharingError(
             f"{remote.name}: {path} does not have the sha256 in SHA256SUMS; it was altered there."
@@ -46,11 +50,28 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, digest: str) -> None:
     part.replace(target)
 
 
-def _append(remote: RemoteFolder, path: str, part: Path) -> None:
-    options = {"block_size": BLOCK_BYTES, "cache_type": "none"}
-    with remote.filesystem.open(f"{remote.path}/{path}", "rb", **options) as source, part.open("ab") as out:
-        if out.tell():
-            source.seek(min(out.tell(), source.size))
-        while block := source.read(BLOCK_BYTES):
+def refuse_planted(folder: Path) -> None:
+    """Look for what no pull leaves in its unfinished `folder`, through which one would write elsewhere.
+
+    Raises:
+        SharingError: there is a link, a device or a pipe, or a file that has another name besides.
+    """
+    entries = [folder, *folder.rglob("*")] if folder.is_dir() else [folder]
+    for entry in entries:
+        facts = entry.lstat()
+        is_plain = entry.is_file() and facts.st_nlink == 1
+        if entry.is_symlink() or not (entry.is_dir() or is_plain):
+            raise SharingError(
+                f"{entry} is a link, a device or a pipe, which no pull leaves there: "
+                f"delete {folder}, then run the same command again."
+            )
+
+
+def _append(remote: RemoteFolder, path: str, part: Path, most: int) -> None:
+    """Add what `part` lacks of `path`; one byte over `most` shows that the file is larger."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK
+    with open(part, "ab", opener=lambda name, _: os.open(name, flags, 0o666)) as out:
+        first = out.tell()
+        for block in remote.blocks(path, first=first, most=most + 1 - first):
             out.write(block)
             out.flush()

@@ -2,11 +2,10 @@
 
 import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.errors import AstraDataError, BadInputError, SharingError
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, SharingError
 from astra_data.core.lock import held
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
@@ -15,17 +14,25 @@ from astra_data.dataset.description import NAME
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.versions import Version, place
 from astra_data.exchange.sharing.address import Hub, parse_source
-from astra_data.exchange.sharing.fetch import fetch
+from astra_data.exchange.sharing.fetch import fetch, refuse_planted
 from astra_data.exchange.sharing.hub import HubStore
 from astra_data.exchange.sharing.store import RemoteFolder, Store
-from astra_data.exchange.sharing.sums import SUMS_PATH, parse_sums
+from astra_data.exchange.sharing.sums import SUMS_PATH, Listed, altered, parse_sums
 from astra_data.exchange.sharing.urls import UrlStore
+
+MOST_BYTES = 100 * 10**9
+"""Most bytes that are downloaded unless more are asked for; a robot's logs stay far below."""
 
 
 def pull(
-    source: str, *, out: Path | None = None, version: str | None = None, progress: Progress = silent
+    source: str,
+    *,
+    out: Path | None = None,
+    version: str | None = None,
+    max_bytes: int = MOST_BYTES,
+    progress: Progress = silent,
 ) -> Dataset:
-    """Download a version of the dataset at `source`; do nothing if it is there already.
+    """Download a version of the dataset at `source`; if it is there already, compare it file by file.
 
     Files are downloaded to a hidden folder beside the dataset's, from which an interrupted pull continues.
     The dataset appears there once it is complete and its values are verified.
@@ -35,11 +42,13 @@ def pull(
             folder, whose last part is its name; "@data-1.2.0" after it names a version.
         out: the dataset's folder, by default its place at home.
         version: such as "1.2.0", by default the newest.
+        max_bytes: the most bytes of all its files; a larger dataset is refused before it is downloaded.
         progress: called with the fraction done.
 
     Raises:
         BadInputError: the source has no such version, or the folder holds something else.
-        SharingError: the source cannot be reached, denies access, or is not a valid dataset.
+        CorruptDatasetError: the folder holds this dataset, altered.
+        SharingError: the source cannot be reached, denies access, is too large, or is not a valid dataset.
 
     Example:
         >>> from pathlib import Path
@@ -68,11 +77,13 @@ def pull(
     if not isinstance(name, str) or not NAME.fullmatch(name) or called != str(chosen):
         raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it cannot be trusted.")
     target = place(description) if out is None else out
-    if target.exists():
-        return _present(target, description)
     sums = parse_sums(remote.read_text(SUMS_PATH), remote.name)
+    if target.exists():
+        dataset = _present(target, description, sums)
+        progress(1.0, f"it is there already, and whole: {len(sums)} files were compared")
+        return dataset
     try:
-        _fetch_all(remote, sums, target, description, progress)
+        _fetch_all(remote, sums, target, description, max_bytes, progress)
     except OSError as error:
         raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
     return Dataset.open(target)
@@ -80,19 +91,24 @@ def pull(
 
 def _fetch_all(
     remote: RemoteFolder,
-    sums: Mapping[str, str],
+    sums: Mapping[str, Listed],
     target: Path,
     description: Mapping[str, Any],
+    max_bytes: int,
     progress: Progress,
 ) -> None:
+    _refuse_sizes(remote, sums, max_bytes)
     partial = target.with_name(f".{target.name}.pull-{description['version']}")
     partial.mkdir(parents=True, exist_ok=True)
+    refuse_planted(partial)
     with held(partial) as ours:
         if not ours:
             raise BadInputError(f"{target} is being pulled right now; wait or choose another folder.")
-        for number, (path, digest) in enumerate(sums.items()):
+        left = max_bytes
+        for number, (path, listed) in enumerate(sums.items()):
             progress(number / len(sums), path)
-            fetch(remote, path, partial, digest)
+            fetch(remote, path, partial, listed, left)
+            left -= (partial / path).stat().st_size
         for file in [file for file in partial.rglob("*") if file.is_file()]:
             if file.relative_to(partial).as_posix() not in sums:
                 file.unlink()
@@ -101,18 +117,46 @@ def _fetch_all(
     progress(1.0, f"{len(sums)} files")
 
 
-def _present(target: Path, description: Mapping[str, Any]) -> Dataset:
-    """Return the dataset in folder `target`, which must be the one described."""
-    with suppress(AstraDataError):
+def _refuse_sizes(remote: RemoteFolder, sums: Mapping[str, Listed], max_bytes: int) -> None:
+    """Compare the sizes of the files with those listed, and their sum with `max_bytes`."""
+    found = {path: facts.get("size") for path, facts in remote.files().items()}
+    wrong = [
+        f"{path} has {found[path]} bytes, listed are {listed.size}"
+        for path, listed in sums.items()
+        if found.get(path) is not None and listed.size not in (None, found[path])
+    ]
+    if wrong:
+        raise SharingError(f"{remote.name} was altered: {'; '.join(wrong)}. Nothing was downloaded.")
+    total = sum(found.get(path) or listed.size or 0 for path, listed in sums.items())
+    if total > max_bytes:
+        raise SharingError(
+            f"{remote.name} has {total} bytes, of which at most {max_bytes} are taken; nothing was "
+            "downloaded. If you trust it, pass a larger --max-bytes."
+        )
+
+
+def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Listed]) -> Dataset:
+    """Return the dataset in folder `target`, which must be the one described, whole."""
+    changed = altered(target, sums)
+    try:
         dataset = Dataset.open(target)
-        if dataset.content_hash == description.get("content_hash"):
-            return dataset
-    raise BadInputError(
-        f"{target} exists already and holds something else; delete it or choose another folder."
-    )
+        is_other = dataset.content_hash != description.get("content_hash")
+        fault = f"it differs from what is shared in {', '.join(changed)}"
+    except CorruptDatasetError as error:
+        is_other, fault = len(changed) == len(sums), str(error)
+        changed = changed or ["its files"]
+    except AstraDataError:
+        is_other = True
+    if is_other:
+        raise BadInputError(
+            f"{target} exists already and holds something else; delete it or choose another folder."
+        )
+    if changed:
+        raise CorruptDatasetError(f"{target} was altered: {fault}. Delete it, or pull to another folder.")
+    return dataset
 
 
-def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], name: str) -> None:
+def _check(folder: Path, sums: Mapping[str, Listed], description: Mapping[str, Any], name: str) -> None:
     """Check that the downloaded files are the complete dataset; they may have been written by anybody."""
     try:
         dataset = Dataset.open(folder)

@@ -1,10 +1,11 @@
 """Share a version of a dataset."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, SharingError
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
@@ -14,7 +15,7 @@ from astra_data.exchange.sharing.card import write_card
 from astra_data.exchange.sharing.hub import HubStore
 from astra_data.exchange.sharing.notes import Notes
 from astra_data.exchange.sharing.store import RemoteFolder, Store
-from astra_data.exchange.sharing.sums import SUMS_PATH, make_sums
+from astra_data.exchange.sharing.sums import SUMS_PATH, Listed, make_sums, parse_sums
 from astra_data.exchange.sharing.urls import UrlStore
 
 
@@ -26,7 +27,7 @@ def push(
     private: bool = False,
     progress: Progress = silent,
 ) -> str:
-    """Upload `dataset` with its card to `destination`; do nothing if it is there already.
+    """Upload `dataset` with its card to `destination`; if it is there already, compare it instead.
 
     Args:
         dataset: a folder, name@data-1.2.0, or name for the newest at home.
@@ -44,7 +45,7 @@ def push(
             Hub rejects the card, or a repository that should be private is public.
         CorruptDatasetError: the dataset is incomplete or was altered.
         RecipeError: the notes have faults.
-        SharingError: the place denies access or cannot be reached.
+        SharingError: the place denies access or cannot be reached, or the version in it was altered.
 
     Example:
         >>> from astra_data import push
@@ -52,6 +53,11 @@ def push(
         'walks@data-1.0.0'
     """
     local = open_dataset(dataset)
+    if local.recorded is not None:
+        raise BadInputError(
+            f"{local.root} was recorded by LeRobot: make a dataset of it first, with `astra-data subset "
+            f"{local.root} --percent 100`"
+        )
     place = parse_place(destination)
     written = load_recipe(notes, Notes) if notes else Notes()
     if private and isinstance(place, Url):
@@ -81,9 +87,29 @@ def push(
 
 
 def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
+    """Compare a version that was shared with ours: its description, its sums, and its files."""
     found = there.description().get("content_hash")
     if found != local.content_hash:
         raise BadInputError(
             f"{there.name} holds other values: its content hash is {found}, not {local.content_hash}. "
             "Versions never change: give the dataset a new one, or push elsewhere."
         )
+    ours = parse_sums(make_sums(local.root), str(local.root))
+    listed = parse_sums(there.read_text(SUMS_PATH), there.name)
+    names = ours.keys() | listed.keys()
+    others = sorted(path for path in names if _digest(ours, path) != _digest(listed, path))
+    if others:
+        raise BadInputError(
+            f"{there.name} holds the same values, but {SUMS_PATH} there lists other files as "
+            f"{', '.join(others)}: it was altered, or pushed from another copy. Look at it and delete it "
+            "there, or push elsewhere."
+        )
+    if changed := there.altered(ours):
+        raise SharingError(
+            f"{there.name} was altered: {', '.join(changed)} there differ from {SUMS_PATH}. "
+            "Delete this version there and push again, or push elsewhere."
+        )
+
+
+def _digest(sums: Mapping[str, Listed], path: str) -> str | None:
+    return sums[path].digest if path in sums else None

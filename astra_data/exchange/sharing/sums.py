@@ -1,18 +1,36 @@
-"""SHA256SUMS: the files of a shared dataset and their checksums, in the format of `sha256sum`."""
+"""SHA256SUMS: the files of a shared dataset, their checksums and sizes, in the format of `sha256sum`.
+
+Sizes are in comments, which `sha256sum` skips: "# 1234 bytes  meta/info.json". Files of 0.1 have none.
+"""
 
 import re
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import SharingError
 
 SUMS_PATH = "SHA256SUMS"
 
-_PATH = re.compile(r"(data|meta)(/[A-Za-z0-9_][A-Za-z0-9._=-]*)+")
-"""Paths of the files of a dataset; none of them leads out of its folder."""
+_NUMBERED = r"chunk-[0-9]{3,}/file-[0-9]{3,}\.parquet"
+_PATH = re.compile(
+    rf"(data|meta/episodes)/{_NUMBERED}"
+    r"|meta/(info\.json|stats\.json|tasks\.parquet)"
+    r"|meta/astra/[a-z_]+\.(json|parquet|safetensors)"
+)
+"""Paths of the files of a dataset, by the names of the format; none of them leads out of its folder."""
 
 _LINE = re.compile(r"(?P<digest>[0-9a-f]{64}) [ *](?P<path>.+)")
+_SIZE = re.compile(r"# (?P<size>[0-9]{1,18}) bytes  (?P<path>.+)")
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A file as it should be: its sha256, and its size in bytes, None where it is not listed."""
+
+    digest: str
+    size: int | None = None
 
 
 def dataset_files(root: Path) -> list[str]:
@@ -23,32 +41,49 @@ def dataset_files(root: Path) -> list[str]:
 
 def make_sums(root: Path) -> str:
     """Return SHA256SUMS of the dataset in folder `root`."""
-    return "".join(f"{file_digest(root / path)}  {path}\n" for path in dataset_files(root))
+    files = {path: root / path for path in dataset_files(root)}
+    sums = [f"{file_digest(file)}  {path}\n" for path, file in files.items()]
+    return "".join(sums + [f"# {file.stat().st_size} bytes  {path}\n" for path, file in files.items()])
 
 
-def parse_sums(text: str, source: str) -> Mapping[str, str]:
-    """Read SHA256SUMS: file path to sha256.
+def parse_sums(text: str, source: str) -> dict[str, Listed]:
+    """Read SHA256SUMS: file path to what is listed of it.
 
     Raises:
-        SharingError: a line is malformed, or a path is not one of a dataset, such as one that leads out of
-            the folder; lists every fault.
+        SharingError: a line is malformed, or a path is not one of a dataset, such as a script or one that
+            leads out of the folder; lists every fault.
     """
-    sums: dict[str, str] = {}
+    sums: dict[str, Listed] = {}
+    sizes: dict[str, int] = {}
     faults = []
     for number, line in enumerate(text.splitlines(), start=1):
-        found = _LINE.fullmatch(line)
-        if not found:
+        if found := _SIZE.fullmatch(line):
+            sizes[found["path"]] = int(found["size"])
+        elif not (found := _LINE.fullmatch(line)):
             faults.append(f"line {number} is not a sha256 with a path")
         elif not _PATH.fullmatch(found["path"]):
-            faults.append(f"line {number} has the path {found['path']!r}, expected one within data/ or meta/")
+            faults.append(
+                f"line {number} has the path {found['path']!r}, expected one of a dataset's files, "
+                "within data/ or meta/"
+            )
         elif found["path"] in sums:
             faults.append(f"line {number} lists {found['path']} again")
         else:
-            sums[found["path"]] = found["digest"]
-    folders = {parent.as_posix() for path in sums for parent in PurePosixPath(path).parents}
-    faults += [f"{path} is listed as a file and as a folder" for path in sums if path in folders]
+            sums[found["path"]] = Listed(found["digest"])
+    faults += [f"the size of {path} is listed without its sha256" for path in sizes.keys() - sums.keys()]
     if faults:
         raise SharingError(
             f"{source}: {SUMS_PATH} cannot be trusted: {'; '.join(faults)}. Nothing was downloaded."
         )
-    return sums
+    return {path: replace(listed, size=sizes.get(path)) for path, listed in sums.items()}
+
+
+def altered(root: Path, sums: Mapping[str, Listed]) -> list[str]:
+    """Return which files of `sums` are missing from folder `root` or differ, by size or else by sha256."""
+    return [path for path, listed in sums.items() if not _is_whole(root / path, listed)]
+
+
+def _is_whole(file: Path, listed: Listed) -> bool:
+    if not file.is_file() or listed.size not in (None, file.stat().st_size):
+        return False
+    return file_digest(file) == listed.digest

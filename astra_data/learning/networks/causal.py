@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import elu
 
-from astra_data.core.config import Config, Count, NotNegative, Positive, Share
+from astra_data.core.config import AtOnce, Config, Count, NotNegative, Positive, Share
 
 
 class CausalConfig(Config):
@@ -16,7 +16,7 @@ class CausalConfig(Config):
 
     updates: Count = 1000
     """Gradient updates per fit."""
-    batch_size: Count = 128
+    batch_size: AtOnce = 128
     """Samples per update."""
     learning_rate: Positive = 3e-3
     """Learning rate of the networks."""

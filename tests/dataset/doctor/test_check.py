@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter, drop, edit, truncate, write
+from damaged import DATA, EPISODES, alter, as_in_0_1, drop, edit, truncate, write
 from fake_dataset import fake_columns, write_fake, writer
 
 from astra_data.core.errors import BadInputError
@@ -73,7 +73,7 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
         (truncate("meta/info.json"), ["meta/info.json is no JSON object"]),
         (write("data/chunk-000/left.tmp", b""), ["data/chunk-000/left.tmp does not belong to it"]),
         (edit("meta/astra/subsets.json", uids=[13, 4]), ["not in the order of their seed"]),
-        (edit("meta/astra/dataset.json", content_hash="0"), ["the content hash is", "expected 0"]),
+        (edit("meta/astra/dataset.json", content_hash="0"), ["meta/astra/dataset.json was altered"]),
         (
             edit("meta/info.json", total_frames=1, total_episodes=2, total_tasks=3, codebase_version="v2.1"),
             [
@@ -103,6 +103,39 @@ def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts
     faults = "\n".join(check(root).faults)
     for part in parts:
         assert part in faults
+
+
+@pytest.mark.parametrize(
+    ("damage", "faults"),
+    [
+        (
+            alter(DATA, "next.reward", 25, 9.0),
+            f"next.reward: other values than were written in {DATA} rows 20 to 49 (episode 3)",
+        ),
+        (
+            alter("meta/astra/episodes.parquet", "success", 1, True),
+            "meta/astra/episodes.parquet was altered after it was written, or is missing",
+        ),
+        (
+            alter("meta/astra/digests.parquet", "action", 1, 5),
+            "meta/astra/digests.parquet was altered after it was written, or is missing",
+        ),
+    ],
+)
+def test_what_was_altered_is_named(tmp_path: Path, damage: Callable[[Path], object], faults: str) -> None:
+    root = write_fake(tmp_path / "set").root
+    damage(root)
+    assert faults in check(root).faults
+    # Nothing else is named so.
+    assert sum("other values" in fault or "was altered" in fault for fault in check(root).faults) == 1
+
+
+def test_a_dataset_of_version_0_1_is_whole_too(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    as_in_0_1(root)
+    report = check(root)
+    assert report.faults == []
+    assert report.notes == ["it was written without digests, which tell what values were altered"]
 
 
 def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
@@ -173,6 +206,7 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
 
 def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
+    as_in_0_1(root)
     table = pq.read_table(root / DATA)
     at = table.column_names.index("next.reward")
     wide = table.column("next.reward").cast(pa.float64())

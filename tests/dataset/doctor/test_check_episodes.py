@@ -8,15 +8,17 @@ from damaged import DATA, EPISODES, alter, drop
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.dataset import Dataset
+from astra_data.dataset.digests import Digests
 from astra_data.dataset.doctor.check_episodes import ESTIMATED, EXACT, EpisodeChecks, is_close
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.plain import plain_columns
+from astra_data.dataset.values import measure
 
 
-def checked(root: Path, is_ours: bool = True) -> tuple[EpisodeChecks, Report]:
+def checked(root: Path, is_ours: bool = True, digests: Digests | None = None) -> tuple[EpisodeChecks, Report]:
     info = json.loads((root / "meta/info.json").read_text())
     report = Report()
-    checks = EpisodeChecks(root, info, plain_columns(info["features"])[0], is_ours, report)
+    checks = EpisodeChecks(root, info, plain_columns(info["features"])[0], digests or {}, is_ours, report)
     checks.run()
     checks.totals()
     return checks, report
@@ -98,3 +100,13 @@ def test_rows_and_episodes_without_each_other_are_found(root: Path, tmp_path: Pa
 )
 def test_statistics_are_close(stored: object, expected: list[float], tolerance: float, close: bool) -> None:
     assert is_close(stored, np.array(expected), tolerance) is close
+
+
+def test_values_are_compared_with_digests(root: Path) -> None:
+    _, digests = measure(Dataset.open(root))
+    assert checked(root, digests=digests)[1].faults == []
+    alter(DATA, "mode", 20, 3)(root)
+    _, report = checked(root, digests={"mode": digests["mode"]})
+    assert f"mode: other values than were written in {DATA} rows 20 to 49 (episode 3)" in report.faults
+    _, report = checked(root, digests={"action": digests["action"]})
+    assert not [fault for fault in report.faults if "other values" in fault]

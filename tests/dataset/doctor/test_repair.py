@@ -11,14 +11,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter_rows
+from damaged import DATA, EPISODES, alter_rows, as_in_0_1, edit
 from fake_dataset import fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
-from astra_data.dataset.format import DATASET_PATH, POLICY_PATH
+from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, METADATA_PATH, POLICY_PATH, SUBSETS_PATH
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +121,7 @@ def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
 
 def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
+    as_in_0_1(root)
     alter_rows(root / DATA, "episode_uid", dict.fromkeys(range(8, 20), 4))
     repaired = repair(root, out=tmp_path / "saved")
     assert "left out episode 2: its uid 4 is taken or negative" in repaired.notes
@@ -129,6 +130,7 @@ def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
 
 def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
+    as_in_0_1(root)
     alter_rows(root / DATA, "frame_index", {9: 7})
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.episodes == 2
@@ -265,8 +267,51 @@ def test_what_cannot_be_repaired_is_told_and_nothing_is_written(tmp_path: Path) 
 
 def test_an_altered_value_is_told_though_it_cannot_be_found(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
-    path = root / DATASET_PATH
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"content_hash": "0" * 64}))
+    as_in_0_1(root)
+    edit(DATASET_PATH, content_hash="0" * 64)(root)
     result = repair(root, out=tmp_path / "out")
     assert [note for note in result.notes if "a value was altered after it was written" in note]
     assert Dataset.open(tmp_path / "out").description["repaired"] == result.notes
+
+
+def test_episodes_with_other_values_than_were_written_are_left_out(tmp_path: Path) -> None:
+    whole = write_fake(tmp_path / "set", subset_seed=7)
+    alter_rows(whole.root / DATA, "next.reward", {25: 9.0})
+    alter_rows(whole.root / DATA, "frame_index", {9: 7})  # a wrong structure costs no later episode either
+    repaired = repair(whole.root, out=tmp_path / "saved")
+    [second, third, lost] = repaired.notes
+    assert "left out episode 2: frame_index is 7" in second
+    assert third == (
+        f"left out episode 3: next.reward: other values than were written in {DATA} rows 20 to 49 (episode 3)"
+    )
+    assert lost == "2 of the 5 episodes that meta/info.json counts are lost"
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.description["repaired"] == repaired.notes
+    kept = [episode for number, episode in enumerate(fake_episodes()) if number not in (2, 3)]
+    for found, expected in zip(saved.episodes(), kept, strict=True):
+        assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
+        for name, values in expected.columns.items():
+            np.testing.assert_array_equal(found.columns[name], values)
+
+
+def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set", subset_seed=7).root
+    alter_rows(root / METADATA_PATH, "success", {1: True})
+    uids = json.loads((root / SUBSETS_PATH).read_text())["uids"]
+    edit(SUBSETS_PATH, uids=uids[::-1])(root)
+    repaired = repair(root, out=tmp_path / "saved")
+    assert repaired.notes == [
+        f"{METADATA_PATH} was altered after it was written: "
+        "success, return and the like of the episodes are lost",
+        f"{SUBSETS_PATH} was altered after it was written: the order of the subsets is that of seed 0",
+    ]
+    saved = Dataset.open(tmp_path / "saved")
+    assert (saved.metadata, saved.subset_seed) == ({}, 0)
+
+
+def test_values_are_saved_also_without_the_digests(tmp_path: Path) -> None:
+    whole = write_fake(tmp_path / "set")
+    alter_rows(whole.root / DIGESTS_PATH, "action", {0: 1})
+    [note] = repair(whole.root, out=tmp_path / "saved").notes
+    assert note.startswith(f"{DIGESTS_PATH} was altered: the values were compared with the content hash only")
+    assert Dataset.open(tmp_path / "saved").content_hash == whole.content_hash

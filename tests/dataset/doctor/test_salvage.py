@@ -8,20 +8,22 @@ from damaged import DATA, EPISODES, alter, drop
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.dataset.columns import STATE
+from astra_data.dataset.digests import Digests
 from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.plain import plain_columns, read_object
+from astra_data.dataset.values import measure
 
 UIDS = [episode.uid for episode in fake_episodes()]
 
 
-def salvaged(root: Path) -> tuple[list[int], list[str]]:
+def salvaged(root: Path, digests: Digests | None = None) -> tuple[list[int], list[str]]:
     """Return the uids of the intact episodes, whose states are compared, and the notes."""
     info = read_object(root / "meta/info.json")
     assert not isinstance(info, str)
     notes: list[str] = []
     states = {episode.uid: episode.columns[STATE] for episode in fake_episodes()}
     uids = []
-    for uid, run in whole_runs(root, plain_columns(info["features"])[0], 20, notes):
+    for uid, run in whole_runs(root, plain_columns(info["features"])[0], digests or {}, 20, notes):
         np.testing.assert_array_equal(run.columns[STATE], states[uid])
         uids.append(uid)
     return uids, notes
@@ -74,3 +76,17 @@ def test_an_episode_that_may_be_incomplete_is_left_out(tmp_path: Path) -> None:
     uids, notes = salvaged(root)
     assert uids == UIDS[:4]
     assert notes[-1] == "the last 5 frames in file-000.parquet may be part of an episode and were left out"
+
+
+@pytest.mark.parametrize(
+    "damage", [alter(DATA, "index", 9, 70), alter(DATA, "action", 9, [0.5, 0]), alter(DATA, "mode", 19, 3)]
+)
+def test_with_digests_an_altered_episode_costs_no_other(
+    tmp_path: Path, damage: Callable[[Path], object]
+) -> None:
+    dataset = write_fake(tmp_path / "set")
+    _, digests = measure(dataset)
+    damage(dataset.root)
+    uids, [note] = salvaged(dataset.root, digests)
+    assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
+    assert f"other values than were written in {DATA} rows 8 to 19 (episode 2)" in note

@@ -2,10 +2,9 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
 
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, TERMINATED, Episode
+from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, TERMINATED
 from astra_data.exchange.exporters import export
 
 
@@ -27,14 +26,3 @@ def test_d3rlpy_has_arrays_per_episode(dataset: Dataset, tmp_path: Path) -> None
             np.testing.assert_array_equal(file[f"actions_{number}"][()], values[ACTION])
             np.testing.assert_array_equal(file[f"rewards_{number}"][()], values[REWARD][:, None])
             assert file[f"terminated_{number}"][()] == values[TERMINATED][-1]
-
-
-def test_d3rlpy_is_told_how_the_last_step_ends(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    columns = next(dataset.episodes()).columns
-    inner = Episode(1, {**columns, TERMINATED: np.arange(len(columns[TERMINATED])) == 1})
-    monkeypatch.setattr(Dataset, "episodes", lambda *_: iter([inner]))
-    export(dataset, tmp_path / "set.h5", format="d3rlpy")
-    with h5py.File(tmp_path / "set.h5") as file:
-        assert not file["terminated_0"][()]

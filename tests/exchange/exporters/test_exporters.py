@@ -1,32 +1,152 @@
 """What all exporters have in common."""
 
+import json
+import os
+import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
+import full_disk
+import h5py
 import numpy as np
 import pytest
-from fake_dataset import write_fake
+from fake_dataset import COLUMNS, fake_columns, write_fake, writer
+from fake_transitions import NEXT, write_transitions
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import ACTION, REWARD, TERMINATED, TRUNCATED
+from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, Array, Episode
+from astra_data.exchange.export_record import Sums
 from astra_data.exchange.exporters import EXPORTERS, export
 from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.layouts import RECORD
+
+REWARDS = """
+name = "a"
+task = "a"
+fps = 1
+columns.a.fields = ["rewards"]
+"""
+FILES = {"d3rlpy": "set.h5", "d4rl": "set.hdf5", "minari": "set-v0", "robomimic": "set.hdf5"}
 
 
-@pytest.mark.parametrize("format", ["d4rl", "robomimic"])
-def test_the_way_there_and_back_keeps_how_episodes_end(dataset: Dataset, tmp_path: Path, format: str) -> None:
-    export(dataset, tmp_path / "set.hdf5", format=format)
-    report = import_dataset([tmp_path / "set.hdf5"], out=tmp_path / "back", name="back", fps=10)
-    names = [ACTION, REWARD, TERMINATED, TRUNCATED]
-    back, expected = Dataset.open(report.root), dataset.columns(names)
-    assert back.lengths.tolist() == dataset.lengths.tolist()
-    assert expected[TERMINATED].any()
-    assert expected[TRUNCATED].any()
-    for name, values in back.columns(names).items():
-        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+@pytest.mark.parametrize("format", sorted(EXPORTERS))
+@pytest.mark.parametrize("has_goal", [True, False])
+def test_all_that_went_in_comes_back(tmp_path: Path, format: str, has_goal: bool) -> None:
+    dataset = write_transitions(tmp_path / "set", has_goal=has_goal)
+    export(dataset, tmp_path / FILES[format], format=format)
+    report = import_dataset([tmp_path / FILES[format]], out=tmp_path / "back")
+    back = Dataset.open(report.root)
+    assert (report.episodes, report.frames) == (len(dataset), int(dataset.lengths.sum()))
+    assert back.schema == dataset.schema
+    assert back.uids.tolist() == dataset.uids.tolist()
+    assert back.metadata == dataset.metadata
+    assert (back.task, back.info["fps"], back.order) == (dataset.task, dataset.info["fps"], dataset.order)
+    for found, expected in zip(back.episodes(), dataset.episodes(), strict=True):
+        for name, values in expected.columns.items():
+            np.testing.assert_array_equal(found.columns[name], values, err_msg=name)
+    # The hash is of every value, LeRobot's own columns included.
+    assert back.content_hash == dataset.content_hash
+    assert back.reference == "fake@data-1.0.1"
+    assert back.description["parents"] == [dataset.identity]
+    assert back.description["environment"] == dataset.description["environment"]
+
+
+@pytest.mark.parametrize("format", sorted(EXPORTERS))
+def test_a_value_that_differs_is_never_shown(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
+) -> None:
+    update = Sums.update
+
+    def altered(self: Sums, columns: Mapping[str, Array]) -> None:
+        update(self, columns)
+        if columns[REWARD].any():
+            columns[REWARD][0] = 0.25
+
+    monkeypatch.setattr(Sums, "update", altered)
+    with pytest.raises(CorruptDatasetError, match=r"was not written: .*next\.reward differs from what"):
+        export(dataset, tmp_path / FILES[format], format=format)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "mapping", [None, 'name = "a"\ntask = "a"\nfps = 1\n[columns.a]\nfields = ["rewards"]']
+)
+def test_an_altered_export_is_not_imported(dataset: Dataset, tmp_path: Path, mapping: str | None) -> None:
+    file = None
+    if mapping:
+        file = tmp_path / "mapping.toml"
+        file.write_text(mapping)
+    export(dataset, tmp_path / "set.hdf5", format="d4rl")
+    with h5py.File(tmp_path / "set.hdf5", "r+") as opened:
+        opened["next_observations"][20] = 0
+    with pytest.raises(CorruptDatasetError, match=r"incomplete: next\.observation\.state differs"):
+        import_dataset([tmp_path / "set.hdf5"], file, out=tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
+def test_an_altered_record_is_told(dataset: Dataset, tmp_path: Path) -> None:
+    export(dataset, tmp_path / "set.hdf5", format="d4rl")
+    with h5py.File(tmp_path / "set.hdf5", "r+") as opened:
+        record = json.loads(opened[RECORD][()])
+        del opened[RECORD]
+        opened[RECORD] = json.dumps(record | {"lengths": [7, -1], "uids": "none"})
+    with pytest.raises(CorruptDatasetError, match=r"record of the export is malformed \(uids .*; lengths"):
+        import_dataset([tmp_path / "set.hdf5"], out=tmp_path / "back")
+
+
+def test_rows_that_are_missing_are_told(dataset: Dataset, tmp_path: Path) -> None:
+    export(dataset, tmp_path / "set.hdf5", format="robomimic")
+    with h5py.File(tmp_path / "set.hdf5", "r+") as opened:
+        del opened["data/demo_4"]
+    with pytest.raises(CorruptDatasetError, match="altered or is incomplete: "):
+        import_dataset([tmp_path / "set.hdf5"], out=tmp_path / "back")
+
+
+def test_exports_are_imported_one_by_one(dataset: Dataset, tmp_path: Path) -> None:
+    paths = [tmp_path / "one.hdf5", tmp_path / "two.hdf5"]
+    for path in paths:
+        export(dataset, path, format="d4rl")
+    with pytest.raises(BadInputError, match="import each on its own, then merge"):
+        import_dataset(paths, out=tmp_path / "back")
+
+
+@pytest.mark.parametrize("format", sorted(EXPORTERS))
+def test_without_rewards_zeros_are_written_aloud_and_do_not_come_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, format: str
+) -> None:
+    columns = [column for column in COLUMNS if column.name != REWARD]
+    with writer(tmp_path / "set", columns=[*columns, NEXT]) as open_writer:
+        values = fake_columns(4, seed=1)
+        del values[REWARD]
+        state = values[STATE]
+        open_writer.add(Episode(1, values | {NEXT_STATE: np.concatenate([state[1:], state[:1]])}))
+    dataset = Dataset.open(tmp_path / "set")
+    export(dataset, tmp_path / FILES[format], format=format)
+    assert caplog.messages == ["fake@data-1.0.0 has no next.reward: rewards are written as 0"]
+    import_dataset([tmp_path / FILES[format]], out=tmp_path / "back")
+    assert Dataset.open(tmp_path / "back").content_hash == dataset.content_hash
+
+
+def test_a_full_disk_leaves_one_line_and_nothing_else(dataset: Dataset, tmp_path: Path) -> None:
+    cases = []
+    for format, name in FILES.items():
+        whole = tmp_path / "whole" / format / name
+        export(dataset, whole, format=format)
+        size = (whole / "data/main_data.hdf5" if whole.is_dir() else whole).stat().st_size
+        cases += [(format, name, int(size * share)) for share in (0, 0.5, 0.97)]
+    command = [sys.executable, full_disk.__file__, str(dataset.root), str(tmp_path), json.dumps(cases)]
+    settings = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # it forks
+    done = subprocess.run(command, env=settings, capture_output=True, text=True, check=True)
+    results = json.loads(done.stdout)
+    assert len(results) == len(cases) == 12
+    for number, (status, line) in enumerate(results):
+        assert (status, line.count("\n")) == (1, 1), (cases[number], line)
+        assert "cannot be written: File too large" in line
+        assert list((tmp_path / str(number)).iterdir()) == []
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))

@@ -102,6 +102,37 @@ def test_robomimic_needs_no_mapping(tmp_path: Path) -> None:
         assert episode.metadata["source"] == f"lift.hdf5/data/{demo}"
 
 
+def test_d3rlpy_needs_no_mapping(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    episodes: list[dict[str, Array]] = []
+    # As its `ReplayBuffer.dump` writes them; two digits, to see the order.
+    with h5py.File(tmp_path / "hopper.h5", "w") as file:
+        for number, length in enumerate([4, 3, *[2] * 9]):
+            episode = {
+                "observations": rng.normal(size=(length, 3)).astype(np.float32),
+                "actions": rng.normal(size=(length, 2)).astype(np.float32),
+                "rewards": rng.normal(size=(length, 1)).astype(np.float32),
+            }
+            for key, values in episode.items():
+                file.create_dataset(f"{key}_{number}", data=values)
+            file.create_dataset(f"terminated_{number}", data=number == 1)
+            episodes.append(episode)
+        file.create_dataset("columns", data=[*episodes[0], "terminated"])
+        file.create_dataset("num_episodes", data=len(episodes))
+        file.create_dataset("version", data="2.1")
+    dataset, report = imported(tmp_path, tmp_path / "hopper.h5", None, name="hopper", fps=20)
+    assert dataset.lengths.tolist() == [3, 3, *[1] * 9]
+    assert report.tally.split_points == {"source": 10}
+    for number, (found, episode) in enumerate(zip(dataset.episodes(), episodes, strict=True)):
+        state, steps = episode["observations"], len(found)
+        np.testing.assert_array_equal(found.columns[STATE], state[:steps])
+        np.testing.assert_array_equal(found.columns[NEXT_STATE][: len(state) - 1], state[1:])
+        np.testing.assert_array_equal(found.columns[ACTION], episode["actions"][:steps])
+        np.testing.assert_array_equal(found.columns[REWARD], episode["rewards"][:steps, 0])
+        is_last = np.arange(steps) == steps - 1
+        np.testing.assert_array_equal(found.columns[TERMINATED], is_last & (number == 1))
+
+
 def test_other_layouts_need_a_mapping(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "log.h5", "w") as file:
         file["x"] = np.zeros(3)
@@ -196,4 +227,27 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     path = write_table(tmp_path / "log.h5", rows())
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(BadInputError, match=r'h5py .*not installed: .* pip install "astra-data\[hdf5\]"'):
+        imported(tmp_path, path)
+
+
+def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        for field in rows():
+            file.create_dataset(field, data=np.zeros(10**5), compression="gzip")
+    with pytest.raises(BadInputError, match=r"log.h5 holds values of 5600000 bytes or more.*--max-bytes"):
+        imported(tmp_path, path)
+
+
+def test_a_chunk_far_larger_than_its_rows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    path = write_table(tmp_path / "log.h5", rows())
+    with h5py.File(path, "a") as file:
+        values = file["x"][:]
+        del file["x"]
+        file.create_dataset("x", data=values, chunks=(2**22,), maxshape=(None,), compression="gzip")
+    with pytest.raises(BadInputError, match=r"holds values of 33\d+ bytes or more"):
         imported(tmp_path, path)

@@ -50,6 +50,13 @@ def test_time_far_apart_costs_nothing(tmp_path: Path) -> None:
     assert dataset.lengths.tolist() == [5, 2]
 
 
+def test_a_message_in_the_far_future_is_not_waited_for(tmp_path: Path) -> None:
+    messages = [pose(0.0, 1), command(0.0, 1), pose(1.8e10, 2), command(1.8e10, 2)]
+    mapping = MAPPING.replace("gap_s = 0.35", "gap_s = 1e10")
+    with pytest.raises(BadInputError, match=r"log\.mcap: .* 100000000000 equal rows, .*split\.gap_s"):
+        imported(tmp_path, write_json(tmp_path / "log.mcap", messages), mapping)
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -1,6 +1,8 @@
+import os
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from minari_recordings import LENGTHS, episodes, write_minari
@@ -66,4 +68,28 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     path = write_minari(tmp_path / "minari", episodes(is_dict=False))
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(BadInputError, match=r'pip install "astra-data\[minari\]"'):
+        imported(tmp_path, path, None, name="ant", fps=10)
+
+
+@pytest.mark.parametrize("link", [h5py.ExternalLink("secret.h5", "/"), h5py.SoftLink("/episode_1")])
+def test_files_with_links_are_refused(tmp_path: Path, link: object) -> None:
+    path = write_minari(tmp_path / "minari", episodes(is_dict=True))
+    with h5py.File(path / "data/main_data.hdf5", "a") as file:
+        del file["episode_0"]
+        file["episode_0"] = link
+    with pytest.raises(BadInputError, match="test-v1: episode_0: expected no links"):
+        imported(tmp_path, path, None, name="ant", fps=10)
+
+
+def test_a_dataset_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path: Path) -> None:
+    path = write_minari(tmp_path / "minari", episodes(is_dict=True))
+    with pytest.raises(BadInputError, match=r"test-v1 holds values of \d+ bytes or more.*--max-bytes"):
+        imported(tmp_path, path, None, name="ant", fps=10, max_bytes=100)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    path = write_minari(tmp_path / "minari", episodes(is_dict=True))
+    (path / "data/main_data.hdf5").unlink()
+    os.mkfifo(path / "data/main_data.hdf5")
+    with pytest.raises(BadInputError, match="is a device or a pipe"):
         imported(tmp_path, path, None, name="ant", fps=10)

@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -7,6 +9,7 @@ from recordings import imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.importers import npz
+from astra_data.exchange.importing import import_dataset
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Source
 
@@ -47,3 +50,53 @@ def test_blocks_hold_consecutive_rows_of_every_array(tmp_path: Path, monkeypatch
         read = np.concatenate([block.values[name] for block in blocks])
         np.testing.assert_array_equal(read, values)
         assert read.dtype == values.dtype
+
+
+def bomb(path: Path, rows: int) -> Path:
+    """Write zeros, which are compressed to a thousandth."""
+    fields = {name: np.zeros(rows) for name in ("x", "y", "command")}
+    np.savez_compressed(path, **fields)  # type: ignore[arg-type]
+    return path
+
+
+BOMB_MAPPING = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["x", "y"]
+[columns.action]
+fields = ["command"]
+"""
+
+
+def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    path = bomb(tmp_path / "log.npz", 10**5)
+    with pytest.raises(BadInputError, match=r"holds values of 2400384 bytes or more, .* --max-bytes"):
+        imported(tmp_path, path, BOMB_MAPPING)
+    (tmp_path / "mapping.toml").write_text(BOMB_MAPPING)
+    report = import_dataset([path], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=2_400_384)
+    assert report.frames == 10**5 - 1
+
+
+def test_a_claimed_shape_costs_no_memory(tmp_path: Path) -> None:
+    """Of 2^60 rows and a header of 4 GB, neither of which the file holds."""
+    header = np.lib.format.magic(2, 0)  # type: ignore[no-untyped-call]
+    with ZipFile(tmp_path / "log.npz", "w") as archive:
+        for name in ("x", "y"):
+            text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**60},)}}\n".encode()
+            archive.writestr(f"{name}.npy", header + len(text).to_bytes(4, "little") + text + b"\0" * 8)
+        archive.writestr("command.npy", header + (2**32 - 1).to_bytes(4, "little"))
+    script = (
+        "import resource, sys; from pathlib import Path;"
+        "from astra_data.core.errors import BadInputError;"
+        "from astra_data.exchange.importing import import_dataset;"
+        "resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32));"
+        "import_dataset([Path('log.npz')], Path('mapping.toml'), out=Path('out'))"
+    )
+    (tmp_path / "mapping.toml").write_text(BOMB_MAPPING)
+    ended = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert "BadInputError: log.npz cannot be read as npz" in ended.stderr.splitlines()[-1]

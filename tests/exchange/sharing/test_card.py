@@ -7,7 +7,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
 from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.errors import DiskError, RecipeError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.exchange.sharing.card import render_card, write_card
@@ -96,5 +96,6 @@ def test_notes_with_faults_are_told(tmp_path: Path) -> None:
 
 
 def test_a_card_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="cannot be written"):
+    (tmp_path / "none").touch()
+    with pytest.raises(DiskError, match=r"it\.md cannot be written"):
         write_card(fake, tmp_path / "none/it.md", Notes())

@@ -88,6 +88,16 @@ def test_a_version_there_never_changes(hub: Hub, fake: Dataset, tmp_path: Path) 
     assert (repo.tags, repo.history) == before
 
 
+def test_an_altered_file_there_is_told_without_a_download(hub: Hub, fake: Dataset) -> None:
+    push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    files = repo.commits[repo.head]
+    files[DATA] = files[DATA][:-1] + b"?"
+    with pytest.raises(SharingError, match=f"was altered: {DATA} there differ"):
+        push(fake.root, "me/it")
+    assert not [asked for asked in hub.ranges if DATA in asked]
+
+
 def test_a_push_that_stopped_is_finished_by_the_next(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
     hub.refuse = lambda method, path: 500 if "/tag/" in path else None
     with pytest.raises(SharingError, match="it answered 500"):

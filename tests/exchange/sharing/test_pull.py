@@ -12,7 +12,7 @@ import pytest
 from fake_dataset import write_fake
 from shared_files import contents
 
-from astra_data.core.errors import BadInputError, SharingError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, SharingError
 from astra_data.dataset import Dataset
 from astra_data.exchange.sharing import fetch
 from astra_data.exchange.sharing.pull import pull
@@ -59,9 +59,9 @@ def test_a_pull_goes_on_where_it_stopped(
     fetched: list[tuple[str, int]] = []
     append = fetch._append
 
-    def watched(remote: object, path: str, part: Path) -> None:
+    def watched(remote: object, path: str, part: Path, most: int) -> None:
         before = part.stat().st_size if part.exists() else 0
-        append(remote, path, part)  # type: ignore[arg-type]
+        append(remote, path, part, most)  # type: ignore[arg-type]
         fetched.append((path, part.stat().st_size - before))
 
     monkeypatch.setattr(fetch, "_append", watched)
@@ -102,6 +102,80 @@ def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_pa
     for out in (tmp_path / "other", tmp_path, tmp_path / "file"):
         with pytest.raises(BadInputError, match="exists already and holds something else"):
             pull(source(shared), out=out)
+
+
+def test_a_copy_that_was_altered_is_told(fake: Dataset, shared: Path, tmp_path: Path) -> None:
+    copy = pull(source(shared), out=tmp_path / "out").root
+    for path in (DATA, "meta/stats.json"):
+        whole = (copy / path).read_bytes()
+        # A changed byte, and a file that is shorter: of a data file, it can then not even be opened.
+        for content in (bytes([whole[100] ^ 1]).join([whole[:100], whole[101:]]), whole[:-20]):
+            (copy / path).write_bytes(content)
+            with pytest.raises(CorruptDatasetError, match=r"was altered: .*Delete it, or pull to another"):
+                pull(source(shared), out=copy)
+        (copy / path).write_bytes(whole)
+    notes: list[str] = []
+    pull(source(shared), out=copy, progress=lambda fraction, note: notes.append(note))
+    assert notes == [f"it is there already, and whole: {len(contents(fake.root))} files were compared"]
+
+
+def test_a_file_that_is_no_part_of_the_format_fetches_nothing(shared: Path, tmp_path: Path) -> None:
+    (shared / "data/evil.sh").write_text("echo evil")
+    digest = hashlib.sha256(b"echo evil").hexdigest()
+    with (shared / "SHA256SUMS").open("a") as sums:
+        sums.write(f"{digest}  data/evil.sh\n")
+    with pytest.raises(SharingError, match=r"data/evil\.sh', expected one of a dataset's files"):
+        pull(source(shared), out=tmp_path / "out")
+    assert not hidden(tmp_path / "out")
+
+
+@pytest.mark.parametrize("path", [DATA, "SHA256SUMS", "meta/astra/dataset.json"])
+@pytest.mark.parametrize("target", ["/dev/zero", "pipe", "copy"])
+def test_links_devices_and_pipes_are_not_read(path: str, target: str, shared: Path, tmp_path: Path) -> None:
+    (shared / path).rename(tmp_path / "copy")
+    if target == "pipe":
+        os.mkfifo(shared / path)
+    else:
+        (shared / path).symlink_to(tmp_path / target)
+    with pytest.raises(SharingError, match=f"{path} is a link, a device or a pipe"):
+        pull(source(shared), out=tmp_path / "out")
+    assert not hidden(tmp_path / "out")
+
+
+def test_a_folder_that_is_a_link_is_not_read(shared: Path, tmp_path: Path) -> None:
+    (shared / "data").rename(tmp_path / "data")
+    (shared / "data").symlink_to(tmp_path / "data")
+    with pytest.raises(SharingError, match="data is a link"):
+        pull(source(shared), out=tmp_path / "out")
+
+
+def test_more_bytes_than_asked_for_are_refused_before_anything_is_fetched(
+    shared: Path, tmp_path: Path
+) -> None:
+    size = sum(len(content) for path, content in contents(shared).items() if "README" not in path)
+    size -= (shared / "SHA256SUMS").stat().st_size
+    with pytest.raises(SharingError, match=rf"has {size} bytes, of which at most {size - 1} .*--max-bytes"):
+        pull(source(shared), out=tmp_path / "out", max_bytes=size - 1)
+    assert not hidden(tmp_path / "out")
+    pull(source(shared), out=tmp_path / "out", max_bytes=size)
+
+
+def test_a_file_that_grew_is_refused_before_anything_is_fetched(shared: Path, tmp_path: Path) -> None:
+    with (shared / DATA).open("ab") as file:
+        file.truncate(2**40)
+    with pytest.raises(SharingError, match=f"was altered: {DATA} has {2**40} bytes"):
+        pull(source(shared), out=tmp_path / "out")
+    assert not hidden(tmp_path / "out")
+
+
+def test_a_link_planted_in_the_unfinished_folder_is_refused(shared: Path, tmp_path: Path) -> None:
+    (tmp_path / "prey").write_text("prey")
+    folder = tmp_path / ".out.pull-1.0.0/data/chunk-000"
+    folder.mkdir(parents=True)
+    (folder / "file-000.parquet.part").symlink_to(tmp_path / "prey")
+    with pytest.raises(SharingError, match=r"file-000\.parquet\.part is a link"):
+        pull(source(shared), out=tmp_path / "out")
+    assert (tmp_path / "prey").read_text() == "prey"
 
 
 def test_two_pulls_of_one_dataset_do_not_mix(shared: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from fake_dataset import write_fake
 from shared_files import contents
 
-from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError, SharingError
 from astra_data.dataset import Dataset
 from astra_data.exchange.sharing.push import push
 
@@ -56,6 +56,27 @@ def test_altered_values_are_not_pushed(tmp_path: Path) -> None:
     description = json.loads((dataset.root / "meta/astra/dataset.json").read_text())
     text = json.dumps(description | {"content_hash": "0" * 64})
     (dataset.root / "meta/astra/dataset.json").write_text(text)
-    with pytest.raises(CorruptDatasetError, match="was altered: the content hash is"):
+    with pytest.raises(CorruptDatasetError, match=r"dataset\.json was altered"):
         push(dataset.root, f"file://{tmp_path}/shared")
     assert not (tmp_path / "shared").exists()
+
+
+def test_an_altered_remote_is_told(fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, f"file://{tmp_path}/shared")
+    shared = tmp_path / "shared/fake/data-1.0.0"
+    path = shared / "data/chunk-000/file-000.parquet"
+    whole = path.read_bytes()
+    for content in (whole[:-1] + b"?", whole + b"?", None):
+        path.unlink()
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(SharingError, match=r"was altered: data/.*Delete this version there"):
+            push(fake.root, f"file://{tmp_path}/shared")
+        path.write_bytes(whole)
+    sums = (shared / "SHA256SUMS").read_text()
+    (shared / "SHA256SUMS").write_text(sums.replace(sums[:64], "0" * 64))
+    with pytest.raises(BadInputError, match=r"SHA256SUMS there lists other files as data/"):
+        push(fake.root, f"file://{tmp_path}/shared")
+    # As 0.1 wrote them, without sizes.
+    (shared / "SHA256SUMS").write_text("".join(f"{line}\n" for line in sums.splitlines() if line[0] != "#"))
+    push(fake.root, f"file://{tmp_path}/shared")

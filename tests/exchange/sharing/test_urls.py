@@ -76,11 +76,21 @@ def test_what_is_pulled_is_what_was_pushed(place: str, fake: Dataset, home: Path
 def test_a_version_there_never_changes(place: str, fake: Dataset, tmp_path: Path) -> None:
     push(fake.root, place)
     filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/SHA256SUMS")
-    filesystem.pipe_file(path, b"not looked at")
     push(fake.root, place)
+    filesystem.pipe_file(path, b"altered")
+    with pytest.raises(SharingError, match=r"SHA256SUMS cannot be trusted"):
+        push(fake.root, place)
     with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
         push(changed(tmp_path / "changed").root, place)
-    assert filesystem.cat_file(path) == b"not looked at"
+    assert filesystem.cat_file(path) == b"altered"
+
+
+def test_a_file_that_was_altered_there_is_told_by_its_size(place: str, fake: Dataset) -> None:
+    push(fake.root, place)
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/meta/info.json")
+    filesystem.pipe_file(path, b"altered")
+    with pytest.raises(SharingError, match=r"was altered: meta/info\.json"):
+        push(fake.root, place)
 
 
 def test_the_newest_version_is_pulled_unless_another_is_named(

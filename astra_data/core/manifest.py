@@ -1,0 +1,81 @@
+"""The manifest of an artefact: its files with their sizes and sha256, and what it was made from.
+
+    {"files": {"policy.safetensors": {"bytes": 13948, "sha256": "…"}, …},
+     "made_from": {"dataset": "<content hash>", "grounding": "<sha256 of grounding.safetensors>"}}
+
+It is written into the working folder of an artefact, so that both appear at once. The settings are in one of
+the files. Datasets have none: their description says the same.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a finished artefact consists of.
+
+    Attributes:
+        files: path inside the folder → its size in bytes and its sha256.
+        made_from: what the artefact was made from → the digest of that.
+    """
+
+    files: Mapping[str, tuple[int, str]]
+    made_from: Mapping[str, str]
+
+    def faults(self, folder: Path, *, verify: bool) -> list[str]:
+        """Return what `folder` lost: by the sizes of its files, with `verify` by their sha256 too."""
+        found, faults = _files(folder), []
+        for name, (size, digest) in self.files.items():
+            if name not in found:
+                faults.append(f"{name} is missing")
+            elif (now := found[name].stat().st_size) != size:
+                faults.append(f"{name} has {now:,} bytes, expected {size:,}")
+            elif verify and file_digest(found[name]) != digest:
+                faults.append(f"{name} was altered")
+        return faults
+
+    def foreign(self, folder: Path) -> list[str]:
+        """Return the files in `folder` that are not of the artefact."""
+        return [name for name in _files(folder) if name not in self.files]
+
+
+def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
+    """Write the manifest of all that is in `folder` now, leaving out of `made_from` what is None."""
+    files = {
+        name: {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        for name, path in _files(folder).items()
+    }
+    digests = {name: digest for name, digest in made_from.items() if digest}
+    (folder / MANIFEST).write_text(json.dumps({"files": files, "made_from": digests}, indent=1))
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """Return the manifest of the artefact in `folder`; None where version 0.1 made it.
+
+    Raises:
+        BadInputError: it cannot be read.
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        return None
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        files = {name: (int(file["bytes"]), str(file["sha256"])) for name, file in content["files"].items()}
+        return Manifest(files, dict(content["made_from"]))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise BadInputError(f"{MANIFEST} cannot be read ({error})") from None
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    """Return the files in `folder`, by their paths inside it, without its manifest."""
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
+    return {name: path for name, path in files.items() if path.is_file() and name != MANIFEST}

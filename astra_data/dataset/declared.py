@@ -1,0 +1,59 @@
+"""What a LeRobot dataset of another tool declares: its columns of numbers, its rate, its name."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Column
+from astra_data.dataset.format import DEFAULT_COLUMNS, INFO_PATH
+from astra_data.dataset.plain import MOST_FPS, PlainColumn, plain_columns
+
+DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
+"""Ours, by the kind of the stored values."""
+
+
+def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
+    """Return from info.json the columns of numbers as stored, the ones of ours for their values, and the fps.
+
+    Raises:
+        CorruptDatasetError: it lacks LeRobot's own columns, or a whole number of frames per second.
+    """
+    features, fps = info.get("features"), info.get("fps")
+    columns = plain_columns(features)[0] if isinstance(features, dict) else []
+    missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
+    if missing or not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
+        raise CorruptDatasetError(
+            f"{folder}: {INFO_PATH} has fps {fps!r} and lacks the columns {', '.join(missing) or 'none'}; "
+            "expected a whole number of frames per second and all of LeRobot's own columns"
+        )
+    assert isinstance(features, dict)
+    specs = []
+    for column in columns:
+        if column.name in names.RESERVED:
+            continue
+        feature = features[column.name]
+        known = feature | {
+            "dtype": DTYPES[np.dtype(column.dtype).kind],
+            "names": _labels(feature.get("names"), column.size),
+        }
+        specs.append(Column.from_feature(column.name, known))
+    return columns, specs, int(fps)
+
+
+def name_of(folder: Path) -> str:
+    """Return a valid name of a dataset, from that of its folder."""
+    name = re.sub(r"[^A-Za-z0-9._-]+|^[^A-Za-z0-9]+", "-", folder.resolve().name)
+    return name.lstrip("-._") or "repaired"
+
+
+def _labels(labels: object, size: int) -> list[str] | None:
+    """Return a name per value, where `labels` has them: as a list, or a list within an object."""
+    if isinstance(labels, dict) and len(labels) == 1:
+        [labels] = labels.values()
+    fits = isinstance(labels, list) and [type(label) for label in labels] == [str] * size
+    return list(labels) if fits and isinstance(labels, list) else None

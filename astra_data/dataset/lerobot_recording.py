@@ -1,0 +1,195 @@
+"""Datasets that LeRobot recorded or edited itself, read as ours.
+
+They have none of our metadata, and mostly no next states. The next state of a step is then the state of the
+following row; the last row of an episode has none and is left out, as are cameras and all else but numbers.
+"""
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import columns as names
+from astra_data.dataset import format as layout
+from astra_data.dataset.columns import Column, Scalar
+from astra_data.dataset.contents import Contents
+from astra_data.dataset.declared import declared_columns, name_of
+from astra_data.dataset.description import ContentHash, complete_description, permutation
+from astra_data.dataset.digests import Digests, digests_of
+from astra_data.dataset.lerobot_rows import ENDS, RecordedFiles, Rows, our_columns
+from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.plain import (
+    Run,
+    data_files,
+    flag_faults,
+    read_object,
+    read_tasks,
+    run_faults,
+    runs,
+)
+
+MOST_FAULTS = 8
+"""Faults that a message lists."""
+_log = logging.getLogger(__name__)
+
+
+class _Found(NamedTuple):
+    """An episode in the files."""
+
+    uid: int
+    first_row: int
+    steps: int
+    metadata: Mapping[str, Scalar]
+
+
+def open_recording(root: Path) -> Contents:
+    """Return the contents of the LeRobot dataset in folder `root`: check every value, log what is left out.
+
+    Raises:
+        BadInputError: it has no state or action of numbers, episodes share a uid, or its format is older.
+        CorruptDatasetError: it is incomplete or was altered; lists the first faults.
+    """
+    info, tasks = read_object(root / layout.INFO_PATH), read_tasks(root)
+    if isinstance(info, str) or isinstance(tasks, str):
+        path = layout.INFO_PATH if isinstance(info, str) else layout.TASKS_PATH
+        raise CorruptDatasetError(f"{path} {info if isinstance(info, str) else tasks}")
+    version = info.get("codebase_version")
+    if version != layout.CODEBASE_VERSION:
+        raise BadInputError(
+            f"{root} has LeRobot's format {version}, expected {layout.CODEBASE_VERSION}: convert it with "
+            "lerobot's convert_dataset_v21_to_v30"
+        )
+    stored, specs, fps = declared_columns(root, info)
+    sizes = {spec.name: spec.size for spec in specs}
+    missing = [name for name in (names.STATE, names.ACTION) if name not in sizes]
+    missing += [f"{name} of a single number" for name in (names.REWARD, *ENDS) if sizes.get(name, 1) > 1]
+    if missing:
+        raise BadInputError(
+            f"{root}, recorded by LeRobot, has no {' and no '.join(missing)}: expected lists of numbers "
+            "for the state and the action, and one number for a reward or flag"
+        )
+    rows = Rows({column.name: column for column in stored}, fps)
+    columns = our_columns(specs, has_tasks=len(tasks) > 1)
+    episodes, content_hash, digests = _survey(root, rows, columns, tasks, info)
+    kept = [episode for episode in episodes if episode.steps]
+    if not kept:
+        raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
+    _announce(root, info, rows, episodes, [*sizes, *names.RESERVED])
+    uids = [episode.uid for episode in kept]
+    lengths = np.array([episode.steps for episode in kept])
+    first, last = episodes[0], episodes[-1]
+    robot = info.get("robot_type")
+    description = {
+        "name": name_of(root),
+        "stage": "record",
+        "config": {"codebase_version": version},
+        "environment": {"robot_type": robot} if isinstance(robot, str) else {},
+    }
+    order = {uid: index for index, uid in enumerate(uids)}
+    stored_columns = layout.stored_columns(columns)
+    frames = int(lengths.sum())
+    return Contents(
+        root=root,
+        info=dict(layout.dataset_info(stored_columns, fps=fps, episodes=len(kept), frames=frames)),
+        description=complete_description(description) | {"content_hash": content_hash},
+        metadata={key: [episode.metadata[key] for episode in kept] for key in first.metadata},
+        uids=np.array(uids),
+        lengths=lengths,
+        starts=np.cumsum(lengths) - lengths,
+        order=[order[uid] for uid in permutation(uids, 0)],
+        subset_seed=0,
+        task=" / ".join(tasks[index] for index in sorted(tasks)),
+        paths=data_files(root),
+        file_starts=np.zeros(1, dtype=np.int64),
+        recorded=RecordedFiles(
+            root=root,
+            paths=data_files(root),
+            rows=rows,
+            uids=np.array(uids),
+            lengths=lengths,
+            first_rows=np.array([episode.first_row for episode in kept]),
+            total_rows=last.first_row + last.steps + rows.dropped,
+            digests=digests,
+        ),
+    )
+
+
+def _survey(
+    root: Path, rows: Rows, columns: list[Column], tasks: Mapping[int, str], info: Mapping[str, Any]
+) -> tuple[list[_Found], str, Digests]:
+    """Read every value once; return all episodes, and hash and digests of what becomes ours."""
+    stored = list(rows.stored.values())
+    specs = layout.stored_columns(columns)
+    ends = [name for name in (*ENDS, names.EPISODE_INDEX) if name in rows.stored]
+    found: list[_Found] = []
+    faults: list[str] = []
+    parts: dict[str, list[NDArray[np.uint64]]] = {spec.name: [] for spec in specs}
+    content, row, kept, steps = ContentHash(), 0, 0, 0
+    tables = read_blocks(data_files(root), [column.name for column in stored])
+    for number, run in enumerate(runs(root / "data", tables, stored)):
+        faults += [fault for _, fault in run_faults(run, number=number, row=row, fps=rows.fps)]
+        faults += flag_faults(replace(run, columns={name: run.columns[name] for name in ends}), number)
+        if len(faults) >= MOST_FAULTS:
+            break
+        uid = int(run.columns.get(names.EPISODE_UID, run.columns[names.EPISODE_INDEX])[0])
+        episode = _Found(uid, row, len(run) - rows.dropped, _facts(run, tasks))
+        found.append(episode)
+        row += len(run)
+        if not episode.steps:
+            continue
+        for spec in specs:
+            values = rows.values(spec, run, kept, steps, uid)
+            content.update(spec.name, values)
+            parts[spec.name].append(digests_of({spec.name: values}, [episode.steps])[spec.name])
+            if values.dtype.kind == "f" and not faults and not np.isfinite(values).all():
+                faults.append(f"{spec.name} in episode {number} is too large for {spec.dtype}")
+        kept, steps = kept + 1, steps + episode.steps
+    counted = (info.get("total_episodes"), info.get("total_frames"))
+    if not faults and (len(found), row) != counted:
+        faults.append(f"{len(found)} episodes of {row} rows, expected {counted[0]} of {counted[1]}")
+    if faults:
+        raise CorruptDatasetError("; ".join(faults[:MOST_FAULTS]))
+    uids = [episode.uid for episode in found]
+    if len(set(uids)) < len(uids) or min(uids, default=0) < 0:
+        raise BadInputError(
+            f"{root}: {len(uids) - len(set(uids))} episodes have the {names.EPISODE_UID} of an earlier one, "
+            "as after a merge by LeRobot's tools; new ones are given, with DATASET one of those merged, by "
+            f"`astra-data repair {root} --like DATASET --new-uids --out FOLDER`"
+        )
+    digests = {name: np.concatenate(values) for name, values in parts.items() if values}
+    return found, content.hexdigest(), digests
+
+
+def _facts(run: Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
+    """Return the metadata of an episode, of all its rows."""
+    facts: dict[str, Scalar] = {}
+    if names.SUCCESS in run.columns:
+        facts["success"] = bool(run.columns[names.SUCCESS].any())
+    if len(tasks) > 1:
+        facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
+    return facts
+
+
+def _announce(
+    root: Path, info: Mapping[str, Any], rows: Rows, episodes: Sequence[_Found], known: Collection[str]
+) -> None:
+    """Say in one line what is left out."""
+    parts = []
+    if rows.dropped:
+        total = episodes[-1].first_row + episodes[-1].steps + 1
+        parts.append(
+            f"next states are those of the following rows, which leaves out the last row of each episode, "
+            f"{len(episodes)} of {total} rows"
+        )
+    single = sum(not episode.steps for episode in episodes)
+    if single:
+        parts.append(f"{single} of them in episodes of a single row")
+    others = sorted(info["features"].keys() - set(known))
+    if others:
+        parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")
+    _log.warning("%s", f"{root}, recorded by LeRobot: {'; '.join(parts) or 'without our metadata'}")

@@ -1,0 +1,167 @@
+"""Rows that LeRobot recorded, as those of ours."""
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import columns as names
+from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.digests import Digests
+from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.plain import PlainColumn, Run, runs
+
+Ints = NDArray[np.int64]
+RECORDED_TASK = "recorded.task_index"
+"""(T,) int64: LeRobot's task_index, where there are several tasks."""
+ENDS = (names.TERMINATED, names.TRUNCATED)
+_FLOATS = (names.STATE, names.NEXT_STATE, names.GOAL, names.ACTION, names.REWARD)
+_FLAGS = (*ENDS, names.DONE, names.SUCCESS)
+_DERIVED = (
+    Column(names.TERMINATED, "bool", meaning="the recording does not tell: never set"),
+    Column(names.TRUNCATED, "bool", meaning="the recording of the episode ends"),
+    Column(names.DONE, "bool", meaning="terminated or truncated"),
+)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """How rows of an episode in the files become rows of ours.
+
+    Attributes:
+        stored: the columns of numbers in the files.
+        fps: steps per second.
+    """
+
+    stored: Mapping[str, PlainColumn]
+    fps: int
+
+    @property
+    def dropped(self) -> int:
+        """Rows at the end of each episode that are left out: 1 where next states are derived, otherwise 0."""
+        return 0 if names.NEXT_STATE in self.stored else 1
+
+    def stored_for(self, wanted: Iterable[str]) -> list[PlainColumn]:
+        """Return the columns of the files from which the columns `wanted` are made, and what splits rows."""
+        sources = {names.EPISODE_INDEX, names.FRAME_INDEX}
+        for name in wanted:
+            if name == names.NEXT_STATE and self.dropped:
+                sources.add(names.STATE)
+            elif name in (names.TRUNCATED, names.DONE):
+                sources.update(ENDS)
+            elif name == RECORDED_TASK:
+                sources.add(names.TASK_INDEX)
+            elif name not in names.RESERVED:
+                sources.add(name)
+        return [column for name, column in self.stored.items() if name in sources]
+
+    def values(self, spec: Column, run: Run, episode: int, start: int, uid: int) -> Array:
+        """Return the column `spec` of one episode, (T,) or (T, size).
+
+        Args:
+            spec: the column.
+            run: its rows in the files, T + `dropped`.
+            episode: its index.
+            start: index of its first step.
+            uid: its uid.
+        """
+        steps = len(run) - self.dropped
+        frames = np.arange(steps)
+        reserved = {
+            names.EPISODE_UID: np.full(steps, uid),
+            names.EPISODE_INDEX: np.full(steps, episode),
+            names.FRAME_INDEX: frames,
+            names.INDEX: frames + start,
+            names.TASK_INDEX: np.zeros_like(frames),
+            names.TIMESTAMP: frames / self.fps,
+        }
+        if spec.name in reserved:
+            return reserved[spec.name].astype(spec.dtype)
+        if spec.name in (names.TRUNCATED, names.DONE):
+            terminated, truncated = self._ends(run, steps)
+            return truncated if spec.name == names.TRUNCATED else terminated | truncated
+        if spec.name == names.TERMINATED:
+            return self._ends(run, steps)[0]
+        if spec.name == names.NEXT_STATE and self.dropped:
+            values = run.columns[names.STATE][1:]
+        else:
+            values = run.columns[names.TASK_INDEX if spec.name == RECORDED_TASK else spec.name][:steps]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return values.astype(spec.dtype)
+
+    def _ends(self, run: Run, steps: int) -> tuple[Array, Array]:
+        """Return terminated and truncated, (T,); an episode that is cut off is truncated."""
+        terminated, truncated = (
+            run.columns[name][:steps] != 0 if name in self.stored else np.zeros(steps, bool) for name in ENDS
+        )
+        if self.dropped or names.TRUNCATED not in self.stored:
+            truncated[-1] |= not terminated[-1]
+        return terminated, truncated
+
+
+@dataclass(frozen=True)
+class RecordedFiles:
+    """The files of a recording, and the E episodes in them that have steps.
+
+    Attributes:
+        root: its folder.
+        paths: the data files in order.
+        rows: how their rows become ours.
+        uids: uid of each episode, (E,).
+        lengths: steps of each episode, (E,).
+        first_rows: the row of the files in which each episode begins, (E,).
+        total_rows: rows of all files.
+        digests: those of the values when the recording was opened.
+    """
+
+    root: Path
+    paths: Sequence[Path]
+    rows: Rows
+    uids: Ints
+    lengths: Ints
+    first_rows: Ints
+    total_rows: int
+    digests: Digests
+
+    def blocks(self, specs: Sequence[Column], chosen: Ints) -> Iterator[dict[str, Array]]:
+        """Yield the columns `specs` of the episodes `chosen` (n,), in order, one at a time.
+
+        Raises:
+            CorruptDatasetError: a file cannot be read, or has other episodes than before.
+        """
+        dropped = self.rows.dropped
+        wanted = None
+        if len(chosen) < len(self.lengths):
+            wanted = np.zeros(self.total_rows, dtype=bool)
+            for episode in chosen:
+                first = self.first_rows[episode]
+                wanted[first : first + self.lengths[episode] + dropped] = True
+        columns = self.rows.stored_for([spec.name for spec in specs])
+        tables = read_blocks(self.paths, [column.name for column in columns], wanted)
+        found = (run for run in runs(self.root / "data", tables, columns) if len(run) > dropped)
+        starts = np.cumsum(self.lengths) - self.lengths
+        for episode, run in itertools.zip_longest(chosen.tolist(), found):
+            if run is None or episode is None or len(run) != self.lengths[episode] + dropped:
+                raise CorruptDatasetError("its files were altered while they were read")
+            place = (episode, int(starts[episode]), int(self.uids[episode]))
+            yield {spec.name: self.rows.values(spec, run, *place) for spec in specs}
+
+
+def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:
+    """Return the columns of the dataset, from those of the recording that are not LeRobot's own."""
+    columns = {column.name: _typed(column) for column in recorded}
+    state = columns[names.STATE]
+    meaning = f"{state.meaning or 'the state'}, one step later"
+    derived = [replace(state, name=names.NEXT_STATE, meaning=meaning), *_DERIVED]
+    derived += [Column(RECORDED_TASK, "int64", meaning="the recording's task_index")] if has_tasks else []
+    return [*columns.values(), *(column for column in derived if column.name not in columns)]
+
+
+def _typed(column: Column) -> Column:
+    if column.name in (*_FLOATS, *_FLAGS):
+        return replace(column, dtype="float32" if column.name in _FLOATS else "bool")
+    return column

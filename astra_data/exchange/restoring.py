@@ -1,0 +1,152 @@
+"""Read our own exports back as they were, and verify their sums."""
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.columns import Array, Column, Episode
+from astra_data.dataset.versions import Version, place, versions_at_home
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.exchange.export_record import ExportRecord, Sums
+from astra_data.exchange.mapping import ColumnMapping, ImportMapping
+from astra_data.exchange.recording import Block, Source
+
+
+def read_record(module: ModuleType, source: Source) -> ExportRecord | None:
+    """Return the record in `source`, None if it is no export of ours.
+
+    Args:
+        module: the importer of the format.
+        source: the file.
+
+    Raises:
+        CorruptDatasetError: the record is malformed.
+    """
+    text = module.record(source) if hasattr(module, "record") else None
+    return None if text is None else ExportRecord.parse(text, str(source))
+
+
+def restored(module: ModuleType, source: Source, record: ExportRecord) -> Iterator[Episode]:
+    """Yield the episodes of an export as its dataset had them; memory holds a block and an episode.
+
+    Args:
+        module: the importer of the format.
+        source: the file.
+        record: its record.
+
+    Raises:
+        BadInputError: fields are missing.
+        CorruptDatasetError: values differ from those that were exported; raised after the last episode.
+    """
+    columns, sums = record.columns, Sums()
+    rest = {column.name: _empty(column) for column in columns}
+    number = 0
+    for block in module.read(source, _mapping(record)):
+        values = {column.name: _values(block, column, record) for column in columns}
+        sums.update(values)
+        rest = {name: np.concatenate([rest[name], values[name]]) for name in values}
+        first, rows = 0, len(rest[columns[0].name])
+        while number < len(record.lengths) and (last := first + record.lengths[number]) <= rows:
+            metadata = {key: facts[number] for key, facts in record.metadata.items()}
+            known = {key: fact for key, fact in metadata.items() if fact is not None}
+            cut = {name: array[first:last] for name, array in rest.items()}
+            yield Episode(record.uids[number], cut, known)
+            first, number = last, number + 1
+        rest = {name: array[first:] for name, array in rest.items()}
+    found = sums.hexdigests()
+    wrong = [column.name for column in columns if found.get(column.name) != record.sums[column.name]]
+    if wrong or number < len(record.lengths):
+        raise CorruptDatasetError(
+            f"{source} was altered or is incomplete: {', '.join(wrong) or 'the number of rows'} differs from "
+            f"what was exported of {record.name}@data-{record.version}; export it again, or restore a copy"
+        )
+
+
+def write_restored(
+    sources: Sequence[Source],
+    record: ExportRecord,
+    episodes: Iterable[Episode],
+    options: Mapping[str, Any],
+    recordings: Sequence[Mapping[str, str]],
+    out: Path | None,
+) -> tuple[Path, int]:
+    """Write the dataset that was exported as the version after it; return its folder and number of steps.
+
+    Args:
+        sources: the export.
+        record: its record.
+        episodes: those of `restored`.
+        options: name, fps and task, where they are to differ.
+        recordings: names and sums of the files.
+        out: the dataset's folder, by default its place at home.
+
+    Raises:
+        BadInputError: there are several sources, which have to be merged.
+        CorruptDatasetError: values differ from those that were exported; nothing is written.
+    """
+    if len(sources) > 1:
+        raise BadInputError(f"{sources[0]} is an export of astra-data: import each on its own, then merge")
+    began = time.perf_counter()
+    name, version = options.get("name", record.name), Version(1, 0, 0)
+    if name == record.name:
+        taken = versions_at_home(name) if out is None else []
+        version = Version.parse(record.version).next("description", taken)
+    description = {
+        "name": name,
+        "version": str(version),
+        "parents": [record.identity],
+        "stage": "import",
+        "config": {"recordings": list(recordings)},
+        "seeds": record.seeds,
+        "environment": record.environment,
+        "simulator": record.simulator,
+    }
+    root = place(description) if out is None else out
+    frames = 0
+    with DatasetWriter(
+        root,
+        record.columns,
+        fps=options.get("fps", record.fps),
+        task=options.get("task", record.task),
+        description=description,
+        subset_seed=record.subset_seed,
+    ) as writer:
+        for episode in episodes:
+            writer.add(episode)
+            frames += len(episode)
+        writer.made = {"wall_seconds": time.perf_counter() - began}
+    return root, frames
+
+
+def _mapping(record: ExportRecord) -> ImportMapping:
+    """Return a mapping that reads every field once."""
+    fields = dict.fromkeys(place.field for place in record.places.values())
+    return ImportMapping(
+        name=record.name,
+        task=record.task,
+        fps=record.fps,
+        columns={str(number): ColumnMapping(fields=(field,)) for number, field in enumerate(fields)},
+        episodes=record.groups,
+    )
+
+
+def _empty(column: Column) -> Array:
+    return np.empty((0, column.size) if column.size > 1 else 0, column.dtype)
+
+
+def _values(block: Block, column: Column, record: ExportRecord) -> Array:
+    place = record.places[column.name]
+    stored = np.asarray(block.values[place.field])
+    rows = stored.reshape(len(block), -1)[:, place.first : place.first + place.size]
+    if stored.dtype.kind not in "biuf" or rows.shape[1] != column.size:
+        raise CorruptDatasetError(
+            f"{block.origin}: field '{place.field}' holds {stored.dtype} of shape {stored.shape}, expected "
+            f"{column.size} numbers per row"
+        )
+    values = np.ascontiguousarray(rows, column.dtype)
+    return values[:, 0].copy() if column.size == 1 else values

@@ -1,0 +1,177 @@
+"""The condition of a run's artefacts: whether each is finished, missing, damaged or stale, and why.
+
+An artefact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
+it was made from something else than what lies there now, or with other settings. Version 0.1 wrote no
+manifests: what it finished counts as finished, if its result is there.
+"""
+
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import AstraDataError
+from astra_data.core.manifest import read_manifest
+from astra_data.dataset.meta_files import read_description
+from astra_data.dataset.reader import Dataset
+from astra_data.experiments.execution import Item
+from astra_data.experiments.experiment import ALWAYS_NEW, Experiment
+from astra_data.experiments.plan import stage_of
+from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.reports.artefacts import Evaluation, read_json
+from astra_data.stages.registry import STAGES, Stage
+from astra_data.training.policy_file import PolicyFile
+
+LOADERS: dict[str, Callable[[Path], object]] = {
+    "ground": load_grounding,
+    "train": PolicyFile.load,
+    "align": load_target_encoder,
+    "evaluate": lambda path: read_json(Evaluation, path),
+}
+"""What reads the results of stages as other stages do."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """The condition of an artefact, and why, where there is something to say."""
+
+    state: Literal["finished", "missing", "damaged", "stale"]
+    why: str = ""
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the artefact can be used."""
+        return self.state == "finished"
+
+
+def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Condition:
+    """Return the condition of the artefact of `item`; with `verify`, every byte of it is read."""
+    key = item.key
+    if not experiment.has(key):
+        return Condition("missing")
+    if why := damage(key, experiment, verify=verify) or (verify and _unreadable(key, experiment)):
+        return Condition("damaged", why)
+    if why := experiment.outdated(key) or _replaced(item, experiment):
+        return Condition("stale", why)
+    return Condition("finished", _remark(key, experiment))
+
+
+def damage(key: str, experiment: Experiment, *, verify: bool) -> str:
+    """Return what is wrong with the files of the artefact `key`: their sizes or, with `verify`, their bytes.
+
+    Of datasets, what the metadata and the footers of the files show or, with `verify`, all values.
+    """
+    folder, stage = experiment.place(key), _stage(key)
+    try:
+        if stage.makes_dataset:
+            dataset = Dataset.open(folder)
+            faults = dataset.verify() if verify else []
+        elif manifest := read_manifest(folder):
+            faults = manifest.faults(folder, verify=verify)
+        else:
+            whole = stage.result is None or _has_bytes(folder / stage.result)
+            faults = [] if whole else [f"{stage.result} is missing or empty"]
+    except AstraDataError as error:
+        return str(error)
+    return "; ".join(faults)
+
+
+def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, str]:
+    """Return which finished artefacts of `items` have to be made again, key to reason.
+
+    Those are the damaged and the stale ones, and what was made from them. Of all, the sizes are compared, of
+    what an item to make reads, the sha256; the values of datasets are verified where they are read.
+
+    Args:
+        items: each after those it reads.
+        experiment: whose artefacts they are.
+    """
+    absent = {item.key for item in items if stage_of(item) in ALWAYS_NEW or not experiment.has(item.key)}
+    reasons: dict[str, str] = {}
+    for item in items:
+        found = condition(item, experiment)
+        if item.key not in absent and not found.is_finished:
+            reasons[item.key] = f"{found.state} ({found.why})"
+    verified = {item.key for item in items if STAGES[stage_of(item)].makes_dataset}
+    while True:
+        for item in items:
+            source = next((key for key in item.inputs if key in reasons), None)
+            if source and item.key not in absent:
+                reasons.setdefault(item.key, f"made from {source}")
+        made = absent | reasons.keys()
+        read = {key for item in items if item.key in made for key in item.inputs}
+        read = (read & {item.key for item in items}) - made - verified
+        if not read:
+            return reasons
+        verified |= read
+        faults = {key: damage(key, experiment, verify=True) for key in sorted(read)}
+        reasons |= {key: f"damaged ({why})" for key, why in faults.items() if why}
+
+
+def can_be_made_again(key: str, experiment: Experiment) -> bool:
+    """Return whether a stage made the artefact `key`; a dataset may also have been put there."""
+    stage = _stage(key)
+    if not stage.makes_dataset:
+        return True
+    with suppress(AstraDataError):
+        return bool(read_description(experiment.place(key))["stage"] == stage.name)
+    return False
+
+
+def _has_bytes(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
+def _stage(key: str) -> Stage:
+    return STAGES[key.partition("/")[0]]
+
+
+def _unreadable(key: str, experiment: Experiment) -> str:
+    """Return why later stages cannot read the artefact `key`, such as weights that are not finite."""
+    stage = _stage(key)
+    try:
+        if stage.result:
+            LOADERS[stage.name](experiment.place(key) / stage.result)
+    except AstraDataError as error:
+        return f"{error}, after removing this"
+    return ""
+
+
+def _replaced(item: Item, experiment: Experiment) -> str:
+    """Return which of the artefacts that `item` was made from is another now."""
+    folder = experiment.place(item.key)
+    made_from: Collection[str]
+    if _stage(item.key).makes_dataset:
+        made_from = [parent["hash"] for parent in read_description(folder)["parents"]]
+    elif manifest := read_manifest(folder):
+        made_from = manifest.made_from.values()
+    else:
+        return ""
+    digests = {key: _digest(key, experiment) for key in item.inputs if experiment.has(key)}
+    others = [key for key, digest in digests.items() if digest and digest not in made_from]
+    return f"made from another {others[0]}" if others else ""
+
+
+def _digest(key: str, experiment: Experiment) -> str | None:
+    """Return the digest by which later artefacts name the artefact `key`; None if it cannot be read."""
+    folder, stage = experiment.place(key), _stage(key)
+    with suppress(AstraDataError, OSError, KeyError):
+        if stage.makes_dataset:
+            return str(read_description(folder)["content_hash"])
+        manifest, name = read_manifest(folder), str(stage.result)
+        return manifest.files[name][1] if manifest else file_digest(folder / name)
+    return None
+
+
+def _remark(key: str, experiment: Experiment) -> str:
+    """Return what is unusual about a finished artefact."""
+    if _stage(key).makes_dataset:
+        return ""
+    folder = experiment.place(key)
+    manifest = read_manifest(folder)
+    if manifest is None:
+        return "no manifest (made by 0.1)"
+    foreign = manifest.foreign(folder)
+    return f"not of it: {', '.join(foreign)}" if foreign else ""

@@ -1,0 +1,160 @@
+import errno
+import os
+from itertools import count
+from pathlib import Path
+
+import pytest
+from failing_disk import Killed, failing
+
+from astra_data.core.durable import NO_FSYNC, clean, discard, make_folder, sync_tree, write_file
+from astra_data.core.errors import DiskError
+from astra_data.core.lock import held
+
+MUTATING = "mkdir rename replace unlink rmdir fsync"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "er" / "file"
+    write_file(path, "first é")
+    assert path.read_bytes() == "first é".encode()
+    write_file(path, b"\0second")
+    assert path.read_bytes() == b"\0second"
+    assert names(path.parent) == ["file"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS])
+def test_a_disk_that_fails_at_any_operation_leaves_the_old_file_or_the_new_one(
+    tmp_path: Path, code: int
+) -> None:
+    path = tmp_path / "file"
+    for at in count():
+        write_file(path, "old")
+        with failing(MUTATING, at, OSError(code, os.strerror(code))) as calls:
+            try:
+                write_file(path, "new")
+            except DiskError as error:
+                assert f"{path} cannot be written: " in str(error)
+                assert path.read_text() in ("old", "new")
+            else:
+                assert path.read_text() == "new"
+        if len(calls) <= at:
+            break
+    assert at > 5
+    write_file(path, "last")
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_kill_at_any_operation_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    for at in count():
+        write_file(path, "old")
+        with failing(MUTATING, at, Killed(), Killed()) as calls:
+            try:
+                write_file(path, "new")
+            except Killed:
+                assert path.read_text() in ("old", "new")
+        if len(calls) <= at:
+            break
+    write_file(path, "last")
+    assert names(tmp_path) == ["file"]
+
+
+def test_what_is_no_plain_file_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    fifo = tmp_path / "pipe"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    write_file(fifo, "through")
+    assert os.read(reader, 100) == b"through"
+    os.close(reader)
+    assert fifo.is_fifo()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DiskError, match="a folder has its name"):
+        write_file(tmp_path / "folder", "text")
+
+
+def test_the_disk_has_each_file_before_its_name_and_each_name_before_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def note_fsync(handle: int) -> None:
+        done.append(f"fsync {os.path.basename(os.readlink(f'/proc/self/fd/{handle}'))}")
+        fsync(handle)
+
+    def note_replace(source: Path, target: Path) -> None:
+        done.append("replace")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_fsync)
+    monkeypatch.setattr(os, "replace", note_replace)
+    write_file(tmp_path / "new" / "file", "text")
+    assert done == [f"fsync {tmp_path.name}", "fsync file", "replace", "fsync new"]
+    done.clear()
+    make_folder(tmp_path / "a" / "b")
+    assert sorted(done) == sorted([f"fsync {tmp_path.name}", "fsync a"])
+    done.clear()
+    sync_tree(tmp_path / "new")
+    assert sorted(done) == ["fsync file", "fsync new"]
+    monkeypatch.setenv(NO_FSYNC, "1")
+    done.clear()
+    write_file(tmp_path / "file", "text")
+    assert done == ["replace"]
+
+
+def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / ".set.staged"
+    for at in count():
+        (folder / "deep").mkdir(parents=True)
+        for name in ("plan", "deep/1", "deep/2"):
+            (folder / name).touch()
+        with failing(MUTATING, at, Killed(), Killed()) as calls:
+            try:
+                discard(folder, tmp_path / "set")
+            except Killed:
+                if folder.exists():
+                    assert sorted(path.name for path in folder.rglob("*")) == ["1", "2", "deep", "plan"]
+        if len(calls) <= at:
+            break
+        if folder.exists():
+            discard(folder, tmp_path / "set")
+    assert at > 5
+    assert [state for _, state in clean(tmp_path)] == ["removed"] * len(names(tmp_path)) or not names(
+        tmp_path
+    )
+    assert names(tmp_path) == []
+
+
+def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    dead = home / "ant" / ".data-1.0.0.tmp-12"
+    alive, staged = home / ".set.tmp-13-1", home / ".set.staged"
+    for folder in (dead / "data", alive, staged, home / ".git", home / "set.tmp-1"):
+        folder.mkdir(parents=True)
+    for file in (".out.hdf5.tmp-99", ".recipe.json.partial", ".notes.partial", "file"):
+        (home / file).touch()
+    (dead / "data" / "file").touch()
+    with held(alive):
+        found = dict(clean(home))
+    assert found == {
+        dead: "removed",
+        alive: "in use",
+        staged: "kept",
+        home / ".out.hdf5.tmp-99": "removed",
+        home / ".recipe.json.partial": "removed",
+    }
+    assert names(home) == [
+        ".git",
+        ".notes.partial",
+        ".set.staged",
+        ".set.tmp-13-1",
+        "ant",
+        "file",
+        "set.tmp-1",
+    ]
+    assert names(home / "ant") == []
+    assert clean(tmp_path / "none") == []

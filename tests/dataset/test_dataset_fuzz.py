@@ -1,0 +1,228 @@
+"""Whatever a dataset holds: it is read, or one clear message. Nothing hangs, nothing ends in a traceback.
+
+ASTRA_DATA_FUZZ is how many random examples are tried of each kind; by default few, always the same.
+"""
+
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from damaged import DATA, EPISODES
+from fake_dataset import write_fake
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from astra_data.core.errors import AstraDataError
+from astra_data.dataset import Dataset
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
+from astra_data.dataset.inspection import inspect_dataset
+
+fuzzed = settings(
+    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "10")),
+    deadline=None,
+    derandomize="ASTRA_DATA_FUZZ" not in os.environ,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+INFO = "meta/info.json"
+JSON = (INFO, "meta/stats.json", "meta/astra/dataset.json", "meta/astra/subsets.json")
+PARQUET = (DATA, EPISODES, "meta/tasks.parquet", "meta/astra/episodes.parquet")
+
+
+@cache
+def sound() -> Path:
+    return write_fake(Path(tempfile.mkdtemp()) / "set").root
+
+
+@contextmanager
+def copied() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(shutil.copytree(sound(), Path(folder) / "set"))
+
+
+def read(root: Path) -> None:
+    """Do with the dataset what people do; leave nothing half done."""
+    for use in (
+        lambda: list(Dataset.open(root).episodes()),
+        lambda: Dataset.open(root).verify(),
+        lambda: inspect_dataset(Dataset.open(root)),
+        lambda: check(root).faults,
+        lambda: repair(root, out=root.parent / "out"),
+    ):
+        try:
+            use()
+        except AstraDataError as error:
+            assert str(error)
+    out = root.parent / "out"
+    assert not out.exists() or Dataset.open(out).verify() == []
+    assert {path.name for path in root.parent.iterdir()} <= {"set", "out"}
+
+
+def double(name: str) -> Callable[[Path], None]:
+    """Give a column another of the same name."""
+
+    def damage(root: Path) -> None:
+        table = pq.read_table(root / name)
+        pq.write_table(table.append_column(table.schema.field(0), table.column(0)), root / name)
+
+    return damage
+
+
+def empty(*files: str) -> Callable[[Path], None]:
+    """Leave no rows."""
+
+    def damage(root: Path) -> None:
+        for name in files:
+            pq.write_table(pq.read_table(root / name).slice(0, 0), root / name)
+
+    return damage
+
+
+def pipe(name: str) -> Callable[[Path], None]:
+    def damage(root: Path) -> None:
+        (root / name).unlink(missing_ok=True)
+        os.mkfifo(root / name)
+
+    return damage
+
+
+def declare(column: str, **feature: Any) -> Callable[[Path], object]:  # noqa: ANN401 - JSON
+    def damage(root: Path) -> object:
+        info = json.loads((root / INFO).read_text())
+        info["features"][column] = info["features"].get(column, {"dtype": "float32", "shape": [1]}) | feature
+        return (root / INFO).write_text(json.dumps(info))
+
+    return damage
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    **{f"{name} has a column twice": (double(name), "more than once") for name in PARQUET},
+    "no rows in the data": (empty(DATA), "there are no steps"),
+    "no rows anywhere": (empty(*PARQUET), "there are no steps"),
+    **{f"{name} is a pipe": (pipe(name), "a device or a pipe") for name in (*JSON, *PARQUET)},
+    "a pipe beside the data": (pipe("data/chunk-000/file-001.parquet"), "a device or a pipe"),
+    "another pipe": (pipe("data/pipe"), "data/pipe does not belong to it"),
+    "a shape of 2^30": (declare("action", shape=[2**30], names=None), "the content hash is"),
+    "a name of 300 letters": (declare("x" * 300), "lacks column xxx"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_hostile_values_are_told(kind: str) -> None:
+    damage, told = DAMAGE[kind]
+    with copied() as root:
+        damage(root)
+        faults = check(root).faults
+        assert faults
+        assert any(re.search(told, fault) for fault in faults), faults
+        read(root)
+
+
+edits = st.lists(
+    st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.booleans()),
+    min_size=1,
+    max_size=4,
+)
+"""Where, as a share of the file, bytes are overwritten or, if true, everything from there on is cut off."""
+
+
+@given(name=st.sampled_from([*JSON, *PARQUET]), changes=edits)
+@fuzzed
+def test_broken_files(name: str, changes: list[tuple[float, bytes, bool]]) -> None:
+    with copied() as root:
+        content = (root / name).read_bytes()
+        for share, new, is_cut in changes:
+            place = int(share * len(content))
+            content = content[:place] + new + (b"" if is_cut else content[place + len(new) :])
+        (root / name).write_bytes(content)
+        read(root)
+
+
+HOSTILE: st.SearchStrategy[object] = st.one_of(
+    st.sampled_from(
+        [
+            *(None, True, -1, 0, 1, 2**30, 2**31, 2**63, 2**64, 10**30, 1e308, "", "..", "/etc/passwd"),
+            *("x" * 300, "\ud800", "\0", "nan", [], {}, [[]], [2**30], [0], ["x"], {"shape": [1]}),
+        ]
+    ),
+    st.floats(),
+    st.text(max_size=4),
+)
+
+
+def places(value: object, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if path:
+        yield path
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        yield from places(value[key], (*path, key))  # type: ignore[index]
+
+
+@given(name=st.sampled_from(JSON), share=st.floats(0, 1, exclude_max=True), value=HOSTILE)
+@fuzzed
+def test_json_with_a_hostile_value(name: str, share: float, value: object) -> None:
+    with copied() as root:
+        content = json.loads((root / name).read_text())
+        every = list(places(content))
+        *path, last = every[int(share * len(every))]
+        inner = content
+        for key in path:
+            inner = inner[key]
+        inner[last] = value
+        (root / name).write_text(json.dumps(content))
+        read(root)
+
+
+TYPES = (
+    *(pa.int8(), pa.int64(), pa.uint64(), pa.float16(), pa.float64(), pa.bool_(), pa.string(), pa.null()),
+    *(pa.list_(pa.float32()), pa.list_(pa.int64(), 3), pa.struct([("x", pa.int64())]), pa.timestamp("ns")),
+)
+
+
+@given(
+    name=st.sampled_from(PARQUET),
+    share=st.floats(0, 1, exclude_max=True),
+    change=st.sampled_from(["retyped", "doubled", "dropped", "renamed", "nulls", "rows", "order"]),
+    kind=st.sampled_from(TYPES),
+    seed=st.integers(0, 60),
+)
+@example(EPISODES, 0.0, "retyped", pa.bool_(), 0)
+@example(PARQUET[3], 0.0, "retyped", pa.int8(), 0)
+@fuzzed
+def test_tables_of_other_columns(name: str, share: float, change: str, kind: pa.DataType, seed: int) -> None:
+    with copied() as root:
+        table = pq.read_table(root / name)
+        at = int(share * table.num_columns)
+        field, column = table.schema.field(at), table.column(at)
+        if change == "retyped":
+            try:
+                values = column.cast(kind)
+            except pa.ArrowException:
+                values = pa.nulls(len(column), kind)
+            table = table.set_column(at, pa.field(field.name, kind), values)
+        elif change == "doubled":
+            table = table.append_column(field, column)
+        elif change == "dropped":
+            table = table.remove_column(at)
+        elif change == "renamed":
+            names = ["x" * 300 if index == at else known for index, known in enumerate(table.column_names)]
+            table = table.rename_columns(names)
+        elif change == "nulls":
+            table = table.set_column(at, field, pa.nulls(len(column), field.type))
+        elif change == "rows":
+            table = table.slice(seed % (len(table) + 1))
+        else:
+            table = table.take([(row + seed) % len(table) for row in range(len(table))])
+        pq.write_table(table, root / name)
+        read(root)

@@ -1,0 +1,57 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset.columns import STATE, Column
+from astra_data.dataset.declared import declared_columns, name_of
+from astra_data.dataset.format import DEFAULT_COLUMNS
+
+OWN = {column.name: column.feature() for column in DEFAULT_COLUMNS}
+
+
+def declared(**features: Any) -> list[Column]:  # noqa: ANN401 - JSON
+    return declared_columns(Path("set"), {"fps": 10.0, "features": OWN | features})[1]
+
+
+@pytest.mark.parametrize(
+    ("labels", "expected"),
+    [
+        (["x", "y"], ("x", "y")),
+        ({"motors": ["x", "y"]}, ("x", "y")),
+        ({"motors": ["x"]}, None),
+        ({"a": ["x", "y"], "b": []}, None),
+        (["x", 1], None),
+        (None, None),
+    ],
+)
+def test_names_are_taken_where_there_is_one_per_value(
+    labels: object, expected: tuple[str, ...] | None
+) -> None:
+    feature = {"dtype": "float64", "shape": [2], "names": labels}
+    assert declared(**{STATE: feature}) == [Column(STATE, "float32", 2, expected)]
+
+
+def test_only_lists_of_numbers_are_columns() -> None:
+    features = {
+        "observation.images.top": {"dtype": "video", "shape": [8, 8, 3], "names": None},
+        "text": {"dtype": "string", "shape": [1], "names": None},
+        "grid": {"dtype": "float32", "shape": [2, 2], "names": None},
+        "count": {"dtype": "uint8", "shape": [1], "names": None},
+    }
+    assert declared(**features) == [Column("count", "int64")]
+
+
+@pytest.mark.parametrize("info", [{"fps": 10, "features": {}}, {"fps": 9.5, "features": OWN}, {}])
+def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(info: dict[str, Any]) -> None:
+    with pytest.raises(CorruptDatasetError, match="expected a whole number of frames per second"):
+        declared_columns(Path("set"), info)
+
+
+def test_a_folder_gives_a_valid_name() -> None:
+    assert [name_of(Path(name)) for name in ("walks", "my set (2)", "-._")] == [
+        "walks",
+        "my-set-2-",
+        "repaired",
+    ]

@@ -1,0 +1,138 @@
+import logging
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import xxhash
+from damaged import DATA, alter, as_in_0_1, drop
+from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import Dataset, parquet
+from astra_data.dataset.columns import ACTION, REWARD, STATE
+from astra_data.dataset.digests import altered_columns, digests_of, read_digests
+from astra_data.dataset.edit import delete
+from astra_data.dataset.format import DIGESTS_PATH
+
+
+def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> None:
+    table = pq.read_table(fake.root / DIGESTS_PATH)
+    assert set(table.column_names) == set(fake.features)
+    for name in (STATE, ACTION, REWARD, "next.done", "mode"):
+        expected = [
+            xxhash.xxh3_64(episode.columns[name].tobytes()).intdigest() for episode in fake_episodes()
+        ]
+        assert table.column(name).to_pylist() == expected
+
+
+def test_digests_of_consecutive_episodes(fake: Dataset) -> None:
+    stored = read_digests(fake.root, fake.description["sums"], fake.features, len(fake))
+    assert stored is not None
+    found = digests_of({STATE: concatenated(STATE), "mode": concatenated("mode")}, LENGTHS)
+    assert altered_columns(found, stored) == {}
+    found[STATE][3] += np.uint64(1)
+    found["mode"][[1, 3]] += np.uint64(1)
+    assert altered_columns(found, stored) == {1: ["mode"], 3: [STATE, "mode"]}
+
+
+@pytest.mark.parametrize("block_rows", [1, 2**16])
+@pytest.mark.parametrize("rows", [3, 10, 1000])
+def test_an_altered_value_is_refused_before_it_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int, rows: int
+) -> None:
+    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
+    root = write_fake(tmp_path / "set").root
+    alter(DATA, REWARD, 25, 9.0)(root)
+    pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=rows)
+    dataset = Dataset.open(root)
+    seen = []
+    with pytest.raises(CorruptDatasetError) as caught:
+        seen += list(dataset.episodes([ACTION, REWARD]))
+    assert len(seen) <= 3
+    assert str(caught.value) == (
+        f"{root} is incomplete or was altered: next.reward: other values than were written in {DATA} rows "
+        "20 to 49 (episode 3). Restore it from a copy, run the stage that wrote it again, or save what is "
+        f"whole of it: `astra-data repair {root} --out FOLDER`."
+    )
+    with pytest.raises(CorruptDatasetError, match=r"next\.reward"):
+        dataset.columns([REWARD])
+    # What was not altered is read as ever.
+    np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], concatenated(ACTION))
+    others = [episode.columns[REWARD] for episode in dataset.episodes([REWARD], [0, 1, 2, 4])]
+    for found, expected in zip(others, [*fake_episodes()[:3], fake_episodes()[4]], strict=True):
+        np.testing.assert_array_equal(found, expected.columns[REWARD])
+
+
+def test_the_row_is_that_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
+    dataset = write_fake(tmp_path / "set")
+    path = dataset.paths[-1].relative_to(dataset.root)
+    rows = pq.read_metadata(dataset.root / path).num_rows
+    assert rows < dataset.lengths.sum()
+    alter(str(path), REWARD, rows - 1, 9.0)(dataset.root)
+    where = rf"{path} rows {rows - 5} to {rows - 1} \(episode 4\)"
+    with pytest.raises(CorruptDatasetError, match=where):
+        Dataset.open(dataset.root).columns([REWARD])
+
+
+def test_a_file_that_shrinks_while_it_is_open_is_refused(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    table = pq.read_table(dataset.root / DATA)
+    for rows in (table.slice(0, 50), pa.concat_tables([table, table.slice(0, 1)])):
+        pq.write_table(rows, dataset.root / DATA)
+        with pytest.raises(CorruptDatasetError, match="other rows than when the dataset was opened"):
+            dataset.columns([REWARD])
+
+
+def test_an_altered_episode_can_be_deleted(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    alter(DATA, REWARD, 25, 9.0)(root)
+    saved = Dataset.open(delete(Dataset.open(root), [6], out=tmp_path / "saved"))
+    assert saved.uids.tolist() == [13, 4, 2**53 + 1, 0]
+    assert saved.verify() == []
+
+
+@pytest.mark.parametrize(
+    ("change", "lack"),
+    [
+        (as_in_0_1, "it was written without digests of its values"),
+        (drop(DIGESTS_PATH), f"{DIGESTS_PATH} is missing"),
+        (alter(DIGESTS_PATH, REWARD, 0, 1), f"{DIGESTS_PATH} was altered"),
+    ],
+)
+def test_without_digests_all_values_are_compared_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: object, lack: str
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    assert callable(change)
+    change(root)
+    dataset = Dataset.open(root)
+    assert caplog.messages == []
+    for _ in range(2):
+        np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], concatenated(ACTION))
+    [record] = caplog.records
+    assert record.levelno == logging.WARNING
+    assert record.getMessage() == f"{root}: {lack}; all values are compared with its content hash now"
+    alter(DATA, REWARD, 25, 9.0)(root)
+    with pytest.raises(CorruptDatasetError, match="other values than were written"):
+        dataset.columns([REWARD])  # compared with what was read the first time
+    with pytest.raises(CorruptDatasetError, match=r"the content hash is \w+, expected"):
+        Dataset.open(root).columns([ACTION])
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        pa.table({REWARD: pa.array([1] * 5, pa.uint64())}),
+        pa.table({REWARD: pa.array([1.0] * 5), ACTION: pa.array([1] * 5, pa.uint64())}),
+        pa.table({name: pa.array([1] * 4, pa.uint64()) for name in (REWARD, ACTION)}),
+        pa.table({name: pa.array([1, 2, 3, 4, None], pa.uint64()) for name in (REWARD, ACTION)}),
+    ],
+)
+def test_digests_that_do_not_fit_are_refused(tmp_path: Path, table: pa.Table) -> None:
+    (tmp_path / DIGESTS_PATH).parent.mkdir(parents=True)
+    pq.write_table(table, tmp_path / DIGESTS_PATH)
+    with pytest.raises(CorruptDatasetError, match="has other columns or episodes than the data"):
+        read_digests(tmp_path, {}, [REWARD, ACTION], 5)

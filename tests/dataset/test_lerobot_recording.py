@@ -1,0 +1,302 @@
+"""What lerobot itself recorded is taken by every command, as a dataset of ours is."""
+
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import lerobot_recordings
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from damaged import DATA, alter_rows
+from fake_dataset import fake_columns, write_fake, writer
+from lerobot_recordings import JOINTS, values
+from typer.testing import CliRunner
+
+from astra_data.cli.app import app
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TIMESTAMP,
+    TRUNCATED,
+    Array,
+    Episode,
+)
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
+from astra_data.dataset.edit import filter_episodes, merge, subset
+from astra_data.dataset.inspection import inspect_dataset
+from astra_data.dataset.lerobot_rows import RECORDED_TASK
+from astra_data.exchange.exporters import EXPORTERS, export
+from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.sharing.push import push
+
+KEPT = (0, 2, 3)
+"""Episodes of `arm` with a next state."""
+GLIDER = """
+import torch
+from astra_data import Column
+
+
+class Glider:
+    abstract_state = Column("abstract.state", size=2, names=("x", "y"))
+    parameters = {"timestep_s": 0.1}
+
+    def __init__(self, num_envs):
+        self.state = torch.zeros(num_envs, 2)
+
+    @staticmethod
+    def abstraction(state):
+        return state[:, :2]
+
+    def reset_to(self, state, rows=None):
+        self.state = state.clone()
+
+    def step(self, action):
+        return self.state + 0.1 * action
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folders that `lerobot_recordings` makes, and the two datasets `a` and `b` behind `merged`."""
+    folder = tmp_path_factory.mktemp("recorded")
+    write_fake(folder / "a")
+    with writer(folder / "b") as open_writer:
+        for uid, length in ((13, 5), (7, 4)):
+            facts = {"success": False, "return": -1.0, "source_episode": 13}
+            open_writer.add(Episode(uid, fake_columns(length, seed=uid + 100), facts))
+    settings = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
+    names = [str(folder), str(folder / "a"), str(folder / "b")]
+    command = [sys.executable, lerobot_recordings.__file__, *names]
+    subprocess.run(command, env=os.environ | settings, check=True, capture_output=True)
+    return folder
+
+
+@pytest.fixture
+def arm(recorded: Path) -> Dataset:
+    return Dataset.open(recorded / "arm")
+
+
+def test_next_states_are_those_of_the_following_rows(arm: Dataset) -> None:
+    assert arm.uids.tolist() == list(KEPT)
+    assert arm.lengths.tolist() == [5, 8, 3]
+    for number, episode in zip(KEPT, arm.episodes(), strict=True):
+        expected = values("arm", number)
+        np.testing.assert_array_equal(episode.columns[STATE], expected[STATE][:-1])
+        np.testing.assert_array_equal(episode.columns[NEXT_STATE], expected[STATE][1:])
+        for name in (ACTION, REWARD, SUCCESS):
+            np.testing.assert_array_equal(episode.columns[name], expected[name][:-1])
+        np.testing.assert_array_equal(episode.columns["force"], expected["force"][:-1].astype(np.float32))
+        last = np.arange(len(episode)) == len(episode) - 1
+        assert not episode.columns[TERMINATED].any()
+        np.testing.assert_array_equal(episode.columns[TRUNCATED], last)
+        np.testing.assert_array_equal(episode.columns[DONE], last)
+        assert set(episode.columns[RECORDED_TASK]) == {number % 2}
+    assert arm.metadata == {"success": [True, False, True], "task": ["lift", "lift", "turn"]}
+    assert arm.specs([NEXT_STATE])[0].names == tuple(JOINTS)
+    assert (arm.task, arm.info["fps"]) == ("lift / turn", 10)
+    assert arm.description["environment"] == {"robot_type": "so101"}
+
+
+def test_parts_of_it_are_parts_of_the_whole(arm: Dataset) -> None:
+    names = [TIMESTAMP, NEXT_STATE, DONE, "index", "episode_uid"]
+    whole = arm.columns(names)
+    rows = np.r_[0:5, 13:16]
+    for name, array in arm.columns(names, episodes=[2, 0]).items():
+        np.testing.assert_array_equal(array, whole[name][rows], err_msg=name)
+    assert whole["episode_uid"].tolist() == [0] * 5 + [2] * 8 + [3] * 3
+    assert whole["index"].tolist() == list(range(16))
+
+
+def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
+    Dataset.open(recorded / "arm")
+    [line] = caplog.messages
+    assert "the last row of each episode, 4 of 20 rows; 1 of them in episodes of a single row" in line
+    assert line.endswith("left out, because they are not lists of numbers: observation.images.top")
+    assert "\n" not in line
+    assert caplog.records[0].levelno == logging.WARNING
+
+
+def test_lineage_names_what_was_read_by_its_hash(arm: Dataset, tmp_path: Path) -> None:
+    whole = Dataset.open(subset(arm, percent=100, out=tmp_path / "whole"))
+    assert whole.description["parents"] == [arm.identity]
+    # The hash of what was read is that of the same values, written by us.
+    assert whole.content_hash == arm.content_hash
+    assert check(whole.root).faults == []
+    assert arm.verify() == []
+
+
+def test_edits_take_it(arm: Dataset, tmp_path: Path) -> None:
+    assert len(Dataset.open(subset(arm, episodes=2, out=tmp_path / "two"))) == 2
+    won = Dataset.open(filter_episodes(arm, success=True, out=tmp_path / "won"))
+    assert won.uids.tolist() == [0, 3]
+    twice = Dataset.open(merge([arm, arm], new_uids=True, out=tmp_path / "twice"))
+    assert len(twice) == 6
+
+
+def test_inspection_shows_it(arm: Dataset) -> None:
+    inspection = inspect_dataset(arm)
+    assert (inspection.success, inspection.lengths.sum()) == (2, 16)
+    states = np.concatenate([values("arm", number)[STATE][:-1] for number in KEPT])
+    [spread] = [spread for spread in inspection.spreads if spread.column.name == STATE]
+    for found, expected in zip(
+        (spread.low, spread.high, spread.mean), (states.min(0), states.max(0), states.mean(0)), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert spread.counts.sum(axis=1).tolist() == [16] * 3
+
+
+@pytest.mark.parametrize("format", sorted(EXPORTERS))
+@pytest.mark.parametrize("case", ["arm", "ant"])
+def test_it_is_exported_and_comes_back(recorded: Path, tmp_path: Path, case: str, format: str) -> None:
+    recording = Dataset.open(recorded / case)
+    out = tmp_path / ("set-v0" if format == "minari" else "set.hdf5")
+    export(recording, out, format=format)
+    import_dataset([out], out=tmp_path / "back")
+    assert Dataset.open(tmp_path / "back").content_hash == recording.content_hash
+
+
+def test_the_commands_take_it(recorded: Path, tmp_path: Path) -> None:
+    (tmp_path / "glider.py").write_text(GLIDER)
+    source, pairs = str(recorded / "arm"), tmp_path / "pairs"
+    commands = [
+        ["inspect", source],
+        ["card", source, "--out", str(tmp_path / "card.md")],
+        ["pair", source, "--simulator", f"{tmp_path / 'glider.py'}:Glider", "--out", str(pairs)],
+        ["validate", str(pairs)],
+    ]
+    for command in commands:
+        result = CliRunner().invoke(app, command, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    assert "3 episodes, 16 steps at 10 Hz" in (tmp_path / "card.md").read_text()
+    columns = Dataset.open(pairs).columns([STATE, ACTION, NEXT_STATE, "abstract.simulated_next_state"])
+    expected = columns[STATE][:, :2] + np.float32(0.1) * columns[ACTION]
+    np.testing.assert_allclose(columns["abstract.simulated_next_state"], expected, rtol=1e-6)
+
+
+def test_it_is_grounded(recorded: Path, tmp_path: Path) -> None:
+    from small_run import GROUND  # noqa: PLC0415 - torch
+
+    from astra_data.stages.ground import ground  # noqa: PLC0415
+    from astra_data.stages.pair import pair  # noqa: PLC0415
+
+    pairs = pair("antmaze-umaze", dataset=recorded / "ant", out=tmp_path / "pairs")
+    few = GROUND.model_copy(update={"updates": 2})
+    ground("antmaze-umaze", "nas", few, dataset=pairs, out=tmp_path / "nas")
+    assert (tmp_path / "nas/grounding.safetensors").is_file()
+    with pytest.raises(BadInputError, match=r"no next\.reward, which the method predicts: .*such as nas"):
+        ground("antmaze-umaze", "astra", few, dataset=pairs, out=tmp_path / "astra")
+
+
+def test_augmenting_needs_roles_and_says_so(recorded: Path, tmp_path: Path) -> None:
+    from astra_data.stages.augment import augment  # noqa: PLC0415 - torch
+
+    with pytest.raises(BadInputError, match=r"no column next\.reward.*it has no roles"):
+        augment("antmaze-umaze", dataset=recorded / "ant", out=tmp_path / "more")
+
+
+def test_what_cannot_be_is_one_line(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"blind, recorded by LeRobot, has no observation\.state"):
+        Dataset.open(recorded / "blind")
+    with pytest.raises(BadInputError, match="1 episodes have the episode_uid of an earlier one"):
+        Dataset.open(recorded / "merged")
+    with pytest.raises(BadInputError, match="recorded by LeRobot: make a dataset of it first"):
+        push(recorded / "arm", str(tmp_path / "shared"))
+    shutil.copytree(recorded / "ant", tmp_path / "old")
+    info = tmp_path / "old/meta/info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"codebase_version": "v2.1"}))
+    with pytest.raises(BadInputError, match=r"format v2\.1, expected v3\.0: convert it"):
+        Dataset.open(tmp_path / "old")
+
+
+@pytest.mark.parametrize(
+    ("column", "changes", "fault"),
+    [
+        (ACTION, {3: [float("nan"), 0.0]}, "action is nan in episode 0 frame 3"),
+        ("frame_index", {70: 3}, "frame_index is 3 in episode 1 frame 10, expected 10"),
+    ],
+)
+def test_damage_is_found_before_anything_is_made_of_it(
+    recorded: Path, tmp_path: Path, column: str, changes: dict[int, object], fault: str
+) -> None:
+    shutil.copytree(recorded / "ant", tmp_path / "set")
+    alter_rows(tmp_path / "set" / DATA, column, changes)
+    with pytest.raises(CorruptDatasetError, match=fault):
+        Dataset.open(tmp_path / "set")
+
+
+def test_rows_that_are_missing_are_found(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "ant", tmp_path / "set")
+    table = pq.read_table(tmp_path / "set" / DATA)
+    pq.write_table(table.slice(0, 110), tmp_path / "set" / DATA)
+    with pytest.raises(CorruptDatasetError, match="2 episodes of 110 rows, expected 3 of 150"):
+        Dataset.open(tmp_path / "set")
+
+
+def test_files_altered_after_opening_are_told(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "ant", tmp_path / "set")
+    dataset = Dataset.open(tmp_path / "set")
+    pq.write_table(pq.read_table(tmp_path / "set" / DATA).slice(0, 140), tmp_path / "set" / DATA)
+    with pytest.raises(CorruptDatasetError, match="its files were altered while they were read"):
+        dataset.columns([STATE])
+
+
+def test_a_dataset_of_ours_without_its_metadata_keeps_uids_and_next_states(tmp_path: Path) -> None:
+    from fake_transitions import write_transitions  # noqa: PLC0415
+
+    ours = write_transitions(tmp_path / "set")
+    shutil.copytree(ours.root, tmp_path / "bare")
+    shutil.rmtree(tmp_path / "bare/meta/astra")
+    bare = Dataset.open(tmp_path / "bare")
+    assert bare.uids.tolist() == ours.uids.tolist()
+    assert bare.content_hash == ours.content_hash
+
+
+def merged_episodes(recorded: Path) -> list[dict[str, Array]]:
+    return [
+        dict(episode.columns) for name in ("a", "b") for episode in Dataset.open(recorded / name).episodes()
+    ]
+
+
+def test_a_merge_of_lerobot_keeps_every_episode_under_new_uids(recorded: Path, tmp_path: Path) -> None:
+    sources = [Dataset.open(recorded / name) for name in ("a", "b")]
+    arguments = ["repair", str(recorded / "merged"), "--out", str(tmp_path / "set"), "--new-uids"]
+    for source in sources:
+        arguments += ["--like", str(source.root)]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert "1 episodes have new uids, because theirs were taken" in result.output
+    saved = Dataset.open(tmp_path / "set")
+    uids = saved.uids.tolist()
+    assert uids[:5] + uids[6:] == [*sources[0].uids.tolist(), 7]
+    assert len(set(uids)) == 7
+    for found, expected in zip(saved.episodes(), merged_episodes(recorded), strict=True):
+        for name, array in expected.items():
+            np.testing.assert_array_equal(found.columns[name], array, err_msg=name)
+    assert saved.metadata["return"] == [*sources[0].metadata["return"], -1.0, -1.0]
+    assert saved.metadata["merged_uid"] == [None] * 5 + [13, None]
+    # Both came from episode 13 of `b`, which has another uid now; those of `a` follow their own.
+    assert saved.metadata["source_episode"][5:] == [uids[5], uids[5]]
+    assert saved.metadata["source_episode"][:5] == sources[0].metadata["source_episode"]
+    assert saved.description["parents"] == [source.identity for source in sources]
+    repair(recorded / "merged", out=tmp_path / "again", like=sources, new_uids=True)
+    assert Dataset.open(tmp_path / "again").uids.tolist() == uids
+
+
+def test_metadata_of_a_merge_is_never_that_of_another_dataset(recorded: Path, tmp_path: Path) -> None:
+    like = Dataset.open(recorded / "b")
+    result = repair(recorded / "merged", out=tmp_path / "set", like=like, new_uids=True)
+    saved = Dataset.open(tmp_path / "set")
+    assert saved.metadata["return"] == [None] * 5 + [-1.0, -1.0]
+    assert "5 episodes have no metadata: they are not among the known ones" in result.notes

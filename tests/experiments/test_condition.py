@@ -1,0 +1,175 @@
+"""The condition of artefacts that fake stages made, with real manifests."""
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli import app as cli
+from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
+from astra_data.core.manifest import MANIFEST
+from astra_data.core.progress import silent
+from astra_data.experiments.execution import Item
+from astra_data.experiments.run import check, run, run_stage
+
+pytestmark = pytest.mark.usefixtures("fake_recipe")
+GROUND, TRAIN, ALIGN, EVALUATE = (
+    f"{stage}/astra/seed_0" for stage in ("ground", "train", "align", "evaluate")
+)
+PLUS = ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0")
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    def execute(items: Iterable[Item], **_: object) -> None:
+        for item in items:
+            item.call(progress=silent)
+
+    monkeypatch.setattr("astra_data.experiments.run.execute", execute)
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "r.toml"
+    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n')
+    return path
+
+
+@pytest.fixture
+def folder(recipe: Path, tmp_path: Path) -> Path:
+    return run(recipe, root=tmp_path, jobs=1)
+
+
+def states(recipe: Path, *, verify: bool = False) -> dict[str, tuple[str, str]]:
+    found = check(recipe, root=recipe.parent, verify=verify)
+    return {key: (of.state, of.why) for key, of in found.items() if (of.state, of.why) != ("finished", "")}
+
+
+def made_again(folder: Path) -> list[str]:
+    aside = folder / "set_aside"
+    return sorted(path.relative_to(aside).as_posix() for path in aside.rglob("seed_0"))
+
+
+def test_an_emptied_file_is_found_and_made_again(
+    recipe: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = folder / TRAIN / "policy.safetensors"
+    whole = policy.read_bytes()
+    policy.write_bytes(b"")
+    why = f"policy.safetensors has 0 bytes, expected {len(whole)}"
+    assert states(recipe) == {TRAIN: ("damaged", why)}
+    capsys.readouterr()
+    run(recipe, root=recipe.parent, jobs=1)
+    assert policy.read_bytes() == whole
+    assert states(recipe) == {}
+    lines = capsys.readouterr().out.splitlines()[:2]
+    aside = folder / "set_aside/1"
+    assert lines == [
+        f"{TRAIN} is made again: damaged ({why}); the old one is in {aside / TRAIN}",
+        f"{EVALUATE} is made again: made from {TRAIN}; the old one is in {aside / EVALUATE}",
+    ]
+    assert (aside / TRAIN / "policy.safetensors").read_bytes() == b""
+    assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}"]
+
+
+def test_what_is_set_aside_twice_is_there_twice(recipe: Path, folder: Path) -> None:
+    for _ in range(2):
+        (folder / EVALUATE / "evaluation.json").unlink()
+        run(recipe, root=recipe.parent, jobs=1)
+    assert made_again(folder) == [f"1/{EVALUATE}", f"2/{EVALUATE}"]
+
+
+def test_altered_bytes_are_found_where_a_step_reads_them(recipe: Path, folder: Path) -> None:
+    grounding = folder / GROUND / "grounding.safetensors"
+    whole = grounding.read_bytes()
+    grounding.write_bytes(b"x" + whole[1:])
+    assert states(recipe) == {}
+    assert states(recipe, verify=True)[GROUND] == ("damaged", "grounding.safetensors was altered")
+    run(recipe, root=recipe.parent, jobs=1)
+    assert grounding.read_bytes() != whole, "no step reads the grounding"
+    shutil.rmtree(folder / PLUS[1])
+    run(recipe, root=recipe.parent, jobs=1)
+    assert grounding.read_bytes() == whole
+    assert made_again(folder) == sorted(f"1/{key}" for key in (GROUND, TRAIN, ALIGN, EVALUATE, PLUS[0]))
+
+
+def test_a_damaged_input_of_one_stage_is_refused_with_what_to_run(recipe: Path, folder: Path) -> None:
+    grounding = folder / GROUND / "grounding.safetensors"
+    grounding.write_bytes(b"x" + grounding.read_bytes()[1:])
+    shutil.rmtree(folder / TRAIN)
+    with pytest.raises(MissingStageError) as caught:
+        run_stage(recipe, "train", root=recipe.parent)
+    assert str(caught.value) == (
+        f"{folder / GROUND} is damaged (grounding.safetensors was altered): "
+        f"run `astra-data ground {recipe} --root {recipe.parent}` first"
+    )
+
+
+def test_an_artefact_of_another_input_is_stale(recipe: Path, folder: Path) -> None:
+    shutil.rmtree(folder / "collect/seed_0")
+    run(recipe, root=recipe.parent, jobs=1)
+    assert states(recipe) == {}, "the same episodes again"
+    description = folder / "collect/seed_0/dataset.json"
+    description.write_text(json.dumps(json.loads(description.read_text()) | {"content_hash": "other"}))
+    stale = ("stale", "made from another collect/seed_0")
+    assert states(recipe) == {"pair/seed_0": stale}
+    run(recipe, root=recipe.parent, jobs=1, until="pair")
+    assert made_again(folder) == ["1/pair/seed_0"]
+    assert json.loads((folder / "pair/seed_0/dataset.json").read_text())["parents"] == [{"hash": "other"}]
+
+
+def test_a_file_that_somebody_added_is_a_remark(recipe: Path, folder: Path) -> None:
+    (folder / TRAIN / "notes.txt").touch()
+    assert states(recipe) == {TRAIN: ("finished", "not of it: notes.txt")}
+    run(recipe, root=recipe.parent, jobs=1)
+    assert (folder / TRAIN / "notes.txt").exists()
+
+
+def test_artefacts_without_manifests_are_finished_as_in_0_1(recipe: Path, folder: Path) -> None:
+    for path in folder.rglob(MANIFEST):
+        path.unlink()
+    remark = ("finished", "no manifest (made by 0.1)")
+    made = {GROUND, TRAIN, ALIGN, EVALUATE, *PLUS, "report"}
+    assert states(recipe) == dict.fromkeys(made, remark)
+    run(recipe, root=recipe.parent, jobs=1)
+    assert not (folder / "set_aside").exists()
+    (folder / TRAIN / "policy.safetensors").write_bytes(b"")
+    assert states(recipe)[TRAIN] == ("damaged", "policy.safetensors is missing or empty")
+    run(recipe, root=recipe.parent, jobs=1)
+    assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}"]
+    assert TRAIN not in states(recipe)
+
+
+def test_a_damaged_manifest_is_damage(recipe: Path, folder: Path) -> None:
+    (folder / TRAIN / MANIFEST).write_text("{")
+    state, why = states(recipe)[TRAIN]
+    assert state == "damaged" and why.startswith("manifest.json cannot be read")
+
+
+def test_a_damaged_dataset_that_no_stage_made_is_not_replaced(recipe: Path, folder: Path) -> None:
+    description = folder / "collect/seed_0/dataset.json"
+    description.write_text("{")
+    with pytest.raises(BadInputError, match=r"collect/seed_0 is damaged .* and was not made by this recipe"):
+        run(recipe, root=recipe.parent)
+    assert description.read_text() == "{"
+    assert not (folder / "set_aside").exists()
+
+
+def test_the_command_lists_what_is_wrong_and_fails(recipe: Path, folder: Path) -> None:
+    def call(*options: str) -> tuple[str, BaseException | None]:
+        result = CliRunner().invoke(cli.app, ["check", str(recipe), "--root", str(recipe.parent), *options])
+        return result.output, result.exception
+
+    grounding = folder / GROUND / "grounding.safetensors"
+    grounding.write_bytes(b"x" + grounding.read_bytes()[1:])
+    output, error = call()
+    assert "9 of 9 items are finished" in output and error is None
+    shutil.rmtree(folder / PLUS[1])
+    output, error = call("--verify")
+    assert f"  damaged   {GROUND}: grounding.safetensors was altered\n" in output
+    assert f"  to do     {PLUS[1]}\n" in output
+    assert isinstance(error, AstraDataError)
+    assert f"{recipe}: " in str(error) and "damaged" in str(error) and "astra-data run" in str(error)

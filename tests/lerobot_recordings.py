@@ -1,0 +1,77 @@
+"""Datasets recorded by lerobot itself: `python lerobot_recordings.py FOLDER A B` makes one folder per case.
+
+arm      4 episodes of two tasks, with a camera, rewards, forces as float64; one has a single row
+ant      3 episodes of a state and an action
+blind    cameras and actions, without a state
+merged   our datasets A and B, merged by lerobot's tools
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+JOINTS = ["shoulder", "elbow", "wrist"]
+ARM: dict[str, Any] = {
+    "observation.state": {"dtype": "float32", "shape": (3,), "names": {"motors": JOINTS}},
+    "action": {"dtype": "float32", "shape": (2,), "names": ["lift", "turn"]},
+    "force": {"dtype": "float64", "shape": (2,), "names": None},
+    "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+    "observation.images.top": {
+        "dtype": "image",
+        "shape": (8, 8, 3),
+        "names": ["height", "width", "channels"],
+    },
+}
+ANT: dict[str, Any] = {
+    "observation.state": {"dtype": "float32", "shape": (29,), "names": None},
+    "action": {"dtype": "float32", "shape": (2,), "names": None},
+}
+BLIND = {name: ARM[name] for name in ("action", "observation.images.top")}
+LENGTHS = {"arm": (6, 1, 9, 4), "ant": (60, 50, 40), "blind": (3,)}
+TASKS = ("lift", "turn")
+FPS = 10
+
+
+def values(case: str, episode: int) -> dict[str, Any]:
+    """The columns of an episode, (T,) or (T, size)."""
+    rng, steps = np.random.default_rng([len(case), episode]), LENGTHS[case][episode]
+    last = np.arange(steps) == steps - 1
+    size = 3 if case == "arm" else 29
+    return {
+        "observation.state": rng.normal(size=(steps, size)).astype(np.float32),
+        "action": rng.uniform(-1, 1, size=(steps, 2)).astype(np.float32),
+        "force": rng.normal(size=(steps, 2)),
+        "next.reward": rng.normal(size=steps).astype(np.float32),
+        "next.done": last,
+        "next.success": last & (episode != 2),
+        "observation.images.top": np.zeros((steps, 8, 8, 3), np.uint8),
+    }
+
+
+def main(folder: Path, merged: list[Path]) -> None:
+    from lerobot.datasets.aggregate import aggregate_datasets  # noqa: PLC0415 - takes seconds
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415
+
+    for case, features in {"arm": ARM, "ant": ANT, "blind": BLIND}.items():
+        robot = "so101" if case == "arm" else None
+        dataset = LeRobotDataset.create(
+            "a/b", FPS, features, root=folder / case, robot_type=robot, use_videos=False
+        )
+        for episode, steps in enumerate(LENGTHS[case]):
+            columns = values(case, episode)
+            task = TASKS[episode % 2] if case == "arm" else TASKS[0]
+            for frame in range(steps):
+                row = {name: np.atleast_1d(columns[name][frame]) for name in features}
+                dataset.add_frame({**row, "task": task})
+            dataset.save_episode()
+        dataset.finalize()
+    ids = [f"a/{number}" for number in range(len(merged))]
+    aggregate_datasets(ids, "a/merged", roots=merged, aggr_root=folder / "merged")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), [Path(path) for path in sys.argv[2:]])

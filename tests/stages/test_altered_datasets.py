@@ -1,0 +1,147 @@
+"""No command makes anything of a dataset that was altered, and each takes one with all its values."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from damaged import DATA, alter, as_in_0_1, drop, edit
+from numpy.typing import NDArray
+from small_run import TASK
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset
+from astra_data.dataset.compare import differences
+from astra_data.dataset.edit import delete, filter_episodes, merge, subset
+from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, METADATA_PATH, SUBSETS_PATH
+from astra_data.dataset.inspection import inspect_dataset
+from astra_data.exchange.exporters import export
+from astra_data.exchange.sharing.card import write_card
+from astra_data.exchange.sharing.notes import Notes
+from astra_data.exchange.sharing.push import push
+from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.pair import PairConfig, pair
+
+Command = Callable[[Path, Path], object]
+"""Read a dataset and write to a path."""
+Rows = NDArray[np.int64]
+
+
+def opened(root: Path) -> Dataset:
+    return Dataset.open(root)
+
+
+COMMANDS: dict[str, Command] = {
+    "subset": lambda root, out: subset(opened(root), percent=100, out=out),
+    "merge": lambda root, out: merge([opened(root), opened(root)], new_uids=True, out=out),
+    "delete": lambda root, out: delete(opened(root), [int(opened(root).uids[-1])], out=out),
+    "filter": lambda root, out: filter_episodes(opened(root), min_length=1, out=out),
+    "augment": lambda root, out: augment(
+        TASK, AugmentConfig(episodes=10), dataset=root, seed=0, out=out, progress=silent
+    ),
+    "pair": lambda root, out: pair(TASK, PairConfig(), dataset=root, out=out, progress=silent),
+    "card": lambda root, out: write_card(opened(root), out, Notes()),
+    "export": lambda root, out: export(opened(root), out, format="d4rl"),
+    "diff": lambda root, _: differences(opened(root), opened(root)),
+    "inspect": lambda root, _: inspect_dataset(opened(root)),
+    "push": lambda root, out: push(root, f"file://{out}"),
+}
+
+
+def reorder(rows: Callable[[Dataset], Rows]) -> Callable[[Path], None]:
+    """Move whole rows of the data file."""
+
+    def change(root: Path) -> None:
+        order = rows(opened(root))
+        pq.write_table(pq.read_table(root / DATA).take(order), root / DATA)
+
+    return change
+
+
+def one_row_group(root: Path) -> None:
+    pq.write_table(pq.read_table(root / DATA), root / DATA, compression="zstd")
+
+
+def reversed_first_episode(dataset: Dataset) -> Rows:
+    order, length = np.arange(dataset.lengths.sum()), dataset.lengths[0]
+    order[:length] = order[:length][::-1]
+    return order
+
+
+def swapped_episodes(dataset: Dataset) -> Rows:
+    first, second = dataset.lengths[:2]
+    order = np.arange(dataset.lengths.sum())
+    return np.concatenate([order[first : first + second], order[:first], order[first + second :]])
+
+
+def reversed_subsets(root: Path) -> None:
+    uids = json.loads((root / SUBSETS_PATH).read_text())["uids"]
+    edit(SUBSETS_PATH, uids=uids[::-1])(root)
+
+
+def another_unit(root: Path) -> None:
+    features = json.loads((root / INFO_PATH).read_text())["features"]
+    features["action"]["astra"]["unit"] = ["km"] * features["action"]["shape"][0]
+    edit(INFO_PATH, features=features)(root)
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a value": (alter(DATA, "next.reward", 5, 9.0), rf"next\.reward: other values .* {DATA} rows 0 to \d+ "),
+    "rows of an episode": (reorder(reversed_first_episode), r"rows 0 to \d+ \(episode 0\)"),
+    "two episodes": (reorder(swapped_episodes), r"other values than were written in .*\(episode 0\)"),
+    "a success": (alter(METADATA_PATH, "success", 0, None), f"{METADATA_PATH} was altered"),
+    "the order of subsets": (reversed_subsets, f"{SUBSETS_PATH} was altered"),
+    "a unit": (another_unit, f"{INFO_PATH} was altered"),
+    "the provenance": (edit(DATASET_PATH, seeds={"collect": 7}), f"{DATASET_PATH} was altered"),
+}
+HARMLESS: dict[str, Callable[[Path], object]] = {
+    "one row group": one_row_group,
+    "no digests file": drop(DIGESTS_PATH),
+    "an altered digest": alter(DIGESTS_PATH, "next.reward", 0, 1),
+    "a dataset of version 0.1": as_in_0_1,
+}
+
+
+@pytest.fixture
+def copied(task: str, collected: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(collected, tmp_path / "set"))
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_nothing_is_made_of_altered_data(command: str, damage: str, copied: Path) -> None:
+    change, sentence = DAMAGE[damage]
+    change(copied)
+    with pytest.raises(CorruptDatasetError, match=sentence) as caught:
+        COMMANDS[command](copied, copied.with_name("made"))
+    assert "\n" not in str(caught.value)
+    assert "Restore it from a copy" in str(caught.value)
+    assert list(copied.parent.iterdir()) == [copied]
+
+
+@pytest.mark.parametrize("change", HARMLESS)
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "push"])
+def test_data_with_all_its_values_is_taken(command: str, change: str, copied: Path) -> None:
+    HARMLESS[change](copied)
+    COMMANDS[command](copied, copied.with_name("made"))
+
+
+@pytest.mark.parametrize("change", [drop(DIGESTS_PATH), alter(DIGESTS_PATH, "next.reward", 0, 1)])
+def test_what_is_incomplete_is_not_shared(change: Callable[[Path], object], copied: Path) -> None:
+    change(copied)
+    with pytest.raises(CorruptDatasetError, match=f"{DIGESTS_PATH} was altered after it was written"):
+        push(copied, f"file://{copied.with_name('made')}")
+    assert list(copied.parent.iterdir()) == [copied]
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "push"])
+def test_values_of_version_0_1_are_compared_with_the_content_hash(command: str, copied: Path) -> None:
+    as_in_0_1(copied)
+    alter(DATA, "next.reward", 5, 9.0)(copied)
+    with pytest.raises(CorruptDatasetError, match="the content hash is"):
+        COMMANDS[command](copied, copied.with_name("made"))
+    assert list(copied.parent.iterdir()) == [copied]
