@@ -18,6 +18,7 @@ from astra_data.dataset.reader import Dataset
 
 MOST_FAULTS = 3
 """Faults of a record that are listed."""
+Uid = Annotated[int, Field(ge=0, lt=2**63)]
 Fact = bool | int | float | str | None
 
 
@@ -59,7 +60,7 @@ class ExportRecord(Config):
     """LeRobot's features of the columns, with our units, frames and roles."""
     places: dict[str, Place]
     """Where each column lies."""
-    uids: tuple[Number, ...]
+    uids: tuple[Uid, ...]
     """Uid of each episode."""
     lengths: tuple[Count, ...]
     """Steps of each episode."""

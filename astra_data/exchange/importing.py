@@ -4,14 +4,13 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from astra_data.core.config import did_you_mean, load_recipe, validated
-from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
@@ -23,12 +22,12 @@ from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import (
-    MOST_UNPACKED,
-    SMALL_BYTES,
     VALUE_BYTES,
     Block,
     Source,
+    bounded,
     find_sources,
+    identities,
     is_archive,
 )
 from astra_data.exchange.restoring import read_record, restored, write_restored
@@ -121,7 +120,7 @@ def import_dataset(
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
-    sources = _bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes)
+    sources = bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes)
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
@@ -129,7 +128,7 @@ def import_dataset(
     for source, record in records.items():
         episodes = _restored(source, chosen, record)
         if settings is None:
-            root, frames = write_restored(sources, record, episodes, options, _identities(sources), out)
+            root, frames = write_restored(sources, record, episodes, options, identities(sources), out)
             seconds = time.perf_counter() - began
             return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
         deque(episodes, maxlen=0)  # verifies the sums
@@ -144,7 +143,7 @@ def import_dataset(
         "name": settings.name,
         "version": settings.version,
         "stage": "import",
-        "config": settings.model_dump(exclude_defaults=True) | {"recordings": _identities(sources)},
+        "config": settings.model_dump(exclude_defaults=True) | {"recordings": identities(sources)},
     }
     root = place(description) if out is None else out
     frames = count = 0
@@ -196,14 +195,6 @@ def _format_of(recording: Path) -> str:
     raise BadInputError(
         f"{recording}: its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
     )
-
-
-def _bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
-    """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
-    if max_bytes is None:
-        size = sum(file.stat().st_size for file in _files(sources))
-        max_bytes = max(SMALL_BYTES, MOST_UNPACKED * size)
-    return [replace(source, most_bytes=max_bytes) for source in sources]
 
 
 def _suffixes(module: ModuleType) -> tuple[str, ...]:
@@ -294,15 +285,3 @@ def _losses(tally: Tally) -> str:
 def _last_rows(tally: Tally) -> str:
     lost = f" (with them a reward of {tally.last_reward:g} in sum)" if tally.last_reward else ""
     return f"{tally.last_rows}{lost}"
-
-
-def _identities(sources: Sequence[Source]) -> list[dict[str, str]]:
-    """Return name and sha256 of every file of the recordings."""
-    return [{"name": file.name, "sha256": file_digest(file)} for file in _files(sources)]
-
-
-def _files(sources: Sequence[Source]) -> list[Path]:
-    files: list[Path] = []
-    for path in dict.fromkeys(source.path for source in sources):
-        files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    return files

@@ -4,11 +4,12 @@ import re
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
 from typing import IO
 
 from astra_data.core.config import did_you_mean
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 
@@ -174,3 +175,23 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
     return next(iter(lengths.values()))
+
+
+def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
+    """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
+    if max_bytes is None:
+        size = sum(file.stat().st_size for file in _files_of(sources))
+        max_bytes = max(SMALL_BYTES, MOST_UNPACKED * size)
+    return [replace(source, most_bytes=max_bytes) for source in sources]
+
+
+def identities(sources: Sequence[Source]) -> list[dict[str, str]]:
+    """Return name and sha256 of every file of the recordings."""
+    return [{"name": file.name, "sha256": file_digest(file)} for file in _files_of(sources)]
+
+
+def _files_of(sources: Sequence[Source]) -> list[Path]:
+    files: list[Path] = []
+    for path in dict.fromkeys(source.path for source in sources):
+        files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    return files

@@ -67,6 +67,9 @@ def test_failures_come_back_and_stop_the_others(address: str, tmp_path: Path) ->
         execute_on_cluster(lost, address=address, jobs=1, logs=tmp_path, watch=Record())
 
 
+NAMING_FOLDERS = ("asked.json", "dataset.json", "manifest.json")
+
+
 def test_a_sweep_on_a_cluster_writes_what_processes_write(
     address: str, tmp_path: Path, fake_recipe: object
 ) -> None:
@@ -83,7 +86,7 @@ def test_a_sweep_on_a_cluster_writes_what_processes_write(
         {
             path.relative_to(folder): path.read_text().replace(str(folder), "")
             for path in folder.rglob("*")
-            if path.is_file() and path.name != "asked.json"
+            if path.is_file() and path.name not in NAMING_FOLDERS
         }
         for folder in folders
     ]

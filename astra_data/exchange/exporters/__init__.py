@@ -48,8 +48,8 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
     """Write `dataset` to `out` in the layout of the library `format`; rewards are 0 where it has none.
 
     Raises:
-        BadInputError: the format is unknown, a column or a package that it needs is missing, `out` exists or
-            cannot be written.
+        BadInputError: the format is unknown, a column or a package that it needs is missing, or `out` exists.
+        DiskError: `out` cannot be written; nothing is left of it.
         CorruptDatasetError: what was written does not read as the dataset does.
     """
     if format not in EXPORTERS:
@@ -60,13 +60,9 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
     if REWARD not in dataset.features:
         _log.warning("%s has no %s: rewards are written as 0", dataset.reference, REWARD)
     exporter = EXPORTERS[format]
-    try:
-        with exporter.place(out) as path:
-            exporter.write(dataset, path, out)
-            _compare(exporter.importer, path, out)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise BadInputError(f"{out} cannot be written: {reason}; nothing is left of it") from error
+    with exporter.place(out) as path:
+        exporter.write(dataset, path, out)
+        _compare(exporter.importer, path, out)
 
 
 def _compare(importer: ModuleType, path: Path, out: Path) -> None:

@@ -145,7 +145,7 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(dataset: Dataset, tmp_path
     assert len(results) == len(cases) == 12
     for number, (status, line) in enumerate(results):
         assert (status, line.count("\n")) == (1, 1), (cases[number], line)
-        assert "cannot be written: File too large" in line
+        assert "cannot be written: a file would be larger than is allowed" in line
         assert list((tmp_path / str(number)).iterdir()) == []
 
 
