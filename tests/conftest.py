@@ -28,6 +28,7 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     plan, recipe, experiment = (
         importlib.import_module(f"astra_data.experiments.{name}") for name in ("plan", "recipe", "experiment")
     )
+    registry = importlib.import_module("astra_data.worlds.registry")
     stages = {
         name: dataclasses.replace(stage, run=getattr(fake_stages, name), config=fake_stages.CONFIGS.get(name))
         for name, stage in plan.STAGES.items()
@@ -36,9 +37,7 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     monkeypatch.setattr(plan, "STAGES", stages)
     for module in (plan, recipe, experiment):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
-    monkeypatch.setitem(fake_stages.TASKS, "maze", recipe.TASKS["antmaze-umaze"])
-    for module in (recipe, experiment):
-        monkeypatch.setattr(module, "TASKS", fake_stages.TASKS)
+    monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
     monkeypatch.setattr(experiment, "Recipe", model)
     condition = importlib.import_module("astra_data.experiments.condition")
     monkeypatch.setattr(condition, "Dataset", fake_stages.FakeDataset)

@@ -94,9 +94,6 @@ METHODS = {
     "fine_tuned": FakeMethod(grounds=False, aligns=False, trains=True, initial="direct_transfer"),
 }
 
-TASKS: dict[str, Any] = {}
-"""Of tests: "maze", which is a real one."""
-
 
 def _write(
     config: FakeConfig,

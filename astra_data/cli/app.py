@@ -21,6 +21,7 @@ from astra_data.cli import (
     recipes,
     sharing,
     sweeping,
+    tasks,
 )
 from astra_data.core.disk import disk_error
 from astra_data.core.durable import NO_FSYNC
@@ -70,6 +71,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "evaluate": recipes.evaluate,
         "report": recipes.report,
         "gap": predicting.gap,
+        "tasks": tasks.tasks,
     },
     "Recipes or datasets": {
         "collect": building.collect,
@@ -77,6 +79,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "subset": editing.subset,
     },
     "Datasets": {
+        "label": tasks.label,
         "augment": augmenting.augment,
         "merge": editing.merge,
         "delete": editing.delete,

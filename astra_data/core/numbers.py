@@ -1,5 +1,8 @@
-"""Normalisation of network inputs."""
+"""Normalisation of network inputs, and the shapes of columns."""
 
+from typing import Any
+
+import numpy as np
 from torch import Tensor
 
 
@@ -10,3 +13,13 @@ def normalised(state: Tensor, mean: Tensor | float, std: Tensor | float) -> Tens
     diverges.
     """
     return ((state - mean) / std).clamp(-5.0, 5.0)
+
+
+def as_rows[Values: np.ndarray[Any, Any]](values: Values) -> Values:
+    """Return a column of a dataset (T,) or (T, size) as rows, (T, size)."""
+    return values.reshape(len(values), -1)  # type: ignore[return-value]
+
+
+def as_column[Values: np.ndarray[Any, Any]](rows: Values) -> Values:
+    """Return rows (T, ...) as a column of a dataset: (T,) where there is one value per step."""
+    return rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # type: ignore[return-value]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.config import did_you_mean, load_tables, validated
-from astra_data.core.errors import RecipeError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import base_method, is_plus
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
@@ -25,7 +25,7 @@ from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
 from astra_data.stages.registry import STAGES
-from astra_data.worlds.registry import TASKS
+from astra_data.worlds.registry import task_named
 
 ALWAYS_NEW = {"report"}
 """Made by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
@@ -181,7 +181,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     Raises:
         RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
     """
-    tables = with_current_keys(load_tables(path), path)
+    tables = _tables(path)
     folder = root / path.stem
     if "based_on" not in tables:
         return Experiment(validated(tables, Recipe, str(path)), path, folder)
@@ -190,13 +190,20 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     if name not in known:
         raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
     base_path = path.with_name(f"{name}.toml")
-    base_tables = with_current_keys(load_tables(base_path), base_path)
+    base_tables = _tables(base_path)
     if "based_on" in base_tables:
         raise RecipeError(f"{path}: based_on: expected a recipe that is based on none itself, got '{name}'")
     base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)
     recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
     _check_fit(recipe, base, path)
     return Experiment(recipe, path, folder, base)
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    """Return the tables of a recipe; a task in a file is looked up beside it."""
+    tables = with_current_keys(load_tables(path), path)
+    task = tables.get("task")
+    return tables | {"task": str(path.parent / task)} if isinstance(task, str) and ".py:" in task else tables
 
 
 def _reads(row: str, table: str) -> bool:
@@ -240,7 +247,10 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
 
 
 def _share_target(task: str, other: str) -> bool:
-    return task in TASKS and TASKS[task].shares_target(TASKS[other])
+    try:
+        return task_named(task).shares_target(task_named(other))
+    except BadInputError:
+        return False
 
 
 def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from astra_data.dataset.edit import share
 from astra_data.methods import METHODS, tables
 from astra_data.methods.method import Table
 from astra_data.stages.registry import STAGES, Stage
-from astra_data.worlds.registry import TASKS
+from astra_data.worlds.registry import task_named
 from astra_data.worlds.score import Score
 
 WHOLE = 100
@@ -43,7 +43,7 @@ class Recipe(Config):
     """
 
     task: str
-    """A name in `astra_data.worlds.registry.TASKS`."""
+    """A task of the package or of an installed one, or of a file beside the recipe: "cart.py:TASK"."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
     seeds: tuple[int, ...] = Field(min_length=1)
@@ -61,7 +61,7 @@ class Recipe(Config):
     @property
     def headline(self) -> Score:
         """The score by which its rows are compared first."""
-        return TASKS[self.task].objective.scores[0]
+        return task_named(self.task).objective.scores[0]
 
     def settings_of(self, row: str, stage: str) -> Config | None:
         """Return the settings of a row's method, if it has any and `stage` takes them.
@@ -73,7 +73,7 @@ class Recipe(Config):
             return None
         table: Any = getattr(self, method.table.name)
         if method.table.ranges and stage == "train":
-            table = table.of_kind(type(getattr(TASKS[self.task].varied, method.table.ranges)))
+            table = table.of_kind(type(getattr(task_named(self.task).varied, method.table.ranges)))
         settings: Config = table
         return settings
 
@@ -99,8 +99,10 @@ class Recipe(Config):
     @field_validator("task")
     @classmethod
     def _is_known_task(cls, task: str) -> str:
-        if task not in TASKS:
-            raise ValueError(f"unknown task '{task}'{did_you_mean(task, TASKS)}")
+        try:
+            task_named(task)
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
         return task
 
     @field_validator("methods")
@@ -120,7 +122,7 @@ class Recipe(Config):
     def _fits_the_learner(self) -> Self:
         if self.train.learner != "ppo" and "rma" in map(base_method, self.methods):
             raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
-        if self.collect.behavior == "suboptimal_sac" and not TASKS[self.task].objective.is_lasting:
+        if self.collect.behavior == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: take 'suboptimal_ppo'")
         return self
 
@@ -155,7 +157,7 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _fits_the_task(self) -> Self:
-        if TASKS[self.task].plane is not None:
+        if task_named(self.task).plane is not None:
             return self
         faults = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].planar]
         asked = {
@@ -231,7 +233,7 @@ def _laid_over(ranges: Literal["randomized", "wide"]) -> Callable[..., Any]:
     def read(overrides: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
         if "task" not in info.data or not isinstance(overrides, dict):
             return check(overrides)
-        usual = getattr(TASKS[info.data["task"]].varied, ranges)
+        usual = getattr(task_named(info.data["task"]).varied, ranges)
         found = check(usual.model_dump() | overrides)
         try:
             found.of_kind(type(usual))

@@ -24,6 +24,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
 from astra_data.learning.recorded import draw_steps
+from astra_data.worlds.commands import Commands
 
 _COLUMNS = (
     *(STATE, ACTION, TERMINATED),
@@ -44,6 +45,7 @@ class PairedEpisodes:
         content_hash: its hash.
         held_out: the episodes that the dataset marks as held out, (E,) bool; None if it marks none.
         dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
+        commands: the bounds of the commands, where these are not ±1 in their own units.
         has_rewards: whether rewards were recorded; otherwise they are 0 here.
     """
 
@@ -55,6 +57,7 @@ class PairedEpisodes:
     content_hash: str
     held_out: Tensor | None = None
     dropped_place: tuple[int, ...] = ()
+    commands: Commands | None = None
     has_rewards: bool = True
 
     @property
@@ -64,7 +67,7 @@ class PairedEpisodes:
 
     @classmethod
     def load(cls, root: str | Path, device: str = "cpu") -> "PairedEpisodes":
-        """Read the paired dataset at `root`.
+        """Read the paired dataset at `root`; actions become multiples of ±1 within the task's bounds.
 
         Raises:
             BadInputError: the dataset has not been paired.
@@ -75,9 +78,15 @@ class PairedEpisodes:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
         names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
         lengths = dataset.lengths.tolist()
+        bounds = dataset.description["simulator"].get("commands")
+        commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
         for name, values in dataset.columns(names).items():
             steps = torch.from_numpy(values if values.dtype == bool else values.astype("float32", copy=False))
+            if name not in (REWARD, TERMINATED, SUCCESS):
+                steps = steps.reshape(len(steps), -1)
+            if name == ACTION and commands is not None:
+                steps = commands.normal(steps)
             padded[name] = pad_sequence(steps.to(device).split(lengths), batch_first=True)
         mask = torch.arange(max(lengths), device=device) < torch.tensor(lengths, device=device)[:, None]
         action, terminated = padded[ACTION], padded[TERMINATED]
@@ -103,8 +112,21 @@ class PairedEpisodes:
             content_hash=dataset.content_hash,
             held_out=torch.tensor(held_out, device=device) if any(held_out) else None,
             dropped_place=_dropped_place(dataset),
+            commands=commands,
             has_rewards=REWARD in padded,
         )
+
+    def check(self, commands: Commands) -> None:
+        """Check that the actions are multiples of ±1 within `commands`.
+
+        Raises:
+            BadInputError: the dataset was paired with other bounds.
+        """
+        if (self.commands or {}) != ({} if commands.are_normal else commands):
+            raise BadInputError(
+                f"{self.reference} was paired for commands within {dict(self.commands or {}) or '±1'}, the "
+                f"task has {dict(commands)}: pair it again"
+            )
 
     def __len__(self) -> int:
         """Return the number of episodes E."""

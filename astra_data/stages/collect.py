@@ -13,6 +13,7 @@ from torch import Tensor
 from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column
 from astra_data.core.progress import Progress, part
 from astra_data.core.provenance import machine
 from astra_data.core.seeding import derive
@@ -115,7 +116,7 @@ def collect(
     The physics runs on `num_threads`, by default one per core; the outcome is the same with any number.
 
     Args:
-        task: a name in `TASKS`.
+        task: see `task_named`.
         config: what to collect.
         seed: of everything random.
         out: the dataset's folder, by default its place at home.
@@ -131,12 +132,12 @@ def collect(
     files = _saved_files(config).items()
     saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
     description = {
-        "name": name or f"{task}-{config.behavior}-seed{seed}".replace("_", "-"),
+        "name": name or f"{world.name}-{config.behavior}-seed{seed}".replace("_", "-"),
         "version": "1.0.0",
         "stage": "collect",
         "config": config.model_dump(mode="json") | saved,
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
-        "environment": {"id": task, "timestep_s": world.timestep_s, **world.facts},
+        "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
     }
     folder = out or place(description)
     with StagedWriter(
@@ -249,6 +250,7 @@ def _record(
     began = time.perf_counter()
     for step in range(config.max_steps):
         row = _step(env, behavior, active, last=step == config.max_steps - 1)
+        row[ACTION] = task.limits.in_units(row[ACTION])
         row[SUCCESS] = task.objective.succeeded(row[SUCCESS], row[TERMINATED] & ~row[SUCCESS], step + 1)
         for name, values in row.items():
             if name not in columns:
@@ -257,7 +259,7 @@ def _record(
         steps += int(active.sum())
         for index in torch.nonzero(active & row[DONE]).squeeze(1).tolist():
             if rows[index] not in writer.staged:
-                episode = {name: values[: step + 1, index] for name, values in columns.items()}
+                episode = {name: as_column(values[: step + 1, index]) for name, values in columns.items()}
                 writer.add(_episode(rows[index], episode, seed), rows[index])
         active &= ~row[DONE]
         done = rows.start + count * (step + 1) / config.max_steps

@@ -74,7 +74,7 @@ def evaluate(
     Starts, goals and headings depend on the seed alone, so they are the same for every method.
 
     Args:
-        task: a name in `TASKS`.
+        task: see `task_named`.
         method: a row.
         config: the recipe's `[evaluate]`.
         policy: what `train` made, for a row that trains.
@@ -105,7 +105,12 @@ def evaluate(
     if base.grounds and grounding is None:
         raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     stopwatch = Stopwatch()
-    results: dict[str, Any] = {"task": task, "method": method, "seed": seed, "episodes": config.episodes}
+    results: dict[str, Any] = {
+        "task": world.name,
+        "method": method,
+        "seed": seed,
+        "episodes": config.episodes,
+    }
     results["leg_scale"] = config.leg_scale
     results |= origin()
     simulators: dict[str, SimulatorEnv] = {}
@@ -186,9 +191,8 @@ def _in_target(
     task: Task, begin: Begin, config: EvaluateConfig, seed: int, num_threads: int | None, progress: Progress
 ) -> tuple[Outcome, Tensor, float]:
     """Return the outcome in the target, the states (T + 1, S) of the first episode, and target steps/s."""
-    env = task.target(
-        config.episodes, seed=derive(seed, "evaluation"), leg_scale=config.leg_scale, num_threads=num_threads
-    )
+    legs = {} if config.leg_scale == 1.0 else {"leg_scale": config.leg_scale}
+    env = task.target(config.episodes, seed=derive(seed, "evaluation"), num_threads=num_threads, **legs)
     env.reset()
     act = begin(env.goal)
     record = EpisodeRecord(env.position)

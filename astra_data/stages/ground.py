@@ -33,7 +33,7 @@ def ground(
     """Fit a method's grounding to a paired dataset; write it with its diagnostics and gap report to `out`.
 
     Args:
-        task: a name in `TASKS`.
+        task: see `task_named`.
         method: a row.
         config: the recipe's `[ground]`.
         settings: the method's own table of the recipe, if it has one.
@@ -58,8 +58,9 @@ def ground(
         raise BadInputError(f"method '{method}' does not ground its simulator")
     world, made = task_named(task), origin(device)
     episodes = PairedEpisodes.load(dataset, device)
+    episodes.check(world.limits)
     training, held_out = episodes.split(config.held_out_share, seed)
-    named = {"task": task, "method": method, **episodes.named}
+    named = {"task": world.name, "method": method, **episodes.named}
     settings_text = as_json(**named, seed=seed, ground=config, settings=settings)
     with finished_folder(out, config=settings_text) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)

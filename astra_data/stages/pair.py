@@ -10,6 +10,7 @@ import torch
 
 from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import machine
 from astra_data.core.stopwatch import Stopwatch
@@ -26,9 +27,10 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
+from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.registry import TASKS
-from astra_data.worlds.simulator_loader import Pairing, built, checked_abstraction, explained, pairing_named
+from astra_data.worlds.simulator_loader import Pairing, built, checked_abstraction, pairing_named
 
 BATCH = 4096
 """Simulators that are reset and stepped in one batch."""
@@ -79,6 +81,9 @@ def pair(
     _check(source, pairing)
     stopwatch = Stopwatch()
     batch = built(pairing, BATCH)
+    bounds = (
+        {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
+    )
     description, out = successor(
         source,
         "columns",
@@ -86,7 +91,7 @@ def pair(
         config=config.model_dump(mode="json"),
         name=name,
         out=out,
-        simulator={"id": pairing.id, **pairing.origin, **batch.parameters},
+        simulator={"id": pairing.id, **pairing.origin, **batch.parameters, **bounds},
     )
     meanings = {
         ABSTRACT_STATE: "abstract state of the target before the action",
@@ -99,7 +104,7 @@ def pair(
         for episodes in _blocks(source):
             before = time.perf_counter()
             state, action, next_state = (
-                np.concatenate([episode.columns[name] for episode in episodes])
+                as_rows(np.concatenate([episode.columns[name] for episode in episodes]))
                 for name in (STATE, ACTION, NEXT_STATE)
             )
             paired, error = pair_steps(
@@ -109,7 +114,9 @@ def pair(
             reset_error = max(reset_error, error)
             first = 0
             for episode in episodes:
-                values = {name: array[first : first + len(episode)] for name, array in paired.items()}
+                values = {
+                    name: as_column(array[first : first + len(episode)]) for name, array in paired.items()
+                }
                 writer.add(Episode(episode.uid, {**episode.columns, **values}, episode.metadata))
                 first += len(episode)
             steps += first

@@ -23,7 +23,7 @@ from astra_data.reports.page import render
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
 from astra_data.reports.statistics import REPLICATES
-from astra_data.worlds.registry import TASKS
+from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def report(
     sizes = _with_common_rows(
         assemble(
             recipe.name,
-            recipe.task,
+            task_named(recipe.task).name,
             tuple(recipe.methods),
             tuple(recipe.seeds),
             root=root,
@@ -115,7 +115,7 @@ def report(
             settings=recipe.settings,
             groundings=recipe.groundings,
             percent=percent,
-            scores=TASKS[recipe.task].objective.scores,
+            scores=task_named(recipe.task).objective.scores,
             paper_success=config.paper_success,
             published=known.get(percent),
         )
@@ -127,7 +127,7 @@ def report(
         found = _sizes(recipe, command, sizes)
         page, figures = partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
     else:
-        task = TASKS[recipe.task]
+        task = task_named(recipe.task)
         found = sizes[0].model_copy(update={"stand_in": task.facts.get("stand_in")})
         page = partial(render, found)
         figures = figures_of(
@@ -188,7 +188,7 @@ def _with_common_rows(sizes: Iterable[Results]) -> list[Results]:
 def _sizes(recipe: Reported, command: str, sizes: Sequence[Results]) -> SizesResults:
     return SizesResults(
         recipe=recipe.name,
-        task=recipe.task,
+        task=task_named(recipe.task).name,
         command=command,
         sizes=[
             SizeResults(percent=percent, results=results)

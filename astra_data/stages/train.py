@@ -38,7 +38,7 @@ def train(
     """Learn the policy of a row and write it with its learning curve to `out`.
 
     Args:
-        task: a name in `TASKS`.
+        task: see `task_named`.
         method: a row.
         config: the recipe's `[train]`, or `[plus]`.
         settings: the method's own table of the recipe, if it has one.
@@ -73,6 +73,7 @@ def train(
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
+    episodes.check(world.limits)
     grounding_file = grounding and grounding / "grounding.safetensors"
     initial_file = initial and initial / "policy.safetensors"
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
@@ -80,7 +81,7 @@ def train(
     grounding_digest = file_digest(grounding_file) if grounding_file else None
     initial_digest = file_digest(initial_file) if initial_file else None
     settings_text = as_json(
-        task=task,
+        task=world.name,
         method=method,
         **episodes.named,
         grounding_sha256=grounding_digest,

@@ -34,7 +34,7 @@ class Objective(ABC):
 
     is_lasting: ClassVar[bool] = False
     action_size: ClassVar[int]
-    goal_size: ClassVar[int]
+    goal_size: ClassVar[int] = 0
 
     horizon: int = field(kw_only=True)
     success_reward: float = field(default=10.0, kw_only=True)
@@ -55,13 +55,16 @@ class Objective(ABC):
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, X), at rest, where the task starts."""
 
-    @abstractmethod
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw goals (count, G)."""
+        """Draw goals (count, G); by default there is nothing to draw, G = 0."""
+        return np.empty((count, 0))
 
-    @abstractmethod
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Assemble the observation of states (..., X) and goals (..., G), each part scaled to about 1."""
+        """Assemble the observation of states (..., X) and goals (..., G), each part scaled to about 1.
+
+        By default both as they are.
+        """
+        return torch.cat([state, goal], dim=-1)
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
         """Clip actions (..., A) to ±1; `limit`, in m/s, has no effect on actions that are no velocities."""

@@ -1,21 +1,55 @@
-"""The tasks by name."""
+"""The tasks by name: those of the package, of other installed packages, and of files of the user's.
+
+A task of a file or of a package is code, which is run when the task is named.
+"""
+
+from importlib.metadata import entry_points
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.ant.tasks import ANTMAZE_TASKS
 from astra_data.worlds.humanoid.tasks import HUMANOID_TASKS
 from astra_data.worlds.nao.tasks import NAO_TASKS
+from astra_data.worlds.own_code import is_own_code, own_object
 from astra_data.worlds.task import Task
 
 TASKS: dict[str, Task] = {task.name: task for task in (*ANTMAZE_TASKS, *NAO_TASKS, *HUMANOID_TASKS)}
+"""The tasks of the package."""
+
+ENTRY_POINTS = "astra_data.tasks"
+"""The group of entry points under which installed packages offer tasks."""
 
 
 def task_named(name: str) -> Task:
-    """Return a task.
+    """Return a task of this or an installed package, or that of "cart.py:TASK" or "package.module:TASK".
 
     Raises:
-        BadInputError: there is no such task.
+        BadInputError: there is no such task, file or module, or it is no task.
     """
-    if name not in TASKS:
-        raise BadInputError(f"unknown task '{name}'{did_you_mean(name, TASKS)}")
-    return TASKS[name]
+    if name in TASKS:
+        return TASKS[name]
+    if is_own_code(name):
+        return _a_task(name, own_object(name))
+    installed = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    if name in installed:
+        return _a_task(name, own_object(installed[name].value))
+    known = (*TASKS, *installed)
+    raise BadInputError(
+        f"unknown task '{name}'{did_you_mean(name, known)}; a task of your own is named as cart.py:TASK"
+    )
+
+
+def known_tasks() -> dict[str, Task]:
+    """Return the tasks of this package and of installed ones, by name.
+
+    Raises:
+        BadInputError: a package offers something else, or it fails.
+    """
+    installed = entry_points(group=ENTRY_POINTS)
+    return TASKS | {point.name: task_named(point.name) for point in installed if point.name not in TASKS}
+
+
+def _a_task(name: str, found: object) -> Task:
+    if not isinstance(found, Task):
+        raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
+    return found

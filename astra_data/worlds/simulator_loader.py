@@ -1,21 +1,18 @@
 """Load the abstract simulator that a dataset is paired with: of a task, or from a file of the user's."""
 
-import importlib.util
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, Array, Column
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.own_code import explained, file_of, is_own_code, own_object
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.registry import TASKS, task_named
+from astra_data.worlds.task import Task
 
 
 @dataclass(frozen=True)
@@ -29,6 +26,7 @@ class Pairing:
         abstract_state: the column of abstract states, with names, units, frames and roles.
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
         simulator: builds B simulators.
+        commands: the bounds of the task's commands; None for a simulator without a task.
     """
 
     id: str
@@ -37,25 +35,32 @@ class Pairing:
     abstract_state: Column
     abstraction: Callable[[Array], Array]
     simulator: Callable[[int], AbstractSimulator]
+    commands: Commands | None = None
 
 
 def pairing_named(name: str) -> Pairing:
     """Return the simulator of the task `name`, or the class `path.py:MySim` of a user's file.
 
-    The class is a `Simulator` of `astra_data.worlds.protocols`.
+    The class is a `Simulator` of `astra_data.worlds.protocols`; the file is run.
 
     Raises:
         BadInputError: there is no such task, file or class, or the class lacks an attribute.
     """
-    if ".py:" not in name:
-        if name not in TASKS and name.endswith(".py"):
-            raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
-        task = task_named(name)
-        origin = {"task": task.name}
-        maze = None if task.plane is None else task.maze
-        return Pairing(task.simulator_id, origin, maze, task.abstract_state, task.abstraction, task.simulator)
-    path, _, kind = name.rpartition(":")
-    made = _load_class(Path(path), kind)
+    if name not in TASKS and name.endswith(".py"):
+        raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
+    made = own_object(name) if is_own_code(name) else task_named(name)
+    if isinstance(made, Task):
+        maze = None if made.plane is None else made.maze
+        origin = {"task": made.name, **file_of(name)}
+        return Pairing(
+            id=made.simulator_id,
+            origin=origin,
+            maze=maze,
+            abstract_state=made.abstract_state,
+            abstraction=made.abstraction,
+            simulator=made.own_simulator,
+            commands=None if made.limits.are_normal else made.limits,
+        )
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]
     if missing:
@@ -66,39 +71,9 @@ def pairing_named(name: str) -> Pairing:
     column = made.abstract_state
     if not isinstance(column, Column):
         raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
-    origin = {"file_sha256": file_digest(Path(path))}
-    return Pairing(kind, origin, None, replace(column, name=ABSTRACT_STATE), made.abstraction, made)
-
-
-def _load_class(path: Path, kind: str) -> Any:  # noqa: ANN401 - any class
-    if not path.is_file():
-        raise BadInputError(f"{path} does not exist: expected a Python file with the simulator's class")
-    spec = importlib.util.spec_from_file_location(f"simulator_of_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look it up there
-    with explained(f"importing {path}"):
-        spec.loader.exec_module(module)
-    if not hasattr(module, kind):
-        known = [key for key, value in vars(module).items() if isinstance(value, type)]
-        raise BadInputError(f"{path} has no class '{kind}'; it has {', '.join(known) or 'none'}")
-    return getattr(module, kind)
-
-
-@contextmanager
-def explained(what: str) -> Iterator[None]:
-    """Turn an exception of the user's code into an error of one line that begins with `what`.
-
-    Raises:
-        BadInputError: for any exception.
-    """
-    try:
-        yield
-    except Exception as error:
-        raise BadInputError(
-            f"{what} fails with {type(error).__name__}: {error}; ASTRA_DATA_DEBUG=1 shows where"
-        ) from error
+    kind = name.rpartition(":")[2]
+    column = replace(column, name=ABSTRACT_STATE)
+    return Pairing(kind, file_of(name), None, column, made.abstraction, made)
 
 
 def built(pairing: Pairing, count: int) -> AbstractSimulator:

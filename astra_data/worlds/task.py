@@ -1,28 +1,30 @@
 """A task: target environment, abstract simulator, the map between their states, and the objective."""
 
+import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import Column
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.worlds.batched import TargetEnv
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.driven import DrivenSimulator, VariedCommands
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.protocols import TaskSimulator, VariableSimulator
-from astra_data.worlds.variation import Variation, VariedSimulator
+from astra_data.worlds.protocols import AbstractSimulator, TaskSimulator, VariableSimulator
+from astra_data.worlds.robot import Robot, RobotEnv
+from astra_data.worlds.variation import RANDOMIZED_COMMANDS, Variation, VariedSimulator
 
 
-class MakeSimulator(Protocol):
-    """Builds B abstract simulators."""
-
-    def __call__(self, num_envs: int, *, device: str) -> TaskSimulator:
-        """Build `num_envs` simulators."""
-        ...
+def whole(state: Tensor) -> Tensor:
+    """Return target states (..., S) as they are."""
+    return state
 
 
 @dataclass(frozen=True)
@@ -52,24 +54,34 @@ class Plane:
     wall_reach_m: float
 
 
-@dataclass(frozen=True)
+_FROM_SIMULATOR: Any = None
+_EACH_ENTRY: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task:
-    """A problem of abstract sim2real.
+    """A problem of abstract sim2real. Six fields must be given; the others have defaults.
 
     Attributes:
-        name: in recipes. instruction: LeRobot's task description.
-        objective: horizon, reward and success; the maze, if there is one.
-        make_target, make_simulator: build the target environment and the abstract simulator.
-        abstraction: φ, target states (..., S) to abstract states (..., X).
-        beyond: the part of target states that φ drops, scaled to about 1, (..., S) to (..., R).
-        state_columns: the columns that hold states, goal and action, with units, frames and roles.
-        abstract_state: the column of abstract states, likewise.
+        name: in datasets, results and, of tasks of the package, in recipes.
         timestep_s: the control period.
-        action_limit: largest action along each axis; target and simulator clip actions to it.
-        quantities: indices in abstract states of what the gap report lists, by name with unit.
+        state: the column of target states, with names, units, frames and roles.
+        commands: the least and the largest command along each axis of the action, by the axes' names.
+        make_simulator: the class of the abstract simulator, a `Simulator`, or what builds B of them.
+        objective: horizon, starts, goals, reward and success; the maze, if there is one.
+        robot: builds one robot, which makes a target to collect in and to test in; or
+        make_target: builds B target environments. A task may have neither.
+        instruction: LeRobot's task description, by default the name.
+        action, goal: their columns, by default with the names of `commands`, and without names.
+        abstraction: φ, target states (..., S) to abstract states (..., X), by default the simulator's.
+        abstract_state: the column of abstract states, by default the simulator's.
+        beyond: the part of target states that φ drops, scaled to about 1, (..., S) to (..., R); by default
+            the whole state.
+        quantities: indices in abstract states of what the gap report lists, by name with unit; by default
+            each entry for itself.
         facts: what datasets record about the target environment.
-        simulator_id: names the abstract simulator in datasets.
-        varied: the same simulator with parameters that vary.
+        simulator_id: names the abstract simulator in datasets, by default after its class.
+        varied: the same simulator with parameters that vary, by default what reaches it of the commands.
         plane: properties of a task in a maze; None for others.
         photograph: renders target states (K, S) as pictures (K, height, width, 3); None where reports show
             none.
@@ -85,23 +97,80 @@ class Task:
     """
 
     name: str
-    instruction: str
-    objective: Objective
-    make_target: Callable[..., TargetEnv]
-    make_simulator: MakeSimulator
-    abstraction: Callable[[Any], Any]
-    beyond: Callable[[Tensor], Tensor]
-    state_columns: tuple[Column, ...]
-    abstract_state: Column
     timestep_s: float
-    action_limit: float
-    quantities: Mapping[str, tuple[int, ...]]
-    simulator_id: str
-    facts: Mapping[str, str | float]
-    varied: Varied
+    state: Column
+    commands: Mapping[str, tuple[float, float]]
+    make_simulator: Callable[..., AbstractSimulator]
+    objective: Objective
+    robot: Callable[[], Robot] | None = None
+    make_target: Callable[..., TargetEnv] | None = None
+    instruction: str = ""
+    action: Column = _FROM_SIMULATOR
+    goal: Column | None = None
+    abstraction: Callable[[Any], Any] = _FROM_SIMULATOR
+    abstract_state: Column = _FROM_SIMULATOR
+    beyond: Callable[[Tensor], Tensor] = whole
+    quantities: Mapping[str, tuple[int, ...]] = _EACH_ENTRY
+    facts: Mapping[str, str | float] = field(default_factory=dict)
+    simulator_id: str = ""
+    varied: Varied = Varied(VariedCommands, RANDOMIZED_COMMANDS, RANDOMIZED_COMMANDS)
     plane: Plane | None = None
     photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
     target_id: str | None = None
+
+    def __post_init__(self) -> None:
+        """Fill in the defaults.
+
+        Raises:
+            BadInputError: the fields contradict each other, or a simulator has no φ; lists every fault.
+        """
+        faults = [
+            f"make_simulator: {_named(self.make_simulator)} has no {name}; give the task one, or the class"
+            for name in ("abstraction", "abstract_state")
+            if getattr(self, name) is None and not hasattr(self.make_simulator, name)
+        ]
+        commands = Commands(self.commands)
+        if self.objective.action_size != len(commands):
+            faults.append(
+                f"objective: action_size {self.objective.action_size}, expected that of commands, "
+                f"{len(commands)}"
+            )
+        if faults:
+            raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
+        abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
+        names = abstract.names or tuple(map(str, range(abstract.size)))
+        size = self.objective.goal_size
+        usual = {
+            "state": replace(self.state, name=STATE),
+            "commands": commands,
+            "instruction": self.instruction or self.name,
+            "action": self.action or Column(ACTION, size=len(commands), names=tuple(commands)),
+            "goal": self.goal or (Column(GOAL, size=size) if size else None),
+            "abstract_state": replace(abstract, name=ABSTRACT_STATE),
+            "quantities": self.quantities or {name: (index,) for index, name in enumerate(names)},
+            "simulator_id": self.simulator_id or _named(self.make_simulator),
+        }
+        if self.abstraction is None:
+            usual["abstraction"] = self.make_simulator.abstraction
+        for name, value in usual.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def state_columns(self) -> tuple[Column, ...]:
+        """The columns of states, of goals if there are any, of actions and of next states."""
+        later = f"{self.state.meaning}, one control step later" if self.state.meaning else ""
+        goal = () if self.goal is None else (self.goal,)
+        return (self.state, *goal, self.action, replace(self.state, name=NEXT_STATE, meaning=later))
+
+    @property
+    def limits(self) -> Commands:
+        """The bounds of the commands, and the way from them to ±1 and back."""
+        return cast(Commands, self.commands)
+
+    @property
+    def has_target(self) -> bool:
+        """Whether there is a target to collect in and to test in."""
+        return self.robot is not None or self.make_target is not None
 
     def shares_target(self, other: "Task") -> bool:
         """Return whether both tasks have the same target and differ only in the simulator."""
@@ -149,12 +218,39 @@ class Task:
         return round(1.0 / self.timestep_s)
 
     def target(self, num_envs: int, **options: Any) -> TargetEnv:  # noqa: ANN401 - handed on
-        """Build `num_envs` target environments; `options` are the environment's own."""
-        return self.make_target(self.objective, num_envs, **options)
+        """Build `num_envs` target environments, driven by actions of ±1; `options` are their own.
+
+        Raises:
+            BadInputError: the task has no target.
+        """
+        if self.make_target is not None:
+            return self.make_target(self.objective, num_envs, **options)
+        if self.robot is None:
+            raise BadInputError(
+                f"task '{self.name}' has no target: give it a `robot`, or leave out what needs one (collect, "
+                "the rows that are trained in the target)"
+            )
+        return RobotEnv(
+            self.objective,
+            num_envs,
+            robot=self.robot,
+            state=self.state,
+            commands=self.limits,
+            abstraction=self.abstraction,
+            **options,
+        )
+
+    def own_simulator(self, num_envs: int, device: str = "cpu") -> AbstractSimulator:
+        """Build `num_envs` abstract simulators, driven by commands in their units."""
+        takes_device = "device" in inspect.signature(self.make_simulator).parameters
+        return self.make_simulator(num_envs, **({"device": device} if takes_device else {}))
 
     def simulator(self, num_envs: int, device: str = "cpu") -> TaskSimulator:
-        """Build `num_envs` abstract simulators."""
-        return self.make_simulator(num_envs, device=device)
+        """Build `num_envs` abstract simulators, driven by actions of ±1."""
+        simulator = self.own_simulator(num_envs, device)
+        if self.limits.are_normal and all(hasattr(simulator, name) for name in ("blocked", "settle", "vary")):
+            return cast(TaskSimulator, simulator)
+        return DrivenSimulator(simulator, self.limits, device)
 
     def varied_simulator(self, num_envs: int, variation: Variation, device: str = "cpu") -> VariedSimulator:
         """Build `num_envs` abstract simulators whose parameters vary; those without a range are plain."""
@@ -172,3 +268,8 @@ def roles(
     """Return a `Column`'s arguments on its entries: names, units, frames, roles and mirror images."""
     astra = {"unit": units, "frame": frames, "role": entries}
     return {"names": names, "astra": astra if mirror is None else {**astra, "mirror": mirror}}
+
+
+def _named(made: object) -> str:
+    """Return the name of a class, or of what a partial call builds."""
+    return _named(made.func) if isinstance(made, partial) else getattr(made, "__name__", type(made).__name__)

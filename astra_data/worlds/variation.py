@@ -52,7 +52,7 @@ class Variation(Config):
     @staticmethod
     def of_json(ranges: Mapping[str, Sequence[float]]) -> "Variation":
         """Return the variation whose `model_dump` was written to JSON."""
-        kinds = (BallVariation, JointVariation)
+        kinds = (BallVariation, JointVariation, CommandVariation)
         kind = next((kind for kind in kinds if kind.model_fields.keys() == ranges.keys()), PlanarVariation)
         return kind(**{name: tuple(ends) for name, ends in ranges.items()})  # type: ignore[arg-type]
 
@@ -136,6 +136,17 @@ class BallVariation(PlanarVariation):
     """Half width of the uniform noise on observed velocities of the ball."""
     contact_direction_deg: Range = (0.0, 0.0)
     """The ball leaves a contact or a kick turned by this angle."""
+
+
+class CommandVariation(Variation):
+    """Ranges for any robot: of what reaches it of the commands."""
+
+    steering: ClassVar[tuple[str, ...]] = ("action_scale",)
+
+    action_scale: Range = (0.0, 0.0)
+    """Relative error of commands: 0.1 makes them 10 % longer."""
+    action_noise: NoiseRange = (0.0, 0.0)
+    """Standard deviation of Gaussian noise on commands, which range over ±1."""
 
 
 class JointVariation(Variation):
@@ -231,6 +242,9 @@ class VariedSimulator(ABC):
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the observed states (B, X)."""
 
+
+RANDOMIZED_COMMANDS = CommandVariation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
+"""Of domain randomization of any robot, by default: the numbers that the paper prints for navigation."""
 
 RANDOMIZED_ACTIONS = PlanarVariation(action_noise=(0.05, 0.05), action_scale=(-0.1, 0.1))
 """Of domain randomization in navigation, as printed in the paper (Section V-A)."""

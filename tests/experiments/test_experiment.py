@@ -18,6 +18,7 @@ from astra_data.worlds.registry import TASKS
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 
+KNOWN = f"{', '.join([*TASKS, 'maze'])}; a task of your own is named as cart.py:TASK"
 BASE = 'task = "maze"\nmethods = ["astra", "astra_plus", "follower"]\nseeds = [0, 1]\n[evaluate]\nsteps = 3\n'
 LONGER = 'based_on = "base"\n[evaluate]\nrate = 2.0\n'
 
@@ -98,7 +99,7 @@ def sketch(base: Path, monkeypatch: pytest.MonkeyPatch, *targets: str | None) ->
     """Write a recipe based on `base` of another task; both have these targets."""
     maze = TASKS["antmaze-umaze"]
     for name, target in zip(("maze", "sketch"), targets, strict=True):
-        monkeypatch.setitem(fake_stages.TASKS, name, replace(maze, name=name, target_id=target))
+        monkeypatch.setitem(TASKS, name, replace(maze, name=name, target_id=target))
     path = base.with_name("other.toml")
     path.write_text('based_on = "base"\ntask = "sketch"\nmethods = ["follower"]\nseeds = [1]\n')
     return path
@@ -231,7 +232,7 @@ def test_a_stage_that_is_borrowed_no_more_is_made_here(base: Path, longer: Path,
         ('based_on = "bse"', ": based_on: unknown recipe 'bse': did you mean 'base'?"),
         ("based_on = 3", ": based_on: unknown recipe '3'; known: base"),
         ('based_on = "longer"', ": based_on: unknown recipe 'longer'; known: base"),
-        ('based_on = "base"\ntask = "moon"', ": task: unknown task 'moon'; known: maze"),
+        ('based_on = "base"\ntask = "moon"', ": task: unknown task 'moon'; known: " + KNOWN),
         (
             'based_on = "base"\nmethods = ["nas", "astra"]\nseeds = [0, 5]',
             " does not fit what it is based on: methods: base has no 'nas', it has ['astra', 'astra_plus', "

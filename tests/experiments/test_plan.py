@@ -11,7 +11,9 @@ from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.stages.registry import Stage
+from astra_data.worlds.registry import TASKS
 
+KNOWN = f"{', '.join([*TASKS, 'maze'])}; a task of your own is named as cart.py:TASK"
 HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
 
 
@@ -173,7 +175,7 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
         (HEAD + "plus = 1", "plus: expected a table, got 1"),
         (HEAD + "[train]\nsteps = 'x'\n[plus]\nrate = 1.0", "train.steps: expected a whole number, got 'x'"),
         (HEAD.replace("astra_", "astro_"), "methods: unknown method 'astro_plus': did you mean 'astra'?"),
-        (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: maze"),
+        (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: " + KNOWN),
         (
             HEAD.replace("astra_plus", "fine_tuned_plus"),
             "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without "

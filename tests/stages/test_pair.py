@@ -130,7 +130,7 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
         (f"{MINE}:Lazy", r"step of Lazy fails with NotImplementedError"),
         (f"{MINE}:Wide", r"abstraction of Wide makes \(\d+, 3\) of states .* expected \(\d+, 2\)"),
         (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),
-        (f"{MINE}:Gilder", r"has no class 'Gilder'; it has .*Glider"),
+        (f"{MINE}:Gilder", r"has no 'Gilder'; it has .*Glider"),
         (f"{MINE}", r"expected the class after a colon"),
         ("nowhere.py:Glider", r"nowhere.py does not exist: expected a Python file"),
         ("antmaze-umase", r"unknown task 'antmaze-umase': did you mean 'antmaze-umaze'"),

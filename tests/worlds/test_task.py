@@ -1,17 +1,20 @@
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from cart import GIVEN, LOGS_ALONE, TASK
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
 from astra_data.methods.follower import careful
 from astra_data.training.behaviors import WallWatch
+from astra_data.worlds.driven import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.states import VariedPlanar
 from astra_data.worlds.registry import TASKS
-from astra_data.worlds.task import roles
+from astra_data.worlds.task import Task, roles
 from astra_data.worlds.variation import BallVariation, PlanarVariation
 
 ANT, WALKER, KICK = (TASKS[name] for name in ("antmaze-umaze", "humanoid-walker2d", "nao-kick"))
@@ -71,3 +74,44 @@ def test_roles_become_what_a_column_takes() -> None:
     assert column.astra == {"unit": ["m", "m"], "frame": ["world"] * 2, "role": ["position"] * 2}
     mirrored = roles(("a",), ["rad"], ["joint"], ["invariant"], ["-a"])
     assert mirrored["astra"]["mirror"] == ["-a"]
+
+
+def test_six_fields_make_a_task() -> None:
+    task = Task(**GIVEN)
+    assert task.instruction == "rail-cart" and task.simulator_id == "Rail" and task.fps == 10
+    assert [(column.name, column.size, column.names) for column in task.state_columns] == [
+        ("observation.state", 2, ("x", "speed")),
+        ("observation.environment_state", 1, None),
+        ("action", 1, ("v",)),
+        ("next.observation.state", 2, ("x", "speed")),
+    ]
+    assert task.abstract_state.name == "abstract.state" and task.quantities == {"x": (0,)}
+    state = torch.tensor([[3.0, 4.0]])
+    assert task.abstraction(state).tolist() == [[3.0]] and torch.equal(task.beyond(state), state)
+    assert not task.has_target and TASK.has_target and ANT.has_target
+    assert replace(task, name="other").commands == task.commands
+
+
+def test_simulators_of_a_task_take_actions_and_commands() -> None:
+    action = torch.tensor([[1.0], [-1.0]])
+    torch.testing.assert_close(TASK.simulator(2).step(action), torch.tensor([[0.4], [-0.1]]))
+    torch.testing.assert_close(TASK.own_simulator(2).step(action), torch.tensor([[0.1], [-0.1]]))
+    assert ANT.simulator(2) is not None and not isinstance(ANT.simulator(2), DrivenSimulator)
+
+
+def test_a_task_without_a_target_says_so() -> None:
+    with pytest.raises(BadInputError, match=r"'rail-cart' has no target: give it a `robot`, or leave out"):
+        LOGS_ALONE.target(1, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)}}, "objective: action_size 1, expected .* 2"),
+        ({"commands": {"v": (1.0, 0.0)}}, "commands: v: expected"),
+        ({"make_simulator": dict}, "dict has no abstraction.*; make_simulator: dict has no abstract_state"),
+    ],
+)
+def test_fields_that_contradict_each_other_are_refused(wrong: dict[str, Any], told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        Task(**GIVEN | wrong)

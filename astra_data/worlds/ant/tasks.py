@@ -3,7 +3,7 @@
 from functools import partial
 from typing import get_args
 
-from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE, Column
 from astra_data.worlds.abstraction import ant_beyond_point_mass, ant_to_point_mass
 from astra_data.worlds.ant.body import TIMESTEP_S, WALL_REACH_M
 from astra_data.worlds.ant.target import AntMazeEnv
@@ -41,13 +41,6 @@ _ANT_STATE = roles(
 )
 _GOAL = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
 _COMMAND = roles(("command_vx", "command_vy"), ["m/s"] * 2, ["world"] * 2, ["vector"] * 2)
-_ANT_COLUMNS = (
-    Column(STATE, size=29, meaning="qpos (15) and qvel (14) of the ant", **_ANT_STATE),
-    Column(GOAL, size=2, meaning="where to go", **_GOAL),
-    Column(ACTION, size=2, meaning="commanded planar velocity, ±1 m/s per axis", **_COMMAND),
-    Column(NEXT_STATE, size=29, meaning="qpos and qvel one control step later", **_ANT_STATE),
-)
-
 
 _POINT_MASS = Column(
     ABSTRACT_STATE,
@@ -68,11 +61,13 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         make_simulator=partial(PointMass, maze, timestep_s=TIMESTEP_S),
         abstraction=ant_to_point_mass,
         beyond=ant_beyond_point_mass,
-        state_columns=_ANT_COLUMNS,
+        state=Column(STATE, size=29, meaning="qpos (15) and qvel (14) of the ant", **_ANT_STATE),
+        goal=Column(GOAL, size=2, meaning="where to go", **_GOAL),
+        action=Column(ACTION, size=2, meaning="commanded planar velocity, ±1 m/s per axis", **_COMMAND),
+        commands={"vx": (-1.0, 1.0), "vy": (-1.0, 1.0)},
         abstract_state=_POINT_MASS,
         quantities={"position_m": (0, 1), "velocity_m_s": (2, 3)},
         timestep_s=TIMESTEP_S,
-        action_limit=1.0,
         simulator_id="point_mass",
         facts={"integrator": "RK4", "leg_scale": 1.0},
         varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),

@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column
+from astra_data.dataset.columns import ACTION, STATE, Column
 from astra_data.worlds.humanoid.abstraction import (
     beyond_extended_kinematics,
     beyond_kinematics,
@@ -41,11 +41,6 @@ _STATE = roles(
 )
 _COMMANDS = ("left_hip", "left_knee", "right_hip", "right_knee")
 _COMMAND = roles(_COMMANDS, ["1"] * 4, ["joint"] * 4, ["invariant"] * 4)
-_COLUMNS = (
-    Column(STATE, size=STATE_SIZE, meaning="qpos (24) and qvel (23) of the humanoid", **_STATE),
-    Column(ACTION, size=4, meaning="commanded joint angles, ±1 over their ranges", **_COMMAND),
-    Column(NEXT_STATE, size=STATE_SIZE, meaning="qpos and qvel one control step later", **_STATE),
-)
 
 RANDOMIZED_ACTIONS = JointVariation(action_noise=(0.05, 0.05), action_scale=(-0.05, 0.05))
 """Of domain randomization, as printed in the paper (Section V-B)."""
@@ -100,11 +95,12 @@ def _task(
         make_simulator=kind,
         abstraction=kind.abstraction,
         beyond=beyond,
-        state_columns=_COLUMNS,
+        state=Column(STATE, size=STATE_SIZE, meaning="qpos (24) and qvel (23) of the humanoid", **_STATE),
+        action=Column(ACTION, size=4, meaning="commanded joint angles, ±1 over their ranges", **_COMMAND),
+        commands=dict.fromkeys(_COMMANDS, (-1.0, 1.0)),
         abstract_state=kind.abstract_state,
         quantities=quantities,
         timestep_s=TIMESTEP_S,
-        action_limit=1.0,
         simulator_id=f"humanoid_{name}",
         photograph=photograph,
         facts={"stiffness": STIFFNESS, "damping": DAMPING, **CommandRanges().parameters},

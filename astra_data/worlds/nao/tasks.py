@@ -8,7 +8,7 @@ and the rewards are ours.
 from functools import partial
 from typing import Any
 
-from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE, Column
 from astra_data.worlds.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
 from astra_data.worlds.nao.body import TICK_S
 from astra_data.worlds.nao.kinematics import JOINTS
@@ -96,19 +96,21 @@ _PLANAR_ROLES: Roles = (
 )
 
 
-def _columns(*, ball: bool) -> tuple[Column, ...]:
+def _columns(*, ball: bool) -> dict[str, Any]:
     size = STATE_SIZE + BALL_SIZE * ball
     state = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
     goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
     command = roles(*(_with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES[:4]))
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
     wish = ", and above 0.5 to stand and kick" if ball else ""
-    return (
-        Column(STATE, size=size, meaning=meaning, **state),
-        Column(GOAL, size=2, meaning="the middle of the goal line" if ball else "where to go", **goal),
-        Column(ACTION, size=2 + ball, meaning=f"commanded planar velocity, ±1 per axis{wish}", **command),
-        Column(NEXT_STATE, size=size, meaning=f"{meaning}, one control step later", **state),
-    )
+    aim = "the middle of the goal line" if ball else "where to go"
+    return {
+        "state": Column(STATE, size=size, meaning=meaning, **state),
+        "goal": Column(GOAL, size=2, meaning=aim, **goal),
+        "action": Column(
+            ACTION, size=2 + ball, meaning=f"commanded planar velocity, ±1 per axis{wish}", **command
+        ),
+    }
 
 
 def _with(known: Roles, more: Roles, count: int | None = None) -> Roles:
@@ -131,11 +133,11 @@ def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
     return Task(
         make_target=partial(NaoEnv, ball=ball),
         beyond=nao_beyond,
-        state_columns=_columns(ball=ball),
+        **_columns(ball=ball),
+        commands=dict.fromkeys(("vx", "vy", *(["kick"] if ball else [])), (-1.0, 1.0)),
         abstract_state=_abstract(ball=ball),
         quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
         timestep_s=CONTROL_STEP_S,
-        action_limit=1.0,
         facts={"stand_in": "mujoco", "tick_s": TICK_S},
         plane=Plane(wall_reach_m=0.3),
         **own,

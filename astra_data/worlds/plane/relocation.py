@@ -89,9 +89,9 @@ class Relocation:
         return self.task.maze.clearance(points) > self.margin_m
 
     def _is_commanded(self, turn: PlanarMap, action: Array) -> bool:
-        command = next(column for column in self.task.state_columns if column.name == ACTION)
-        turned = turn.of_column(command, action)
-        return bool(np.abs(turned).max() <= self.task.action_limit + _ROUNDING)
+        turned = turn.of_column(self.task.action, action)
+        least, largest = np.array(list(self.task.commands.values())).T
+        return bool(((turned >= least - _ROUNDING) & (turned <= largest + _ROUNDING)).all())
 
     def _draw_turn(self, rng: np.random.Generator) -> PlanarMap:
         angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}

@@ -1,0 +1,50 @@
+"""`astra-data tasks` and `astra-data label`."""
+
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName, NewName, Out
+
+
+def tasks() -> None:
+    """List the tasks that can be named, and what they have."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from astra_data.worlds.registry import TASKS, known_tasks
+
+    table = Table("task", "from", "commands", "abstract states", "target", "steps/s")
+    for name, task in known_tasks().items():
+        table.add_row(
+            name,
+            "astra-data" if name in TASKS else "an installed package",
+            ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in task.commands.items()),
+            ", ".join(task.abstract_state.names or (f"{task.abstract_state.size} values",)),
+            "yes" if task.has_target else "no",
+            str(task.fps),
+        )
+    Console(soft_wrap=True).print(table)
+    typer.echo("A task of your own is named by its place, cart.py:TASK or package.module:TASK; it is run.")
+
+
+def label(
+    dataset: DatasetName,
+    task: Annotated[
+        str,
+        typer.Option(help="A task, by name or place: cart.py:TASK. The file is run.", show_default=False),
+    ],
+    seed: Annotated[int, typer.Option(help="Of the goals.")] = 0,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Compute the goals, rewards, successes and failures that a log lacks, as a task defines them."""
+    from astra_data.dataset.versions import locate
+    from astra_data.experiments.display import shown
+    from astra_data.stages.label import label as label_dataset
+
+    with shown("label") as progress:
+        folder = label_dataset(
+            task, dataset=locate(dataset), seed=seed, name=name, out=out, progress=progress
+        )
+    typer.echo(f"finished: {folder}")

@@ -1,0 +1,152 @@
+"""Label: what a log lacks of goals, rewards, successes and failures, as the task computes them from φ(s)."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column, as_rows
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import generator
+from astra_data.dataset.columns import (
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Episode,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import open_dataset, successor
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.task import Task
+
+
+def label(
+    task: str,
+    *,
+    dataset: str | Path,
+    seed: int = 0,
+    name: str | None = None,
+    out: Path | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Add the columns of goals and outcomes that `dataset` lacks; return the new folder.
+
+    Goals are drawn by the objective, one an episode. Episodes end where the goal is reached: later steps are
+    dropped. An episode that its log ends as terminated, without a success, is a failure.
+
+    Args:
+        task: see `task_named`.
+        dataset: with states, actions and next states.
+        seed: of the goals.
+        name: of the new dataset, by default that of `dataset`, whose next version it is.
+        out: its folder, by default its place at home.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: the dataset lacks states or actions, or these are not those of the task.
+        CorruptDatasetError: the dataset is incomplete.
+    """
+    world, source = task_named(task), open_dataset(dataset)
+    _check(source, world)
+    more = [
+        column
+        for column in ((world.goal,) if world.goal else ()) + OUTCOME_COLUMNS
+        if column.name not in source.features
+    ]
+    if not more:
+        raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
+    description, out = successor(
+        source,
+        "columns",
+        stage="label",
+        config={"task": world.name, "seed": seed, "columns": [column.name for column in more]},
+        name=name,
+        out=out,
+    )
+    steps = successes = failures = 0
+    with DatasetWriter.like(source, out, description, more=more) as writer:
+        for number, episode in enumerate(source.episodes(), start=1):
+            labelled = labels(world, episode, seed)
+            writer.add(labelled)
+            steps += len(labelled)
+            successes += bool(labelled.metadata["success"])
+            failures += bool(labelled.metadata["failed"])
+            progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
+        writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
+    return out
+
+
+def labels(task: Task, episode: Episode, seed: int) -> Episode:
+    """Return the episode with goals and outcomes, up to its first success.
+
+    What it has of them is kept.
+    """
+    given = episode.columns
+    before, after = (
+        torch.from_numpy(np.ascontiguousarray(task.abstraction(as_rows(given[key])), dtype=np.float32))
+        for key in (STATE, NEXT_STATE)
+    )
+    goal = _goals(task, episode, seed)
+    over = torch.zeros(len(episode), dtype=torch.bool)
+    if TERMINATED in given:
+        over = torch.from_numpy(given[TERMINATED])
+    missed = task.objective.missed(after, goal)
+    reached = (
+        torch.from_numpy(given[SUCCESS]) if SUCCESS in given else task.objective.reached(after, goal) & ~over
+    )
+    failed = (over | missed) & ~reached
+    reward = task.objective.reward(before, after, goal, failed).numpy()
+    terminated = (reached | failed).numpy()
+    length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
+    truncated = np.zeros(len(episode), bool)
+    truncated[length - 1] = not terminated[length - 1]
+    computed: dict[str, Array] = {
+        **({GOAL: as_column(goal.numpy())} if task.goal else {}),
+        REWARD: reward.astype(np.float32),
+        SUCCESS: reached.numpy(),
+    }
+    columns = (
+        computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
+    )
+    success = bool(columns[SUCCESS][:length].any())
+    metadata = {
+        "success": success,
+        "failed": bool(terminated[length - 1]) and not success,
+        "return": float(columns[REWARD][:length].sum(dtype=np.float64)),
+    }
+    return Episode(
+        episode.uid,
+        {key: values[:length] for key, values in columns.items()},
+        metadata | dict(episode.metadata),
+    )
+
+
+def _goals(task: Task, episode: Episode, seed: int) -> torch.Tensor:
+    if GOAL in episode.columns:
+        return torch.from_numpy(as_rows(episode.columns[GOAL]))
+    drawn = task.objective.draw_goals(generator(seed, f"goal of episode {episode.uid}"), 1)
+    return torch.from_numpy(drawn).float().expand(len(episode), -1).contiguous()
+
+
+def _check(source: Dataset, task: Task) -> None:
+    faults = []
+    for expected in (task.state, task.action):
+        if expected.name not in source.features:
+            faults.append(f"has no column {expected.name}")
+        elif (found := source.features[expected.name]["shape"][0]) != expected.size:
+            faults.append(
+                f"{expected.name} has {found} values, expected those of {task.name}: {expected.size}"
+            )
+    if NEXT_STATE not in source.features:
+        faults.append(f"has no column {NEXT_STATE}")
+    if faults:
+        raise BadInputError(f"{source.reference} {'; '.join(faults)}")

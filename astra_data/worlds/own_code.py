@@ -1,0 +1,96 @@
+"""Objects from the user's code: "cart.py:TASK" in a file, "package.module:TASK" in an installed package."""
+
+import hashlib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import AstraDataError, BadInputError
+
+
+def is_own_code(name: str) -> bool:
+    """Return whether `name` is of the form "file.py:OBJECT" or "package.module:OBJECT"."""
+    module, colon, attribute = name.rpartition(":")
+    return bool(colon and module and attribute.isidentifier())
+
+
+def own_object(name: str) -> Any:  # noqa: ANN401 - any object
+    """Run the file or module that `name` begins with, and return the object that it ends with.
+
+    Raises:
+        BadInputError: there is no such file, module or object, or running it fails.
+    """
+    place, _, attribute = name.rpartition(":")
+    module = _of_file(Path(place)) if place.endswith(".py") else _of_package(place)
+    if not hasattr(module, attribute):
+        raise BadInputError(
+            f"{place} has no '{attribute}'; it has {', '.join(_own_names(module)) or 'nothing'}"
+        )
+    return getattr(module, attribute)
+
+
+def file_of(name: str) -> dict[str, str]:
+    """Return the sha256 of the file that `name` begins with, as "file_sha256"; empty where it is none."""
+    place = Path(name.rpartition(":")[0])
+    return {"file_sha256": file_digest(place)} if place.suffix == ".py" and place.is_file() else {}
+
+
+def _of_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise BadInputError(f"{path} does not exist: expected a Python file")
+    key = hashlib.sha256(f"{path.resolve()}".encode()).hexdigest()[:12]
+    name = f"astra_data_own_{path.stem}_{key}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look it up there
+    try:
+        with explained(f"importing {path}"):
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _own_names(module: ModuleType) -> list[str]:
+    """Return the public names that a module defines itself."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and not isinstance(value, ModuleType)
+        and type(value).__module__ not in ("__future__", "typing")
+        and not (isinstance(value, type | FunctionType) and value.__module__ != module.__name__)
+    ]
+
+
+def _of_package(name: str) -> ModuleType:
+    with explained(f"importing {name}"):
+        return importlib.import_module(name)
+
+
+@contextmanager
+def explained(what: str) -> Iterator[None]:
+    """Turn an exception of the user's code into an error of one line that begins with `what`.
+
+    Raises:
+        BadInputError: for any exception.
+    """
+    try:
+        yield
+    except AstraDataError:
+        raise
+    except Exception as error:
+        raise BadInputError(
+            f"{what} fails with {type(error).__name__}: {error}; ASTRA_DATA_DEBUG=1 shows where"
+        ) from error

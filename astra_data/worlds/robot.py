@@ -1,0 +1,154 @@
+"""The target made of single robots: anything that can be reset and stepped."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import derive
+from astra_data.dataset.columns import Column
+from astra_data.worlds.batched import Step
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.objective import Objective
+
+State = NDArray[np.floating[Any]] | Sequence[float]
+
+
+class Robot(Protocol):
+    """One robot, real or simulated. `reset` may take a keyword `seed`, for what is random about it."""
+
+    def reset(self) -> State:
+        """Bring the robot to where an episode starts; return its state (S,)."""
+        ...
+
+    def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
+        """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed."""
+        ...
+
+
+class RobotEnv:
+    """B robots, stepped one after another, as a batched target environment.
+
+    Attributes:
+        goal: (B, G) float32.
+        failed: which robots failed in their last step, (B,) bool.
+        wall_contact: none of them, (B,) bool: robots do not tell.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        num_envs: int,
+        *,
+        robot: Callable[[], Robot],
+        state: Column,
+        commands: Commands,
+        abstraction: Callable[[Any], Any],
+        seed: int,
+        num_threads: int | None = None,
+        start_anywhere: bool = False,
+    ) -> None:
+        """Build B robots.
+
+        Args:
+            objective: of the task.
+            num_envs: B.
+            robot: builds one.
+            state: the column of its states.
+            commands: the bounds of its commands.
+            abstraction: φ.
+            seed: of goals, and of the robots if they take one.
+            num_threads: without effect.
+            start_anywhere: without effect: a robot starts where it is put.
+        """
+        self.num_envs, self.action_size = num_envs, len(commands)
+        self._objective, self._column, self._commands = objective, state, commands
+        self._abstraction = abstraction
+        self._robots = [robot() for _ in range(num_envs)]
+        self._takes_seed = "seed" in inspect.signature(self._robots[0].reset).parameters
+        self.goal = torch.zeros(num_envs, objective.goal_size)
+        self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
+        self._state = torch.zeros(num_envs, state.size)
+        self.reseed(seed)
+        self.observation_size = self._observe().shape[1]
+
+    @property
+    def state(self) -> Tensor:
+        """The robots' states, (B, S) float32."""
+        return self._state.clone()
+
+    @property
+    def position(self) -> Tensor:
+        """What the objective takes from abstract states as positions in the plane, (B, 2 K) float32, m."""
+        return self._objective.places(self._abstract())
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers at `seed`."""
+        self._seed, self._episodes = seed, 0
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Restart the robots in `mask` (B,), by default all; return observations (B, O)."""
+        rows = range(self.num_envs) if mask is None else mask.nonzero().squeeze(1).tolist()
+        for row in rows:
+            seed = derive(self._seed, f"episode {self._episodes}")
+            self._episodes += 1
+            options = {"seed": seed} if self._takes_seed else {}
+            self._state[row] = self._checked(self._robots[row].reset(**options), "reset")
+            goal = self._objective.draw_goals(np.random.default_rng(seed), 1)
+            self.goal[row] = torch.from_numpy(goal[0]).float()
+            self.failed[row] = False
+        return self._observe()
+
+    def step(self, action: Tensor, active: Tensor | None = None) -> Step:
+        """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are."""
+        before = self._abstract()
+        commands = self._commands.in_units(action).double().numpy()
+        rows = range(self.num_envs) if active is None else active.nonzero().squeeze(1).tolist()
+        for row in rows:
+            state, has_failed = self._robots[row].step(commands[row])
+            self._state[row], self.failed[row] = self._checked(state, "step"), bool(has_failed)
+        after = self._abstract()
+        success = self._objective.reached(after, self.goal) & ~self.failed
+        failed = (self.failed | self._objective.missed(after, self.goal)) & ~success
+        return Step(
+            observation=self._observe(),
+            reward=self._objective.reward(before, after, self.goal, failed),
+            terminated=success | failed,
+            success=success,
+        )
+
+    def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
+        """Refuse: a robot cannot be set to any state.
+
+        Raises:
+            BadInputError: always.
+        """
+        raise BadInputError("robots cannot be put into a recorded state: expected data_start_share = 0")
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what there is to continue from: nothing, robots are where they are."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Start new episodes."""
+        self.reset()
+
+    def _abstract(self) -> Tensor:
+        return torch.as_tensor(self._abstraction(self.state))
+
+    def _observe(self) -> Tensor:
+        return self._objective.observe(self._abstract(), self.goal)
+
+    def _checked(self, state: State, call: str) -> Tensor:
+        found = torch.as_tensor(np.asarray(state, dtype=np.float32))
+        if found.shape != (self._column.size,) or not found.isfinite().all():
+            raise BadInputError(
+                f"{call} of the robot: expected a finite state of {self._column.size} numbers, got {state!r}"
+            )
+        return found

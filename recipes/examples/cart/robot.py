@@ -1,0 +1,68 @@
+"""The robot itself, which the toolkit does not see: a simulated cart stands in for it.
+
+python robot.py logs          records 60 drives by random commands as CSV, in millimetres and degrees
+"""
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+
+TIPPED_RAD = 0.6
+
+
+class TrueCart:
+    """A differential drive that lags by 0.2 s and slips, with a payload on a spring that tips."""
+
+    def __init__(self):
+        self.rng = np.random.default_rng()
+
+    def reset(self, seed=None):
+        self.rng = np.random.default_rng(seed)
+        self.pose = np.array([0.0, 0.0, self.rng.uniform(-np.pi, np.pi)])
+        self.wheels, self.tilt = np.zeros(2), np.zeros(2)
+        return self.state()
+
+    def state(self):
+        return np.concatenate([self.pose, self.wheels, self.tilt])
+
+    def step(self, command):
+        for _ in range(10):
+            pull = (np.asarray(command) - self.wheels) / 0.2
+            self.wheels = self.wheels + 0.01 * pull
+            v, w = self.wheels * [0.95, 0.9 - 0.15 * abs(self.wheels[0])]
+            self.pose = self.pose + 0.01 * np.array([v * np.cos(self.pose[2]), v * np.sin(self.pose[2]), w])
+            sway = 3.5 * pull[0] + 5.0 * v * w - 16.0 * self.tilt[0] - 1.2 * self.tilt[1]
+            self.tilt = self.tilt + 0.01 * np.array([self.tilt[1], sway])
+        self.tilt[1] += self.rng.normal(0.0, 0.01)
+        return self.state(), bool(abs(self.tilt[0]) > TIPPED_RAD)
+
+
+FIELDS = ["t_ms", "x_mm", "y_mm", "yaw_deg", "v_mm_s", "w_deg_s", "tilt_deg", "tilt_rate_deg_s"]
+UNITS = [1e-3, 1e-3, np.pi / 180, 1e-3, np.pi / 180, np.pi / 180, np.pi / 180]
+
+
+def record(folder, drives=60, seconds=15, seed=0):
+    """Drive by random commands, each held for 0.3 to 2 s, until the payload tips."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    for drive in range(drives):
+        cart = TrueCart()
+        state, tipped, left = cart.reset(int(rng.integers(2**32))), False, 0
+        with open(folder / f"drive_{drive:02d}.csv", "w", newline="") as file:
+            log = csv.writer(file)
+            log.writerow([*FIELDS, "cmd_v_mm_s", "cmd_w_deg_s", "tipped"])
+            for step in range(10 * seconds):
+                if left == 0:
+                    command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]), rng.integers(3, 20)
+                left -= 1
+                row = [*(state / UNITS), command[0] / 1e-3, np.degrees(command[1])]
+                log.writerow([100 * step, *(f"{value:.3f}" for value in row), int(tipped)])
+                if tipped:
+                    break
+                state, tipped = cart.step(command)
+
+
+if __name__ == "__main__":
+    record(Path(sys.argv[1]))

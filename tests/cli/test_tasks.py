@@ -1,0 +1,46 @@
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli.app import app
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, Column, Episode
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.worlds import registry
+
+CART = Path(__file__).parents[1] / "cart.py"
+
+
+def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = EntryPoint("rail-cart", "cart:LOGS_ALONE", registry.ENTRY_POINTS)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [offered])
+    result = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    lines = {line.split()[1]: line for line in result.output.splitlines() if line.startswith("│")}
+    assert set(registry.TASKS) <= set(lines)
+    assert "an installed package" in lines["rail-cart"] and "v -1…4" in lines["rail-cart"]
+    assert "no" in lines["rail-cart"].split() and "yes" in lines["antmaze-umaze"].split()
+    assert registry.task_named("rail-cart").name == "rail-cart"
+    with pytest.raises(BadInputError, match=r"unknown task 'rail-crat': did you mean 'rail-cart'"):
+        registry.task_named("rail-crat")
+
+
+def test_a_log_is_labelled_by_a_task_in_a_file(tmp_path: Path) -> None:
+    state = np.column_stack([0.1 * np.arange(6), np.ones(6)]).astype(np.float32)
+    columns = [Column(STATE, size=2), Column(ACTION), Column(NEXT_STATE, size=2)]
+    about: dict[str, Any] = {"fps": 10, "task": "drive", "description": {"name": "logs", "stage": "import"}}
+    with DatasetWriter(tmp_path / "logs", columns, **about) as writer:
+        writer.add(
+            Episode(0, {STATE: state[:-1], ACTION: np.ones(5, np.float32), NEXT_STATE: state[1:].copy()})
+        )
+    command = ["label", f"{tmp_path}/logs", "--task", f"{CART}:LOGS_ALONE", "--out", f"{tmp_path}/labelled"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    assert f"finished: {tmp_path}/labelled" in result.output.replace("\n", "")
+    reward = Dataset.open(tmp_path / "labelled").columns([REWARD])[REWARD]
+    np.testing.assert_allclose(reward, 0.1, atol=1e-6)

@@ -1,0 +1,114 @@
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Column,
+    Episode,
+)
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.stages.label import label
+
+CART = f"{Path(__file__).parents[1] / 'cart.py'}:LOGS_ALONE"
+COLUMNS = (
+    Column(STATE, size=2, names=("x", "speed")),
+    Column(ACTION, size=1, names=("v",)),
+    Column(NEXT_STATE, size=2, names=("x", "speed")),
+)
+
+
+def drive(speed: float, steps: int) -> dict[str, np.ndarray[Any, Any]]:
+    x = 0.1 * speed * np.arange(steps + 1, dtype=np.float32)
+    state = np.column_stack([x, np.full(steps + 1, speed)]).astype(np.float32)
+    return {STATE: state[:-1], ACTION: np.full(steps, speed, np.float32), NEXT_STATE: state[1:]}
+
+
+def write(
+    folder: Path,
+    episodes: list[Mapping[str, Any]],
+    more: tuple[Column, ...] = (),
+    **metadata: Any,  # noqa: ANN401
+) -> Path:
+    with DatasetWriter(
+        folder, [*COLUMNS, *more], fps=10, task="drive", description={"name": "logs", "stage": "import"}
+    ) as writer:
+        for uid, columns in enumerate(episodes):
+            writer.add(Episode(uid, dict(columns), metadata))
+    return folder
+
+
+def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
+    logs = write(tmp_path / "logs", [drive(0.5, 10), drive(4.0, 10)])
+    labelled = Dataset.open(label(CART, dataset=logs, out=tmp_path / "labelled"))
+    slow, fast = labelled.episodes()
+    assert len(slow) == 10 and not slow.columns[SUCCESS].any() and not slow.columns[TERMINATED].any()
+    np.testing.assert_allclose(slow.columns[REWARD], 0.05, atol=1e-6)
+    assert slow.columns[TRUNCATED].tolist() == slow.columns[DONE].tolist() == [False] * 9 + [True]
+    # 0.4 m a step: the episode ends with the step that reaches the goal, between 1 and 2 m.
+    goal = float(fast.columns[GOAL][0])
+    assert len(fast) == int(np.ceil(goal / 0.4)) and 1.0 <= goal <= 2.0
+    assert (
+        fast.columns[SUCCESS].tolist()
+        == fast.columns[TERMINATED].tolist()
+        == [False] * (len(fast) - 1) + [True]
+    )
+    np.testing.assert_allclose(fast.columns[REWARD][-1], 10.4, atol=1e-5)
+    assert labelled.metadata["success"] == [False, True] and labelled.metadata["failed"] == [False, False]
+    assert labelled.metadata["return"] == pytest.approx([0.5, 10 + 0.4 * len(fast)], abs=1e-5)
+    assert labelled.description["dropped_steps"] == 10 - len(fast)
+    assert labelled.reference == "logs@data-2.0.0"
+
+
+def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
+    fell = np.array([False] * 9 + [True])
+    goal = Column(GOAL, size=1)
+    given = drive(1.0, 10) | {TERMINATED: fell, GOAL: np.full(10, 0.95, np.float32)}
+    more = (goal, *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
+    logs = write(tmp_path / "logs", [given], more, driver="Ada")
+    labelled = Dataset.open(label(CART, dataset=logs, out=tmp_path / "labelled"))
+    (episode,) = labelled.episodes()
+    # It is at the goal when it falls: a failure.
+    assert episode.columns[TERMINATED].tolist() == fell.tolist() and not episode.columns[SUCCESS].any()
+    assert episode.columns[REWARD][-1] == pytest.approx(0.1 - 10.0)
+    assert episode.columns[GOAL].tolist() == given[GOAL].tolist()
+    assert dict(episode.metadata) == {
+        **{"driver": "Ada", "success": False, "failed": True},
+        "return": pytest.approx(-9.0),
+    }
+
+
+def test_the_seed_decides_the_goals(tmp_path: Path) -> None:
+    logs = write(tmp_path / "logs", [drive(0.1, 3)] * 3)
+    goals = [
+        Dataset.open(label(CART, dataset=logs, seed=seed, out=tmp_path / f"{number}")).columns([GOAL])[GOAL]
+        for number, seed in enumerate((0, 0, 1))
+    ]
+    assert np.array_equal(goals[0], goals[1]) and not np.array_equal(goals[0], goals[2])
+    assert len(np.unique(goals[0])) == 3
+
+
+def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
+    logs = write(tmp_path / "logs", [drive(0.1, 3)])
+    with pytest.raises(
+        BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: 29"
+    ):
+        label("antmaze-umaze", dataset=logs, out=tmp_path / "out")
+    labelled = label(CART, dataset=logs, out=tmp_path / "labelled")
+    with pytest.raises(BadInputError, match="has goals and outcomes already: there is nothing to label"):
+        label(CART, dataset=labelled, out=tmp_path / "again")
+    assert not (tmp_path / "out").exists() and not (tmp_path / "again").exists()

@@ -1,0 +1,66 @@
+import torch
+from cart import TASK, Rail
+
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.driven import DrivenSimulator, VariedCommands
+from astra_data.worlds.variation import CommandVariation
+
+DRIVE = Commands({"v": (-1.0, 4.0)})
+
+
+def driven(count: int = 2) -> DrivenSimulator:
+    return DrivenSimulator(Rail(count), DRIVE, "cpu")
+
+
+def test_actions_become_commands_in_their_units() -> None:
+    simulator = driven(3)
+    landed = simulator.step(torch.tensor([[-1.0], [1.0], [5.0]]))
+    torch.testing.assert_close(landed, torch.tensor([[-0.1], [0.4], [0.4]]))
+    assert torch.equal(simulator.state, landed)
+
+
+def test_there_are_no_walls_where_the_simulator_has_none() -> None:
+    simulator = driven()
+    simulator.reset_to(torch.tensor([[1.0]]), torch.tensor([1]))
+    assert simulator.state.tolist() == [[0.0], [1.0]]
+    settled = simulator.settle(simulator.state, torch.tensor([[7.0], [8.0]]))
+    assert settled.tolist() == simulator.state.tolist() == [[7.0], [8.0]]
+    assert simulator.blocked.tolist() == [False, False]
+    simulator.vary({"friction": torch.ones(2, 1)})
+    assert simulator.parameters == {"timestep_s": 0.1}
+
+
+class Walled(Rail):
+    """A rail with an end at 1."""
+
+    blocked = torch.tensor([True, False])
+    varied = 0
+
+    def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
+        self.reset_to(landed.clamp_max(1.0))
+        return self.state
+
+    def vary(self, parameters: dict[str, torch.Tensor]) -> None:
+        self.varied += len(parameters)
+
+
+def test_walls_and_parameters_of_the_simulator_are_its_own() -> None:
+    walled = Walled(2)
+    simulator = DrivenSimulator(walled, DRIVE, "cpu")
+    assert simulator.settle(simulator.state, torch.tensor([[0.5], [3.0]])).tolist() == [[0.5], [1.0]]
+    assert simulator.blocked.tolist() == [True, False]
+    simulator.vary({"friction": torch.ones(2, 1)})
+    assert walled.varied == 1
+
+
+def test_commands_vary_from_episode_to_episode() -> None:
+    longer = CommandVariation(action_scale=(0.5, 0.5))
+    simulator = TASK.varied_simulator(2, longer)
+    assert isinstance(simulator, VariedCommands)
+    # 0.4 of ±1 becomes 0.6: 1.5 + 2.5 * 0.6 = 3 m/s for a tenth of a second.
+    torch.testing.assert_close(simulator.step(torch.full((2, 1), 0.4)), torch.full((2, 1), 0.3))
+    torch.manual_seed(0)
+    noisy = TASK.varied_simulator(500, CommandVariation(action_noise=(0.05, 0.05)))
+    landed = noisy.step(torch.zeros(500, 1))
+    assert abs(float(landed.std()) / (0.05 * 2.5 * 0.1) - 1.0) < 0.1
+    assert abs(float(landed.mean()) - 0.15) < 0.002

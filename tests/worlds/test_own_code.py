@@ -1,0 +1,74 @@
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.own_code import file_of, is_own_code, own_object
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.task import Task
+
+CART = Path(__file__).parents[1] / "cart.py"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("cart.py:TASK", True),
+        ("robots/cart.py:TASK", True),
+        ("package.module:TASK", True),
+        ("antmaze-umaze", False),
+        ("cart.py", False),
+        (":TASK", False),
+        ("cart.py:", False),
+        ("s3://bucket", False),
+    ],
+)
+def test_code_is_named_by_its_place_and_an_object(name: str, expected: bool) -> None:
+    assert is_own_code(name) == expected
+
+
+def test_a_file_is_run_once_and_its_objects_are_found() -> None:
+    task = task_named(f"{CART}:TASK")
+    assert isinstance(task, Task) and task.name == "rail-cart"
+    assert task_named(f"{CART}:TASK") is task
+    assert task_named(f"{CART}:LOGS_ALONE") is own_object(f"{CART}:LOGS_ALONE")
+
+
+def test_a_module_of_an_installed_package_is_found() -> None:
+    assert own_object("astra_data.worlds.task:Task") is Task
+    with pytest.raises(BadInputError, match=r"importing no.such fails with ModuleNotFoundError"):
+        own_object("no.such:TASK")
+    with pytest.raises(BadInputError, match=r"astra_data.worlds.task:Task is a type, expected a Task"):
+        task_named("astra_data.worlds.task:Task")
+
+
+def test_a_file_that_fails_is_run_again(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("1 / 0")
+    for _ in range(2):
+        with pytest.raises(BadInputError, match=r"importing .*mine.py fails with ZeroDivisionError"):
+            own_object(f"{file}:TASK")
+    file.write_text("TASK = 3")
+    assert own_object(f"{file}:TASK") == 3
+
+
+def test_files_of_one_name_are_two(tmp_path: Path) -> None:
+    for folder, value in (("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text(f"VALUE = {value}")
+    assert [own_object(f"{tmp_path}/{folder}/mine.py:VALUE") for folder in "ab"] == [1, 2]
+
+
+def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("import sys\nfrom pathlib import Path\nTASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
+    with pytest.raises(BadInputError, match=r"mine.py has no 'TAKS'; it has TASK, reach$"):
+        own_object(f"{file}:TAKS")
+    with pytest.raises(BadInputError, match=r"none.py does not exist: expected a Python file"):
+        own_object(f"{tmp_path}/none.py:TASK")
+
+
+def test_a_file_is_known_by_its_digest() -> None:
+    assert file_of(f"{CART}:TASK") == {"file_sha256": hashlib.sha256(CART.read_bytes()).hexdigest()}
+    assert file_of("antmaze-umaze") == file_of("package.module:TASK") == {}

@@ -1,0 +1,80 @@
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cart import TASK, Cart
+
+from astra_data.core.errors import BadInputError
+
+
+def test_robots_are_stepped_by_commands_in_their_units() -> None:
+    env = TASK.target(3, seed=0)
+    env.reset()
+    step = env.step(torch.tensor([[-1.0], [0.6], [1.0]]))
+    # The middle is 1.5, half the range 2.5: -1, 3 and 4 m/s; the third is pushed too hard.
+    torch.testing.assert_close(env.state, torch.tensor([[-0.09, -1.0], [0.27, 3.0], [0.36, 4.0]]))
+    assert env.failed.tolist() == step.terminated.tolist() == [False, False, True]
+    torch.testing.assert_close(step.reward, torch.tensor([-0.09, 0.27, 0.36 - 10.0]))
+    assert not step.success.any() and not env.wall_contact.any()
+
+
+def test_robots_that_are_done_stay_as_they_are() -> None:
+    env = TASK.target(2, seed=0)
+    env.reset()
+    env.step(torch.zeros(2, 1))
+    env.step(torch.zeros(2, 1), torch.tensor([True, False]))
+    torch.testing.assert_close(env.state[:, 0], torch.tensor([0.27, 0.135]))
+    env.reset(torch.tensor([True, False]))
+    torch.testing.assert_close(env.state[:, 0], torch.tensor([0.0, 0.135]))
+
+
+def test_an_episode_ends_at_its_goal() -> None:
+    env = TASK.target(1, seed=3)
+    env.reset()
+    for _ in range(40):
+        step = env.step(torch.tensor([[0.4]]))
+        if step.terminated[0]:
+            break
+    assert step.success[0] and env.state[0, 0] >= env.goal[0, 0] > env.state[0, 0] - 0.225 - 1e-6
+
+
+class Noted(Cart):
+    """A robot that notes its seeds."""
+
+    seeds: list[int] = []  # noqa: RUF012 - shared on purpose
+
+    def reset(self, seed: int = -1) -> list[float]:
+        self.seeds.append(seed)
+        return super().reset()
+
+
+def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
+    task, goals = replace(TASK, robot=Noted), []
+    Noted.seeds.clear()
+    for seed in (1, 1, 2):
+        env = task.target(2, seed=seed)
+        env.reset()
+        goals.append(env.goal.tolist())
+    assert goals[0] == goals[1] != goals[2] and goals[0][0] != goals[0][1]
+    assert Noted.seeds[:2] == Noted.seeds[2:4] != Noted.seeds[4:]
+    assert -1 not in Noted.seeds
+
+
+@pytest.mark.parametrize("state", [[0.0], [0.0, float("nan")], [0.0, 0.0, 0.0], None])
+def test_a_state_of_another_kind_is_refused(state: Any) -> None:  # noqa: ANN401
+    class Broken(Cart):
+        def step(self, command: np.ndarray[Any, Any]) -> tuple[Any, bool]:
+            return state, False
+
+    env = replace(TASK, robot=Broken).target(1, seed=0)
+    env.reset()
+    with pytest.raises(BadInputError, match="step of the robot: expected a finite state of 2 numbers, got"):
+        env.step(torch.zeros(1, 1))
+
+
+def test_a_robot_is_not_put_anywhere() -> None:
+    env = TASK.target(1, seed=0)
+    with pytest.raises(BadInputError, match="data_start_share = 0"):
+        env.reset_to(np.array([0]), np.zeros((1, 2)))
