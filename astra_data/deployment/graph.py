@@ -4,8 +4,10 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -85,7 +87,8 @@ def write_graphs(deployed: DeployedPolicy, folder: Path) -> Written:
         except Exception as error:
             raise _not_traceable(deployed, error) from error
         (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
-        torch.jit.freeze(torch.jit.trace(graph, example, check_trace=False)).save(str(folder / TORCHSCRIPT))
+        script = torch.jit.freeze(torch.jit.trace(graph, example, check_trace=False))
+        _save_script(script, folder / TORCHSCRIPT)
     readers = {ONNX: load_onnx, TORCHSCRIPT: load_torchscript}
     apart = {name: _apart(graph, read(folder / name), name) for name, read in readers.items()}
     return Written(graph.parts, apart)
@@ -135,6 +138,16 @@ def _onnx(module: nn.Module, example: tuple[Tensor, ...], **names: Sequence[str]
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
     return model
+
+
+def _save_script(script: Any, path: Path) -> None:  # noqa: ANN401 - torch has no name for it
+    """Write a TorchScript module, without the lines and paths of the code that made it."""
+    buffer = BytesIO()
+    torch.jit.save(script, buffer)
+    with ZipFile(buffer) as whole, ZipFile(path, "w") as kept:
+        for record in whole.infolist():
+            if not record.filename.endswith(".debug_pkl"):
+                kept.writestr(record, whole.read(record))
 
 
 def _hypot(x: Tensor, y: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from cart import GIVEN, Rail, Reach
 from cart import TASK as CART
 from torch import Tensor
 
+import astra_data
 from astra_data.core.errors import BadInputError
 from astra_data.deployment.graph import (
     ONNX,
@@ -109,6 +110,8 @@ def test_a_graph_holds_no_paths_of_the_machine_and_is_the_same_twice(tmp_path: P
     written = (tmp_path / "a" / ONNX).read_bytes()
     assert written == (tmp_path / "b" / ONNX).read_bytes()
     assert not re.search(rb"\.py\b|astra_data", written)
+    script = (tmp_path / "a" / TORCHSCRIPT).read_bytes()
+    assert str(Path(astra_data.__file__).parent).encode() not in script
 
 
 def through_numpy(state: Tensor) -> Tensor:
