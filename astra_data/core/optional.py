@@ -18,6 +18,8 @@ EXTRAS = {
     "PIL": "report",
     "rliable": "report",
     "jinja2": "report",
+    "onnxruntime": "deploy",
+    "onnxscript": "deploy",
 }
 """Which extra brings each package that whole rooms of the code import."""
 

@@ -32,16 +32,40 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         >>> policy.start(1)
         >>> velocity = policy.act(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
     """
-    folder = Path(run)
-    recipe = folder / "recipe.json"
+    files = policy_files(run, row, seed=seed, percent=percent)
+    return deploy(
+        task_named(task_of(run)),
+        PolicyFile.load(files["train"]),
+        load_grounding(files["ground"]) if "ground" in files else NO_GROUNDING,
+        load_target_encoder(files["align"]) if "align" in files else None,
+    )
+
+
+def task_of(run: str | Path) -> str:
+    """Return the task that a run's recipe names.
+
+    Raises:
+        BadInputError: it is not the folder of a run.
+    """
+    recipe = Path(run) / "recipe.json"
     if not recipe.is_file():
         raise BadInputError(
-            f"{folder}: expected the folder of a run, which holds recipe.json: make it with astra-data run"
+            f"{run}: expected the folder of a run, which holds recipe.json: make it with astra-data run"
         )
+    return str(json.loads(recipe.read_text())["task"])
+
+
+def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = None) -> dict[str, Path]:
+    """Return the files that make up the policy of a row, by the stage that wrote them.
+
+    Raises:
+        BadInputError: as `load_policy`.
+    """
+    task_of(run)
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")
-    base, where = grounded_as(base_method(row)), place(seed, percent)
+    folder, base, where = Path(run), grounded_as(base_method(row)), place(seed, percent)
     files = {"train": folder / "train" / row / where / "policy.safetensors"}
     if method.grounds:
         files["ground"] = folder / "ground" / base / where / "grounding.safetensors"
@@ -49,9 +73,4 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         files["align"] = folder / "align" / base / where / "target_encoder.safetensors"
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
-    return deploy(
-        task_named(json.loads(recipe.read_text())["task"]),
-        PolicyFile.load(files["train"]),
-        load_grounding(files["ground"]) if method.grounds else NO_GROUNDING,
-        load_target_encoder(files["align"]) if method.aligns else None,
-    )
+    return files

@@ -1,7 +1,7 @@
 """Run a policy step by step, in the target or a simulator, with its encoder and memory."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +24,21 @@ def target_observation(
     """
     abstract = policy_observation(task.objective, task.abstraction(state), goal, latent)
     return abstract if observed == "abstract" else torch.cat([abstract, task.beyond(state)], dim=-1)
+
+
+class Memory(NamedTuple):
+    """What B robots remember of their episodes: zeros at the start.
+
+    Attributes:
+        previous_output: what the policy put out last, (B, A). previous_action: the same as it was given to
+            the robot, (B, A).
+        policy: the policy's own memory, (B, M). encoder: that of the encoder, (B, Z).
+    """
+
+    previous_output: Tensor
+    previous_action: Tensor
+    policy: Tensor
+    encoder: Tensor
 
 
 @dataclass
@@ -55,11 +70,15 @@ class DeployedPolicy:
 
     def start(self, count: int, generator: torch.Generator | None = None) -> None:
         """Start B = `count` episodes without history; with `generator`, draw actions as in training."""
+        still = torch.zeros(count, self.policy.shape.action_size)
+        latent = torch.zeros(count, self._latent_size)
+        self.resume(Memory(still, still, self.policy.initial_hidden(count), latent))
         self._generator = generator
-        self._previous_output = torch.zeros(count, self.policy.shape.action_size)
-        self._previous_action = torch.zeros_like(self._previous_output)
-        self._hidden = self.policy.initial_hidden(count)
-        self._encoder_hidden = torch.zeros(count, self._latent_size)
+
+    def resume(self, memory: Memory) -> None:
+        """Go on with episodes from what is remembered of them, with the modes of the actions."""
+        self.memory = memory
+        self._generator = None
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
@@ -80,15 +99,16 @@ class DeployedPolicy:
     def _latent(self, encoder: LatentEncoder | None, seen: Tensor, goal: Tensor) -> Tensor | None:
         if encoder is None:
             return None
-        inputs = encoder.encoder_input(seen, goal, self._previous_action)
-        self._encoder_hidden = encoder.encoder.step(inputs, self._encoder_hidden)
-        return encoder.encoder.latent(self._encoder_hidden)
+        inputs = encoder.encoder_input(seen, goal, self.memory.previous_action)
+        hidden = encoder.encoder.step(inputs, self.memory.encoder)
+        self.memory = self.memory._replace(encoder=hidden)
+        return encoder.encoder.latent(hidden)
 
     @torch.no_grad()
     def _act(self, observation: Tensor) -> Tensor:
-        features, self._hidden = self.policy.remember(observation, self._previous_output, self._hidden)
-        self._previous_output = self.policy.act(features, self._generator)
-        self._previous_action = self.task.objective.limit_command(
-            self._previous_output, self.command_limit_m_s
-        )
-        return self._previous_action
+        before = self.memory
+        features, hidden = self.policy.remember(observation, before.previous_output, before.policy)
+        output = self.policy.act(features, self._generator)
+        action = self.task.objective.limit_command(output, self.command_limit_m_s)
+        self.memory = Memory(output, action, hidden, before.encoder)
+        return action

@@ -1,0 +1,96 @@
+"""The folder of a deployed policy: graphs, a description, a page of its own, and a loop that runs them."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
+from astra_data.core.provenance import origin
+from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.columns import Column
+from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, TORCHSCRIPT, write_graphs
+from astra_data.deployment.page import page
+from astra_data.experiments.trained_policy import load_policy, policy_files, task_of
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.policy_file import PolicyFile
+from astra_data.worlds.own_code import file_of
+
+DESCRIPTION, LOOP, PAGE = "policy.json", "run_policy.py", "README.md"
+FORMAT = 1
+"""Of `DESCRIPTION`."""
+
+
+def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None = None) -> Path:
+    """Write the policy of a row into the new folder `out`, which runs without this package; return it.
+
+    Args:
+        run: the folder of a run.
+        row: a row of its recipe, such as "astra_plus".
+        out: the folder to write.
+        seed: one of the recipe's seeds.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+
+    Raises:
+        BadInputError: the row trains no policy, an artefact of it is not there, code of the task cannot be
+            written as a graph, or `out` exists.
+    """
+    if out.exists():
+        raise BadInputError(f"{out} exists already; delete it or choose another folder.")
+    deployed = load_policy(run, row, seed=seed, percent=percent)
+    made_from = policy_files(run, row, seed=seed, percent=percent)
+    digests = {stage: file_digest(path) for stage, path in made_from.items()}
+    trained = PolicyFile.load(made_from["train"])
+    with atomic_folder(out) as folder:
+        written = write_graphs(deployed, folder)
+        about = {
+            "format": FORMAT,
+            "row": row,
+            "seed": seed,
+            **({} if percent is None else {"percent": percent}),
+            "trained_on": {"dataset": trained.dataset, "hash": trained.content_hash},
+            **describe(deployed, written.parts),
+            "largest_difference": written.apart,
+            "made_from": digests | file_of(task_of(run)),
+            **origin(),
+        }
+        (folder / DESCRIPTION).write_text(json.dumps(about, indent=1))
+        (folder / PAGE).write_text(page(about))
+        with as_file(files("astra_data.deployment") / LOOP) as loop:
+            shutil.copyfile(loop, folder / LOOP)
+        write_manifest(folder, digests)
+    return out
+
+
+def describe(deployed: DeployedPolicy, parts: Mapping[str, int]) -> dict[str, Any]:
+    """Return what one has to know to run a policy whose hidden state has these `parts`, by their sizes."""
+    task = deployed.task
+    encoder = "target" if deployed.target_encoder is not None else "source"
+    least, largest = zip(*task.limits.values(), strict=True)
+    return {
+        "task": task.name,
+        "instruction": task.instruction,
+        "rate_hz": 1.0 / task.timestep_s,
+        "files": {"onnx": ONNX, "torchscript": TORCHSCRIPT},
+        "inputs": list(INPUTS),
+        "outputs": list(OUTPUTS),
+        "state": _values(task.state, "state"),
+        "goal": _values(task.goal, "goal") if task.goal else {"names": []},
+        "command": _values(task.action, "command") | {"least": least, "largest": largest},
+        "hidden": {"size": sum(parts.values()), "start": 0.0, "parts": dict(parts)},
+        "encoder": encoder if deployed.source_encoder is not None else None,
+        "observed": deployed.observed,
+        "command_limit_m_s": deployed.command_limit_m_s if task.plane else None,
+    }
+
+
+def _values(column: Column, called: str) -> dict[str, Any]:
+    """Return the names of a column's values, and their units and frames where they are known."""
+    names = column.names or tuple(f"{called}_{index}" for index in range(column.size))
+    known = column.astra or {}
+    kept = {f"{key}s": known[key] for key in ("unit", "frame") if key in known}
+    return {"column": column.name, "names": list(names), **kept}

@@ -1,0 +1,225 @@
+"""A policy with its encoder and memory as one graph, without state: ONNX and TorchScript."""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+from zipfile import ZipFile
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.training.deployment import DeployedPolicy, Memory
+
+ONNX, TORCHSCRIPT = "policy.onnx", "policy.torchscript"
+INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
+TOLERANCE = 1e-3
+"""How far commands of a graph may be from those of the policy, in half ranges: more than rounding does."""
+
+_COMPARED_STEPS = 100
+
+Graph = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+class PolicyGraph(nn.Module):
+    """One step of a policy on one robot: its hidden state is an argument and a result, zeros at the start.
+
+    Attributes:
+        parts: the parts of the hidden state, (1, H), one after the other: each with its size.
+    """
+
+    def __init__(self, deployed: DeployedPolicy) -> None:
+        super().__init__()
+        networks = (deployed.policy, deployed.source_encoder, deployed.target_encoder)
+        self.networks = nn.ModuleList([network for network in networks if isinstance(network, nn.Module)])
+        self._deployed = deployed
+        deployed.start(1)
+        self.parts = {name: part.shape[1] for name, part in deployed.memory._asdict().items()}
+
+    @property
+    def example(self) -> tuple[Tensor, Tensor, Tensor]:
+        """A state (1, S), a goal (1, G) and the hidden state (1, H) at the start, all zeros."""
+        task = self._deployed.task
+        sizes = (task.state.size, task.objective.goal_size, sum(self.parts.values()))
+        return torch.zeros(1, sizes[0]), torch.zeros(1, sizes[1]), torch.zeros(1, sizes[2])
+
+    def forward(self, state: Tensor, goal: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the command (1, A), in its units, and the next hidden state (1, H).
+
+        `state` (1, S) is the target's, `goal` (1, G) may have no values, `hidden` is (1, H).
+        """
+        robot = replace(self._deployed)
+        robot.resume(Memory(*hidden.split(list(self.parts.values()), dim=-1)))
+        command = robot.task.limits.in_units(robot.act(state, goal))
+        return command, torch.cat(robot.memory, dim=-1)
+
+
+class Written(NamedTuple):
+    """What was written.
+
+    Attributes:
+        parts: the parts of the hidden state, with their sizes.
+        apart: the largest difference from the policy's commands, in half ranges of these, by file.
+    """
+
+    parts: dict[str, int]
+    apart: dict[str, float]
+
+
+def write_graphs(deployed: DeployedPolicy, folder: Path) -> Written:
+    """Write the policy as ONNX and TorchScript into `folder`, and compare both with it.
+
+    Raises:
+        BadInputError: code of the task cannot be traced, or a graph gives other commands than the policy.
+    """
+    optional("onnxscript", "deploy")
+    graph = PolicyGraph(deployed).eval()
+    example = graph.example
+    with _quiet():
+        try:
+            model = _onnx(graph, example, input_names=INPUTS, output_names=OUTPUTS)
+        except Exception as error:
+            raise _not_traceable(deployed, error) from error
+        (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
+        script = torch.jit.freeze(torch.jit.trace(graph, example, check_trace=False))
+        _save_script(script, folder / TORCHSCRIPT)
+    readers = {ONNX: load_onnx, TORCHSCRIPT: load_torchscript}
+    apart = {name: _apart(graph, read(folder / name), name) for name, read in readers.items()}
+    return Written(graph.parts, apart)
+
+
+def load_onnx(path: Path) -> Graph:
+    """Return the graph of an ONNX file, run on one core.
+
+    Raises:
+        BadInputError: onnxruntime is not installed.
+    """
+    runtime = optional("onnxruntime", "deploy")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = runtime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+    def run(*values: Tensor) -> tuple[Tensor, Tensor]:
+        feed = {name: value.numpy() for name, value in zip(INPUTS, values, strict=True)}
+        command, hidden = session.run(None, feed)
+        return torch.from_numpy(command), torch.from_numpy(hidden)
+
+    return run
+
+
+def load_torchscript(path: Path) -> Graph:
+    """Return the graph of a TorchScript file."""
+    with _quiet():
+        loaded: Graph = torch.jit.load(str(path))
+    return loaded
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hide the warnings of torch's exporters about torch's own code."""
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _onnx(module: nn.Module, example: tuple[Tensor, ...], **names: Sequence[str]) -> Any:  # noqa: ANN401
+    """Return a module as an ONNX model, without the lines and paths of the code that made it."""
+    exported = torch.export.export(module, example, strict=False).run_decompositions(_DECOMPOSED)
+    program = torch.onnx.export(exported, dynamo=True, verbose=False, **names)  # type: ignore[arg-type]
+    assert program is not None
+    model: Any = program.model_proto
+    for node in model.graph.node:
+        node.ClearField("metadata_props")
+        node.ClearField("doc_string")
+    return model
+
+
+def _save_script(script: Any, path: Path) -> None:  # noqa: ANN401 - torch has no name for it
+    """Write a TorchScript module, without the lines and paths of the code that made it."""
+    buffer = BytesIO()
+    torch.jit.save(script, buffer)
+    with ZipFile(buffer) as whole, ZipFile(path, "w") as kept:
+        for record in whole.infolist():
+            if not record.filename.endswith(".debug_pkl"):
+                kept.writestr(record, whole.read(record))
+
+
+def _hypot(x: Tensor, y: Tensor) -> Tensor:
+    return (x.square() + y.square()).sqrt()
+
+
+_DECOMPOSED: dict[Any, Callable[..., Any]] = {torch.ops.aten.hypot.default: _hypot}
+"""Operations that ONNX has not."""
+
+
+def _not_traceable(deployed: DeployedPolicy, error: Exception) -> BadInputError:
+    """Return the error that names the task's function which cannot be traced."""
+    task, (state, goal, _) = deployed.task, PolicyGraph(deployed).example
+    action = torch.zeros(1, task.objective.action_size)
+    functions: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        "abstraction": (task.abstraction, (state,)),
+        "objective.observe": (task.objective.observe, (torch.zeros(1, task.abstract_state.size), goal)),
+        "beyond": (task.beyond, (state,)),
+        "objective.limit_command": (
+            lambda given: task.objective.limit_command(given, deployed.command_limit_m_s),
+            (action,),
+        ),
+    }
+    name, cause = "the policy", error
+    for candidate, (function, given) in functions.items():
+        try:
+            _onnx(_Call(function), given)
+        except Exception as found:  # noqa: BLE001 - it is the user's code
+            name, cause = candidate, found
+            break
+    while cause.__cause__ is not None:
+        cause = cause.__cause__  # type: ignore[assignment]
+    reason = next(iter(str(cause).strip().splitlines()), "")
+    return BadInputError(
+        f"{task.name}: {name} cannot be written as a graph ({type(cause).__name__}: {reason}): expected "
+        "operations of torch alone, and no branch that depends on values"
+    )
+
+
+class _Call(nn.Module):
+    """A function as a module."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__()
+        self._function = function
+
+    def forward(self, *given: Tensor) -> Any:  # noqa: ANN401 - whatever it returns
+        """Call it."""
+        return self._function(*given)
+
+
+def _apart(graph: PolicyGraph, written: Graph, name: str) -> float:
+    """Return how far the commands of a written graph are from the policy's, for random states and goals.
+
+    Raises:
+        BadInputError: they differ.
+    """
+    rng = np.random.default_rng(0)
+    deployed = graph._deployed
+    state, goal, hidden = graph.example
+    low, high = torch.tensor(list(deployed.task.limits.values())).unbind(-1)
+    deployed.start(1)
+    largest = 0.0
+    for step in range(_COMPARED_STEPS):
+        state, goal = (torch.from_numpy(rng.standard_normal(x.shape, np.float32)) for x in (state, goal))
+        command, hidden = written(state, goal, hidden)
+        expected = deployed.task.limits.in_units(deployed.act(state, goal))
+        apart = float(((command - expected).abs() * 2 / (high - low)).max())
+        if not apart <= TOLERANCE:
+            raise BadInputError(
+                f"{deployed.task.name}: in step {step} {name} gives the command {command[0].tolist()}, the "
+                f"policy {expected[0].tolist()}: does φ or the objective depend on more than its arguments?"
+            )
+        largest = max(largest, apart)
+    return largest

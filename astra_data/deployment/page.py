@@ -1,0 +1,80 @@
+"""The page that lies beside a deployed policy."""
+
+from collections.abc import Mapping
+from typing import Any
+
+_PAGE = """\
+# {task}: {row}, seed {seed}
+
+A policy that `astra-data deploy` wrote. It runs with NumPy and onnxruntime alone, {rate_hz:g} times a
+second:
+
+```python
+from run_policy import RobotPolicy, run
+
+policy = RobotPolicy(
+    rate_hz={rate_hz:g},
+    state={state_names},
+    goal={goal_names},
+)
+run(policy, measure, send, goal, steps={minute})
+```
+
+`measure()` returns the robot's state, `send(command)` gives it a command; both are yours.
+`policy.start()` begins an episode and `policy.act(state, goal)` takes one step. Another rate, other
+values, and values that are not finite are refused with a `ValueError`. `pip install numpy onnxruntime`
+brings all that it takes; `python run_policy.py` tries it with zeros.
+
+## State
+
+{state}
+
+## Goal
+
+{goal}
+
+## Command
+
+{command}
+
+## Graph
+
+`policy.onnx` and `policy.torchscript` are the same graph, of one robot and one step, in float32: `state`
+(1, {states}), `goal` (1, {goals}) and `hidden` (1, {hidden}) in, `command` (1, {commands}) and
+`next_hidden` (1, {hidden}) out. All values are in the units above: scaling, φ, the encoder and the
+memory are inside. `hidden` is zeros when an episode begins, and after that what the last step gave as
+`next_hidden`.
+
+## Where it comes from
+
+Learned from {dataset} (hash `{hash}`). `policy.json` has all of this for programs, with the digests of
+the files that it was made from and the versions of the packages; `manifest.json` has the digests of the
+files here.
+"""
+
+
+def page(about: Mapping[str, Any]) -> str:
+    """Return the page, in Markdown, of a policy with the description `about`."""
+    return _PAGE.format(
+        **{key: about[key] for key in ("task", "row", "seed", "rate_hz")},
+        minute=round(60 * about["rate_hz"]),
+        state_names=about["state"]["names"],
+        goal_names=about["goal"]["names"],
+        state=_table(about["state"]),
+        goal=_table(about["goal"]) if about["goal"]["names"] else "None: all episodes have the same.",
+        command=_table(about["command"]),
+        states=len(about["state"]["names"]),
+        goals=len(about["goal"]["names"]),
+        commands=len(about["command"]["names"]),
+        hidden=about["hidden"]["size"],
+        dataset=about["trained_on"]["dataset"],
+        hash=about["trained_on"]["hash"],
+    )
+
+
+def _table(values: Mapping[str, Any]) -> str:
+    """Return the lists in the description of a column as a table, one row for each value."""
+    lists = {key: entries for key, entries in values.items() if not isinstance(entries, str)}
+    titles = [key.removesuffix("s") if key != "names" else "name" for key in lists]
+    rows = [titles, ["---"] * len(titles), *zip(*lists.values(), strict=True)]
+    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in rows)

@@ -1,0 +1,74 @@
+"""Run the policy in this folder: onnxruntime and NumPy alone. `python run_policy.py` tries it at rest."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+HERE = Path(__file__).parent
+
+
+class RobotPolicy:
+    """The policy, for one robot: `start` an episode, then `act` once every control period."""
+
+    def __init__(
+        self, *, rate_hz: float, state: Sequence[str], goal: Sequence[str] = (), folder: Path = HERE
+    ) -> None:
+        """Take the rate at which it will act, and the names of the values that it will be given."""
+        self.about: dict[str, Any] = json.loads((folder / "policy.json").read_text())
+        if abs(rate_hz / self.about["rate_hz"] - 1.0) > 0.01:
+            raise ValueError(f"rate_hz: expected {self.about['rate_hz']:g}, got {rate_hz:g}")
+        for column, names in (("state", state), ("goal", goal)):
+            if list(names) != (expected := self.about[column]["names"]):
+                raise ValueError(f"{column}: expected the values {expected}, got {list(names)}")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self.session = onnxruntime.InferenceSession(
+            folder / "policy.onnx", options, providers=["CPUExecutionProvider"]
+        )
+        self.start()
+
+    def start(self) -> None:
+        """Forget the last episode."""
+        self.hidden = np.zeros((1, self.about["hidden"]["size"]), np.float32)
+
+    def act(self, state: Any, goal: Any = ()) -> Any:  # noqa: ANN401 - anything like an array
+        """Return the command (A,) for a state (S,) and a goal (G,), all in the units of policy.json."""
+        feed = {"hidden": self.hidden}
+        for column, given in (("state", state), ("goal", goal)):
+            values, names = np.asarray(given, np.float32), self.about[column]["names"]
+            if values.shape != (len(names),) or not np.isfinite(values).all():
+                raise ValueError(f"{column}: expected {len(names)} finite values {names}, got {given!r}")
+            feed[column] = values[None]
+        command, hidden = self.session.run(None, feed)
+        if not np.isfinite(command).all():
+            raise ValueError(f"the policy gives no command for the state {state!r} and the goal {goal!r}")
+        self.hidden = hidden
+        return command[0]
+
+
+def run(
+    policy: RobotPolicy,
+    measure: Callable[[], Any],
+    send: Callable[[Any], None],
+    goal: Sequence[float],
+    steps: int,
+) -> None:
+    """Measure the state, send the command, and wait for the next control period, `steps` times."""
+    policy.start()
+    due = time.perf_counter()
+    for _ in range(steps):
+        send(policy.act(measure(), goal))
+        due += 1.0 / policy.about["rate_hz"]
+        time.sleep(max(0.0, due - time.perf_counter()))
+
+
+if __name__ == "__main__":
+    described = json.loads((HERE / "policy.json").read_text())
+    state, goal = described["state"]["names"], described["goal"]["names"]
+    policy = RobotPolicy(rate_hz=described["rate_hz"], state=state, goal=goal)
+    run(policy, lambda: np.zeros(len(state)), print, [0.0] * len(goal), steps=10)

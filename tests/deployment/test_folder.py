@@ -1,0 +1,113 @@
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_run import GROUND, TASK, TRAIN, short_task
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import read_manifest
+from astra_data.core.progress import silent
+from astra_data.deployment.folder import deploy
+from astra_data.experiments.trained_policy import load_policy
+from astra_data.stages.collect import CollectConfig, collect
+from astra_data.stages.ground import ground
+from astra_data.stages.pair import PairConfig, pair
+from astra_data.stages.train import train
+from astra_data.worlds.registry import TASKS
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run with a policy of NAS, which has the source encoder."""
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    with short_task():
+        config = CollectConfig(episodes=4, max_steps=20)
+        walks = collect(TASK, config, seed=0, out=folder / "collect/seed_0", progress=silent)
+        pairs = pair(TASK, PairConfig(), dataset=walks, out=folder / "pair/seed_0")
+        grounding = folder / "ground/nas/seed_0"
+        few = GROUND.model_copy(update={"updates": 2})
+        ground(TASK, "nas", few, dataset=pairs, out=grounding)
+        train(TASK, "nas", TRAIN, dataset=pairs, grounding=grounding, out=folder / "train/nas/seed_0")
+    (folder / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze"}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(run: Path) -> Path:
+    return deploy(run, "nas", run.with_name("policy"))
+
+
+def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) -> None:
+    names = {path.name for path in folder.iterdir()}
+    graphs = {"policy.onnx", "policy.torchscript"}
+    assert names == graphs | {"policy.json", "README.md", "run_policy.py", "manifest.json"}
+    about = json.loads((folder / "policy.json").read_text())
+    task = TASKS["antmaze-umaze"]
+    assert about["rate_hz"] == 20 and about["row"] == "nas" and about["encoder"] == "source"
+    assert tuple(about["state"]["names"]) == task.state.names
+    assert len(about["state"]["units"]) == 29
+    assert len(about["goal"]["names"]) == 2
+    assert about["command"]["least"] == [-1, -1] and about["command"]["largest"] == [1, 1]
+    assert about["hidden"]["size"] == sum(about["hidden"]["parts"].values()) == 2 + 2 + 16
+    assert len(about["trained_on"]["hash"]) == 64
+    assert max(about["largest_difference"].values()) < 1e-6
+    manifest = read_manifest(folder)
+    assert manifest is not None and manifest.faults(folder, verify=True) == []
+    assert manifest.made_from == about["made_from"] and set(about["made_from"]) == {"train", "ground"}
+    page = " ".join((folder / "README.md").read_text().split())
+    assert "20 times a second" in page and "{" not in page
+    assert str(run.parent) not in page + json.dumps(about)
+
+
+def test_its_page_runs(folder: Path) -> None:
+    code = (folder / "README.md").read_text().partition("```python\n")[2].partition("```")[0]
+    given = "measure, send, goal = lambda: [0.0] * 29, print, [1.0, 2.0]\n"
+    code = code.replace("steps=1200", "steps=2")
+    shown = alone(folder, given + code)
+    assert len(shown.splitlines()) == 2
+
+
+def test_it_runs_without_this_package_and_without_torch(folder: Path, run: Path, tmp_path: Path) -> None:
+    moved = shutil.copytree(folder, tmp_path / "robot")
+    states, goal = np.random.default_rng(0).standard_normal((20, 29)).astype("float32"), [1.0, -2.0]
+    np.save(tmp_path / "states.npy", states)
+    shown = alone(
+        moved,
+        "import json, numpy\nfrom run_policy import RobotPolicy\nabout = json.load(open('policy.json'))\n"
+        "policy = RobotPolicy(rate_hz=20, state=about['state']['names'], goal=about['goal']['names'])\n"
+        "states = numpy.load('../states.npy')\npolicy.act(states[3], [0, 0])\npolicy.start()\n"
+        f"print(json.dumps([policy.act(state, {goal}).tolist() for state in states]))\n",
+    )
+    here = load_policy(run, "nas")
+    here.start(1)
+    expected = [here.act(torch.from_numpy(state[None]), torch.tensor([goal]))[0] for state in states]
+    np.testing.assert_allclose(json.loads(shown), torch.stack(expected), atol=1e-5, rtol=0)
+    assert (
+        len(alone(moved, "import runpy\nrunpy.run_path('run_policy.py', run_name='__main__')").split("\n"))
+        > 9
+    )
+
+
+def alone(folder: Path, code: str) -> str:
+    """Run code in a folder, where neither this package nor torch can be imported."""
+    without = (
+        "import sys\nsys.path.insert(0, '.')\nfor name in ('astra_data', 'torch'): sys.modules[name] = None\n"
+    )
+    command = [sys.executable, "-I", "-c", without + code]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="follower trains no policy"):
+        deploy(run, "follower", tmp_path / "a/policy")
+    with pytest.raises(BadInputError, match=r"nas, seed 1: expected .*\(astra-data train\).*run the recipe"):
+        deploy(run, "nas", tmp_path / "a/policy", seed=1)
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(BadInputError, match=r"exists already; delete it or choose another folder"):
+        deploy(run, "nas", tmp_path)
+    assert list(tmp_path.iterdir()) == []

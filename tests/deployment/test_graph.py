@@ -1,0 +1,151 @@
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cart import GIVEN, Rail, Reach
+from cart import TASK as CART
+from torch import Tensor
+
+import astra_data
+from astra_data.core.errors import BadInputError
+from astra_data.deployment.graph import (
+    ONNX,
+    TORCHSCRIPT,
+    PolicyGraph,
+    load_onnx,
+    load_torchscript,
+    write_graphs,
+)
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.adaptation import AdaptiveShape, Student
+from astra_data.learning.networks.alignment import TargetEncoder
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.policy import PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
+
+ANT = TASKS["antmaze-umaze"]
+
+
+class Stay(Reach):
+    """The cart's objective without goals."""
+
+    goal_size = 0
+
+
+class Speed(Rail):
+    """An abstraction with an operation that ONNX has not."""
+
+    @staticmethod
+    def abstraction(state: Tensor) -> Tensor:
+        return torch.hypot(state[..., :1], state[..., 1:])
+
+
+def lively[P: ActorCritic](policy: P) -> P:
+    """Make its actions of some size."""
+    with torch.no_grad():
+        for weight in policy.actor[-1].parameters():
+            weight.mul_(50)
+    return policy
+
+
+def actor(observation_size: int, action_size: int = 2, **sizes: Any) -> ActorCritic:  # noqa: ANN401
+    return lively(ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(8,), **sizes)))
+
+
+def policies() -> dict[str, DeployedPolicy]:
+    torch.manual_seed(0)
+    latent = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
+    rma = AdaptiveShape(8, 2, hidden_sizes=(8,), extrinsics_size=3)
+    still = Task(**GIVEN | {"make_simulator": Speed, "objective": Stay(horizon=40)})
+    whole = SoftActor(PolicyShape(33, 2, hidden_sizes=(8,)))
+    return {
+        "feed-forward": DeployedPolicy(ANT, actor(8), command_limit_m_s=0.4),
+        "recurrent": DeployedPolicy(ANT, actor(8, memory_size=8), command_limit_m_s=0.4),
+        "source encoder": DeployedPolicy(ANT, actor(16), latent, command_limit_m_s=0.4),
+        "target encoder": DeployedPolicy(ANT, actor(16, memory_size=8), latent, aligned),
+        "adaptive": DeployedPolicy(ANT, lively(Student(rma))),
+        "full state": DeployedPolicy(ANT, whole, observed="full"),
+        "units, no goal": DeployedPolicy(still, actor(1, 1, memory_size=4)),
+    }
+
+
+POLICIES = policies()
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_graphs_act_as_the_policy_over_1000_steps(name: str, tmp_path: Path) -> None:
+    deployed = POLICIES[name]
+    write_graphs(deployed, tmp_path)
+    task, rng = deployed.task, np.random.default_rng(1)
+    written = (load_onnx(tmp_path / ONNX), load_torchscript(tmp_path / TORCHSCRIPT))
+    hidden = [PolicyGraph(deployed).example[2]] * 2
+    deployed.start(1)
+    spread, apart = [], 0.0
+    for _ in range(1000):
+        state, goal = (
+            torch.from_numpy(rng.standard_normal((1, size), np.float32))
+            for size in (task.state.size, task.objective.goal_size)
+        )
+        expected = task.limits.in_units(deployed.act(state, goal))
+        spread.append(expected)
+        for index, run in enumerate(written):
+            command, hidden[index] = run(state, goal, hidden[index])
+            apart = max(apart, float((command - expected).abs().max()))
+    assert apart <= 1e-5
+    assert torch.cat(spread).std(dim=0).max() > 0.05, "the policy does something"
+
+
+def test_a_graph_holds_no_paths_of_the_machine_and_is_the_same_twice(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write_graphs(POLICIES["units, no goal"], tmp_path / folder)
+    written = (tmp_path / "a" / ONNX).read_bytes()
+    assert written == (tmp_path / "b" / ONNX).read_bytes()
+    assert not re.search(rb"\.py\b|astra_data", written)
+    script = (tmp_path / "a" / TORCHSCRIPT).read_bytes()
+    assert str(Path(astra_data.__file__).parent).encode() not in script
+
+
+def through_numpy(state: Tensor) -> Tensor:
+    return torch.from_numpy(np.asarray(state.numpy())[..., :1])
+
+
+def branching(state: Tensor) -> Tensor:
+    return state[..., :1] if float(state[0, 0]) > 0 else state[..., 1:]
+
+
+class Forgetful:
+    calls = 0
+
+    def __call__(self, state: Tensor) -> Tensor:
+        self.calls += 1
+        return state[..., :1] + self.calls
+
+
+@pytest.mark.parametrize(
+    ("abstraction", "told"),
+    [
+        (
+            through_numpy,
+            "rail-cart: abstraction cannot be written as a graph .*: expected operations of torch",
+        ),
+        (branching, "rail-cart: abstraction cannot be written as a graph .*, and no branch"),
+        (
+            Forgetful(),
+            r"rail-cart: in step 0 policy.onnx gives the command \[.*\], the policy \[.*\]: does φ",
+        ),
+    ],
+)
+def test_code_that_is_no_graph_is_named_in_one_line(abstraction: Any, told: str, tmp_path: Path) -> None:  # noqa: ANN401
+    task = replace(CART, abstraction=abstraction)
+    with pytest.raises(BadInputError, match=told) as raised:
+        write_graphs(DeployedPolicy(task, actor(2, 1)), tmp_path)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,79 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cart import TASK
+
+from astra_data.deployment.folder import describe
+from astra_data.deployment.graph import write_graphs
+from astra_data.deployment.run_policy import RobotPolicy, run
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.training.deployment import DeployedPolicy
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("cart")
+    torch.manual_seed(0)
+    deployed = DeployedPolicy(TASK, ActorCritic(ActorCriticShape(2, 1, memory_size=4)))
+    written = write_graphs(deployed, made)
+    (made / "policy.json").write_text(json.dumps(describe(deployed, written.parts)))
+    return made
+
+
+GIVEN: dict[str, Any] = {"rate_hz": 10, "state": ["x", "speed"], "goal": ["goal_0"]}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"rate_hz": 20}, "rate_hz: expected 10, got 20"),
+        ({"state": ["speed", "x"]}, r"state: expected the values \['x', 'speed'\], got \['speed', 'x'\]"),
+        ({"state": ["x"]}, r"state: expected the values \['x', 'speed'\], got \['x'\]"),
+        ({"goal": []}, r"goal: expected the values \['goal_0'\], got \[\]"),
+    ],
+)
+def test_another_rate_and_other_values_are_refused(wrong: dict[str, Any], told: str, folder: Path) -> None:
+    with pytest.raises(ValueError, match=told):
+        RobotPolicy(**GIVEN | wrong, folder=folder)
+
+
+@pytest.mark.parametrize(
+    ("state", "goal", "told"),
+    [
+        ([0.0, np.nan], [1.0], r"state: expected 2 finite values \['x', 'speed'\], got \[0.0, nan\]"),
+        ([0.0], [1.0], "state: expected 2 finite values"),
+        ([[0.0, 0.0]], [1.0], "state: expected 2 finite values"),
+        ([0.0, 0.0], [np.inf], r"goal: expected 1 finite values \['goal_0'\], got \[inf\]"),
+        ([0.0, 0.0], [], "goal: expected 1 finite values"),
+    ],
+)
+def test_values_that_are_none_are_refused_and_forgotten(
+    state: list[Any], goal: list[float], told: str, folder: Path
+) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    with pytest.raises(ValueError, match=told):
+        policy.act(state, goal)
+    assert not policy.hidden.any()
+
+
+def test_a_command_that_is_none_is_refused(folder: Path) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    policy.hidden[:] = np.nan
+    with pytest.raises(ValueError, match=r"the policy gives no command for the state \[0, 0\]"):
+        policy.act([0, 0], [1])
+
+
+def test_the_loop_keeps_the_rate_and_begins_without_memory(folder: Path) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    sent: list[Any] = []
+    policy.about["rate_hz"] = 1000.0
+    first = policy.act([0.5, 1.0], [1.0])
+    assert first.shape == (1,) and policy.hidden.any()
+    run(policy, lambda: [0.5, 1.0], sent.append, [1.0], steps=3)
+    assert len(sent) == 3
+    np.testing.assert_array_equal(sent[0], first)
+    assert not np.array_equal(sent[1], first)
