@@ -45,7 +45,7 @@ def repair(
         typer.Option(
             metavar="DATASET",
             help="The dataset from which FOLDER was made by LeRobot's tools: its origin and its episodes' "
-            "metadata are copied, matched by uid. After a merge, once for each dataset merged.",
+            "metadata are copied, matched by uid and values. After a merge, once for each dataset merged.",
             show_default=False,
         ),
     ] = None,

@@ -32,8 +32,12 @@ _OF_THE_PLACE = {
 
 
 @contextmanager
-def writing(target: Path) -> Iterator[None]:
+def writing(target: Path, *, place: bool = True) -> Iterator[None]:
     """Report that `target` cannot be written, if the block fails because of the disk or of its place.
+
+    Args:
+        target: what is written.
+        place: also report what is wrong with its place, such as permissions, not the disk's faults alone.
 
     Raises:
         DiskError: says why, and what to do.
@@ -42,7 +46,7 @@ def writing(target: Path) -> Iterator[None]:
         yield
     except Exception as error:
         code = _code(error)
-        if code not in _OF_THE_DISK and not (code and _is_about(error, target)):
+        if code not in _OF_THE_DISK and not (place and code and _is_about(error, target)):
             raise
         raise DiskError(_report(f"{target} cannot be written", code)) from error
 

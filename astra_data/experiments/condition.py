@@ -82,7 +82,7 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
     """Return which finished artefacts of `items` have to be made again, key to reason.
 
     Those are the damaged and the stale ones, and what was made from them. Of all, the sizes are compared, of
-    what an item to make reads, the sha256; the values of datasets are verified where they are read.
+    what an item to make reads, every byte.
 
     Args:
         items: each after those it reads.
@@ -94,7 +94,7 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
         found = condition(item, experiment)
         if item.key not in absent and not found.is_finished:
             reasons[item.key] = f"{found.state} ({found.why})"
-    verified = {item.key for item in items if STAGES[stage_of(item)].makes_dataset}
+    verified: set[str] = set()
     while True:
         for item in items:
             source = next((key for key in item.inputs if key in reasons), None)

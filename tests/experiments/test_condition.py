@@ -16,6 +16,7 @@ from astra_data.experiments.execution import Item
 from astra_data.experiments.run import check, run, run_stage
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
+COLLECT = "collect/seed_0"
 GROUND, TRAIN, ALIGN, EVALUATE = (
     f"{stage}/astra/seed_0" for stage in ("ground", "train", "align", "evaluate")
 )
@@ -94,6 +95,21 @@ def test_altered_bytes_are_found_where_a_step_reads_them(recipe: Path, folder: P
     run(recipe, root=recipe.parent, jobs=1)
     assert grounding.read_bytes() == whole
     assert made_again(folder) == sorted(f"1/{key}" for key in (GROUND, TRAIN, ALIGN, EVALUATE, PLUS[0]))
+
+
+def test_altered_values_of_a_dataset_are_made_again_once_a_step_reads_them(
+    recipe: Path, folder: Path
+) -> None:
+    altered = folder / COLLECT / "altered"
+    altered.touch()
+    assert states(recipe, verify=True)[COLLECT] == ("damaged", "a value was altered")
+    run(recipe, root=recipe.parent, jobs=1)
+    assert altered.exists(), "no step reads the episodes"
+    shutil.rmtree(folder / "pair/seed_0")
+    run(recipe, root=recipe.parent, jobs=1)
+    assert not altered.exists()
+    assert (folder / "set_aside/1" / COLLECT / "altered").exists()
+    assert states(recipe) == {}
 
 
 def test_a_damaged_input_of_one_stage_is_refused_with_what_to_run(recipe: Path, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +73,9 @@ def repair(
         folder: the damaged dataset; it is not changed.
         out: folder of the new one.
         like: the dataset from which LeRobot's tools made `folder`, dropping our metadata: provenance and the
-            episodes' metadata are taken from it, joined by episode_uid. Or several, of which the first gives
-            the provenance: metadata is then joined by uid and values, as it is with `new_uids`.
+            episodes' metadata are taken from it, joined by episode_uid and values. Or several, of which the
+            first gives the provenance. An episode with the uid of one of theirs and other values is left
+            out, or, with `new_uids`, has no metadata.
         new_uids: give an episode whose uid an earlier one has a new one, the same in every run, and keep the
             old one as "merged_uid"; otherwise it is left out.
 
@@ -100,27 +102,30 @@ def repair(
     old = _old_description(folder, result.notes) if first is None else {}
     altered = set(_altered_files(folder, old, result.notes))
     digests = _digests(folder, old, columns, result.notes) if first is None else {}
-    metadata = (
-        _metadata(folder, altered, result.notes)
-        if first is None
-        else _facts(first.uids.tolist(), first.metadata)
-    )
+    metadata = _metadata(folder, altered, result.notes) if first is None else {}
     description = _description(folder, sources, old)
     unknown = 0
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
     seed = _subset_seed(folder, altered) if first is None else first.subset_seed
+    whole = partial(whole_runs, folder, columns, digests, fps, repeated=new_uids)
     joined: list[Joined] = []
-    if new_uids or len(sources) > 1:
-        whole = whole_runs(folder, columns, digests, fps, [], repeated=new_uids)
-        joined = join(((uid, run.columns) for uid, run in whole), specs, sources)
+    if sources or new_uids:
+        joined = join(((uid, run.columns) for uid, run in whole([])), specs, sources)
         renamed = sum("merged_uid" in episode.metadata for episode in joined)
         result.notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
+    theirs = {uid for source in sources for uid in source.uids.tolist()}
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
-        for uid, run in whole_runs(folder, columns, digests, fps, result.notes, repeated=new_uids):
+        for number, (uid, run) in enumerate(whole(result.notes)):
             values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
-            known = Joined(uid, dict(metadata.get(uid, {})), uid in metadata)
-            if joined:
-                known = joined[result.episodes]
+            known = joined[number] if joined else Joined(uid, {}, is_known=False)
+            if first is None:
+                known = Joined(known.uid, metadata.get(uid, {}) | known.metadata, uid in metadata)
+            elif uid in theirs and not known.is_known and not new_uids:
+                result.notes.append(
+                    f"left out the episode of uid {uid}: its values are not those in "
+                    f"{' or '.join(source.reference for source in sources)}"
+                )
+                continue
             unknown += not known.is_known
             facts = known.metadata
             if len(tasks) > 1:
@@ -142,7 +147,7 @@ def repair(
         writer.policy = policy if (policy := folder / POLICY_PATH).is_file() else None
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
-    if metadata and unknown:
+    if (metadata or sources) and unknown:
         result.notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
     if len(tasks) > 1:
         result.notes.append(
@@ -202,14 +207,8 @@ def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[
     columns = table.to_pydict()
     uids = columns.pop(names.EPISODE_UID, [])
     columns.pop("length", None)
-    return _facts(uids, columns)
-
-
-def _facts(
-    uids: Sequence[int], metadata: Mapping[str, Sequence[Scalar | None]]
-) -> dict[int, dict[str, Scalar]]:
     return {
-        uid: {key: value for key, values in metadata.items() if (value := values[row]) is not None}
+        uid: {key: value for key, values in columns.items() if (value := values[row]) is not None}
         for row, uid in enumerate(uids)
     }
 

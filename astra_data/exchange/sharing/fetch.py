@@ -4,7 +4,8 @@ import os
 from pathlib import Path
 
 from astra_data.core.digest import file_digest
-from astra_data.core.errors import SharingError
+from astra_data.core.disk import writing
+from astra_data.core.errors import AstraDataError, SharingError
 from astra_data.exchange.sharing.store import RemoteFolder
 from astra_data.exchange.sharing.sums import Listed, altered
 
@@ -20,7 +21,8 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed, most: i
         most: the most bytes that it may have, if its size is not known.
 
     Raises:
-        SharingError: it cannot be read or written, is larger, or its checksum is another.
+        DiskError: it cannot be written.
+        SharingError: it cannot be read, is larger, or its checksum is another.
     """
     target = folder / path
     if not altered(folder, {path: listed}):
@@ -28,12 +30,15 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed, most: i
     most = most if listed.size is None else listed.size
     part = target.with_name(f"{target.name}.part")
     try:
-        part.parent.mkdir(parents=True, exist_ok=True)
-        resumed = part.exists()
-        _append(remote, path, part, most)
-        if resumed and file_digest(part) != listed.digest:
-            part.unlink()
+        with writing(part, place=False):
+            part.parent.mkdir(parents=True, exist_ok=True)
+            resumed = part.exists()
             _append(remote, path, part, most)
+            if resumed and file_digest(part) != listed.digest:
+                part.unlink()
+                _append(remote, path, part, most)
+    except AstraDataError:
+        raise
     except Exception as error:
         raise SharingError(
             f"{remote.name}: {path} cannot be downloaded ({type(error).__name__}: {error}); "

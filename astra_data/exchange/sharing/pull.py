@@ -141,10 +141,10 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Li
     try:
         dataset = Dataset.open(target)
         is_other = dataset.content_hash != description.get("content_hash")
-        fault = f"it differs from what is shared in {', '.join(changed)}"
     except CorruptDatasetError as error:
-        is_other, fault = len(changed) == len(sums), str(error)
-        changed = changed or ["its files"]
+        if len(changed) < len(sums):
+            raise CorruptDatasetError(f"{error} Delete it, or pull to another folder.") from error
+        is_other = True
     except AstraDataError:
         is_other = True
     if is_other:
@@ -152,7 +152,10 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Li
             f"{target} exists already and holds something else; delete it or choose another folder."
         )
     if changed:
-        raise CorruptDatasetError(f"{target} was altered: {fault}. Delete it, or pull to another folder.")
+        raise CorruptDatasetError(
+            f"{target} was altered: it differs from what is shared in {', '.join(changed)}. "
+            "Delete it, or pull to another folder."
+        )
     return dataset
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from astra_data.core.disk import writing
 from astra_data.core.errors import AstraDataError, BadInputError, SharingError
 from astra_data.core.optional import cure
 from astra_data.core.progress import Progress
@@ -106,7 +107,8 @@ class UrlStore:
 def _explained(url: str) -> Iterator[None]:
     """Turn the exceptions of a back end, each of which has its own, into one-line messages."""
     try:
-        yield
+        with writing(Path(url.removeprefix("file://")), place=False):
+            yield
     except AstraDataError:
         raise
     except PermissionError as error:

@@ -16,6 +16,7 @@ from fake_dataset import fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
+from astra_data.dataset.columns import REWARD
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, METADATA_PATH, POLICY_PATH, SUBSETS_PATH
@@ -315,3 +316,34 @@ def test_values_are_saved_also_without_the_digests(tmp_path: Path) -> None:
     [note] = repair(whole.root, out=tmp_path / "saved").notes
     assert note.startswith(f"{DIGESTS_PATH} was altered: the values were compared with the content hash only")
     assert Dataset.open(tmp_path / "saved").content_hash == whole.content_hash
+
+
+def test_episodes_with_other_values_than_the_original_are_left_out(tmp_path: Path) -> None:
+    original = write_fake(tmp_path / "original")
+    edited = tmp_path / "edited"
+    shutil.copytree(original.root, edited)
+    shutil.rmtree(edited / "meta/astra")
+    table = pq.read_table(edited / DATA)
+    rewards = table.column(REWARD).to_pylist()
+    rewards[0] += 1.0
+    at = table.column_names.index(REWARD)
+    pq.write_table(table.set_column(at, table.field(REWARD), pa.array(rewards, pa.float32())), edited / DATA)
+    uid, *others = original.uids.tolist()
+    repaired = repair(edited, out=tmp_path / "joined", like=original)
+    assert (
+        f"left out the episode of uid {uid}: its values are not those in {original.reference}"
+        in repaired.notes
+    )
+    joined = Dataset.open(tmp_path / "joined")
+    assert joined.uids.tolist() == others
+    assert joined.metadata == {key: values[1:] for key, values in original.metadata.items()}
+    # In a merge it may be another dataset's, whose uids were the same.
+    repair(edited, out=tmp_path / "merged", like=original, new_uids=True)
+    merged = Dataset.open(tmp_path / "merged")
+    assert merged.metadata == {key: [None, *values[1:]] for key, values in original.metadata.items()}
+
+
+def test_new_uids_alone_keep_the_metadata(tmp_path: Path) -> None:
+    whole = write_fake(tmp_path / "set")
+    repair(whole.root, out=tmp_path / "saved", new_uids=True)
+    assert Dataset.open(tmp_path / "saved").metadata == whole.metadata

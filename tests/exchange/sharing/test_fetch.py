@@ -1,3 +1,4 @@
+import errno
 import hashlib
 import os
 from pathlib import Path
@@ -6,7 +7,7 @@ from typing import Any
 import fsspec
 import pytest
 
-from astra_data.core.errors import SharingError
+from astra_data.core.errors import DiskError, SharingError
 from astra_data.exchange.sharing import fetch as module
 from astra_data.exchange.sharing import store
 from astra_data.exchange.sharing.fetch import fetch, refuse_planted
@@ -110,6 +111,20 @@ def test_a_link_in_the_unfinished_folder_is_not_written_through(remote: RemoteFo
     with pytest.raises(SharingError, match="cannot be downloaded"):
         fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
     assert (tmp_path / "prey").read_text() == "prey"
+
+
+def test_a_full_disk_is_told_and_what_was_fetched_stays(
+    remote: RemoteFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "_append", full)
+        with pytest.raises(DiskError, match=r"here/data/file\.part cannot be written: the disk is full"):
+            fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+    fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+    assert (tmp_path / "here/data/file").read_bytes() == CONTENT
 
 
 def plant_link(folder: Path) -> None:

@@ -111,8 +111,11 @@ def test_a_copy_that_was_altered_is_told(fake: Dataset, shared: Path, tmp_path: 
         # A changed byte, and a file that is shorter: of a data file, it can then not even be opened.
         for content in (bytes([whole[100] ^ 1]).join([whole[:100], whole[101:]]), whole[:-20]):
             (copy / path).write_bytes(content)
-            with pytest.raises(CorruptDatasetError, match=r"was altered: .*Delete it, or pull to another"):
+            with pytest.raises(
+                CorruptDatasetError, match=r"was altered: .*Delete it, or pull to another"
+            ) as caught:
                 pull(source(shared), out=copy)
+            assert ".." not in str(caught.value), "two messages in one"
         (copy / path).write_bytes(whole)
     notes: list[str] = []
     pull(source(shared), out=copy, progress=lambda fraction, note: notes.append(note))

@@ -1,11 +1,13 @@
+import errno
 import json
 from pathlib import Path
 
 import pytest
 from fake_dataset import write_fake
+from fsspec.implementations.local import LocalFileSystem
 from shared_files import contents
 
-from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError, SharingError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError, RecipeError, SharingError
 from astra_data.dataset import Dataset
 from astra_data.exchange.sharing.push import push
 
@@ -80,3 +82,17 @@ def test_an_altered_remote_is_told(fake: Dataset, tmp_path: Path) -> None:
     # As 0.1 wrote them, without sizes.
     (shared / "SHA256SUMS").write_text("".join(f"{line}\n" for line in sums.splitlines() if line[0] != "#"))
     push(fake.root, f"file://{tmp_path}/shared")
+
+
+def test_a_full_disk_is_told_with_the_folder_there(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left", str(fake.root))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(LocalFileSystem, "put_file", full)
+        with pytest.raises(DiskError, match=r"shared/fake cannot be written: the disk is full"):
+            push(fake.root, f"file://{tmp_path}/shared")
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert contents(tmp_path / "shared/fake/data-1.0.0").keys() > contents(fake.root).keys()
