@@ -83,10 +83,10 @@ def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], hori
         if errors[size][0] > limit:
             break
         least = size
-    told = f"{title}, `{quantity}`, {horizon} steps ahead: "
+    where = f"{title}, `{quantity}`, {horizon} steps ahead: "
     if least == largest:
-        return f"{told}the error still falls up to {largest} %: more data may help."
-    return f"{told}from {least} % on, the error is within the interval of {largest} %."
+        return f"{where}the error still falls up to {largest} %: more data may help."
+    return f"{where}from {least} % on, the error is within the interval of {largest} %."
 
 
 def _lines(

@@ -19,7 +19,7 @@ def warning(results: Results) -> str:
         return ""
     reference = reference_of(results.methods)
     if reference is None:
-        told = (
+        place = (
             "each row in its own grounded simulator, or in the raw one where it grounds none: in the very "
             "simulator that it was trained in, so the figures say what it learned, not whether it transfers. "
             "With a row of NAS, all would be tested in one simulator."
@@ -27,8 +27,8 @@ def warning(results: Results) -> str:
     else:
         grounds = {row: METHODS[base_method(row)].grounded_as or base_method(row) for row in results.methods}
         there = [method_title(row) for row, owner in grounds.items() if owner == reference]
-        told = (
+        place = (
             f"the abstract simulator as {method_title(reference)} grounded it, in which no row was trained "
             f"but {' and '.join(there)}. What is in no abstract state, it cannot show."
         )
-    return f"**Nothing was tested on a robot: the task has no target.** Figures were measured in {told}"
+    return f"**Nothing was tested on a robot: the task has no target.** Figures were measured in {place}"
