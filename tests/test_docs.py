@@ -22,6 +22,7 @@ from typer.main import get_command
 from astra_data.cli.app import app
 from astra_data.core.config import Config
 from astra_data.core.progress import silent
+from astra_data.exchange import mapping  # noqa: F401 - has the keys of mappings
 from astra_data.experiments import recipe  # noqa: F401 - has all tables of settings
 from astra_data.stages.align import align
 from astra_data.stages.collect import CollectConfig, collect

@@ -56,7 +56,6 @@ class Deliver(Objective):
 
     def reward(self, before, after, goal, failed):
         closer = (before[:, :2] - goal).norm(dim=-1) - (after[:, :2] - goal).norm(dim=-1)
-        closer = closer * self.success_reward / 3.0  # the whole way is worth as much as arriving
         ends = self.success_reward * (self.reached(after, goal) & ~failed) + self.failure_reward * failed
         return closer + ends
 
