@@ -128,7 +128,7 @@ def _write(
     os.replace(folder, out)
 
 
-DATASETS = ("collect", "augment", "pair", "subset")
+DATASETS = ("collect", "label", "augment", "pair", "subset")
 RESULTS = {
     "ground": "grounding.safetensors",
     "train": "policy.safetensors",
@@ -177,6 +177,10 @@ def collect(
     _write(config, out, progress, task=task, seed=seed, episodes=config.episodes, num_threads=num_threads)
 
 
+def label(task: str, *, data: str, seed: int, out: Path, progress: Progress) -> None:
+    _write(FakeConfig(), out, progress, task=task, data=data, seed=seed)
+
+
 def augment(
     task: str, config: FakeConfig, *, dataset: Path, seed: int, out: Path, progress: Progress
 ) -> None:
@@ -187,7 +191,7 @@ def pair(task: str, config: FakeConfig, *, dataset: Path, out: Path, progress: P
     _write(config, out, progress, task=task, dataset=dataset)
 
 
-def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progress) -> None:
+def subset(dataset: Path, *, percent: int, of: int | None, out: Path, progress: Progress) -> None:
     _write(FakeConfig(), out, progress, dataset=dataset, percent=percent, of=of)
 
 

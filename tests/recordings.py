@@ -10,7 +10,8 @@ import numpy as np
 
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Array
-from astra_data.exchange.importing import ImportReport, import_dataset
+from astra_data.exchange.import_report import ImportReport
+from astra_data.exchange.importing import import_dataset
 
 LENGTHS = (6, 9, 5)
 STEPS = (5, 9, 4)
@@ -19,6 +20,7 @@ TABLES = ("log.csv", "log.npz", "log.h5", "log.json")
 
 MAPPING = """
 name = "log"
+terminal = "stand_still"
 task = "walk"
 fps = 10
 [columns."observation.state"]

@@ -3,6 +3,7 @@
 import glob
 import os
 import re
+import runpy
 import shlex
 import shutil
 import tomllib
@@ -21,6 +22,7 @@ from typer.main import get_command
 from astra_data.cli.app import app
 from astra_data.core.config import Config
 from astra_data.core.progress import silent
+from astra_data.exchange import mapping  # noqa: F401 - has the keys of mappings
 from astra_data.experiments import recipe  # noqa: F401 - has all tables of settings
 from astra_data.stages.align import align
 from astra_data.stages.collect import CollectConfig, collect
@@ -110,6 +112,13 @@ def workplace(quickstart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     return tmp_path
 
 
+def run_script(words: list[str]) -> None:
+    """Run a script of a page, for a smaller number than by default."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", [*words, "6"])
+        runpy.run_path(words[0], run_name="__main__")
+
+
 def run_command(words: list[str]) -> None:
     """Run one command of a page as the shell would, or fail."""
     line = shlex.join(words)
@@ -136,6 +145,8 @@ def test_the_snippets_of_a_page_run_in_order(page: str, workplace: Path) -> None
             for words in block.commands:
                 if words[0] == "astra-data":
                     run_command(words)
+                elif words[0] == "python":
+                    run_script(words[1:])
 
 
 def all_commands() -> Iterator[tuple[str, list[str]]]:

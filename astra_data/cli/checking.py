@@ -16,8 +16,11 @@ def validate(
 ) -> None:
     """Check every file and value of a LeRobot dataset, and list all faults."""
     from astra_data.core.errors import CorruptDatasetError
+    from astra_data.dataset.columns import TERMINATED
     from astra_data.dataset.doctor.check import check
     from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
+    from astra_data.dataset.endings import endings_of
+    from astra_data.dataset.reader import Dataset
     from astra_data.dataset.versions import locate
 
     root = locate(dataset)
@@ -33,6 +36,9 @@ def validate(
             f"{message}\nTo save its whole episodes: astra-data repair {root} --out DIR"
         )
     typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
+    whole = Dataset.open(root)
+    if TERMINATED in whole.features:
+        typer.echo(f"episodes end: {endings_of(whole)}")
 
 
 def repair(

@@ -58,6 +58,8 @@ def _summary(inspection: Inspection) -> str:
     if inspection.success is not None:
         share = inspection.success / len(lengths)
         lines.append(f"success {inspection.success} of {len(lengths)} episodes ({share:.2f})")
+    if inspection.endings is not None:
+        lines.append(f"episodes end: {inspection.endings}")
     return "\n".join(lines)
 
 

@@ -52,6 +52,7 @@ def run(
 
     with resumable():
         folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
+        show_errors(folder, until)
         typer.echo(f"finished: {folder}")
 
 
@@ -154,6 +155,15 @@ def run_stage(
             add=add,
         )
         typer.echo(f"finished: {folder}")
+
+
+def show_errors(folder: Path, until: str | None) -> None:
+    """Print the page of held-out errors of a run that ends with its groundings."""
+    from astra_data.reports.held_out import PAGE
+
+    if until == "ground" and (folder / PAGE).is_file():
+        typer.echo((folder / PAGE).read_text())
+        typer.echo(f"written: {folder / PAGE}")
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.recipes import RUNS, Device, Jobs, RecipePath, Root, Seeds, resumable
+from astra_data.cli.recipes import RUNS, Device, Jobs, RecipePath, Root, Seeds, Until, resumable, show_errors
 from astra_data.core.errors import BadInputError
 
 
@@ -33,6 +33,7 @@ def sweep(
     ] = False,
     jobs: Jobs = None,
     device: Device = "cpu",
+    until: Until = None,
     root: Root = RUNS,
     engine: Annotated[
         Engine, typer.Option(help="Processes of this machine, or tasks of a Ray cluster.")
@@ -68,5 +69,7 @@ def sweep(
             device=device,
             cluster=(address or "local") if engine is Engine.ray else None,
             trackio=trackio,
+            until=until,
         )
+        show_errors(folder, until)
         typer.echo(f"finished: {folder} (points: {folder / 'sweep.csv'})")

@@ -44,7 +44,5 @@ def label(
     from astra_data.stages.label import label as label_dataset
 
     with shown("label") as progress:
-        folder = label_dataset(
-            task, dataset=locate(dataset), seed=seed, name=name, out=out, progress=progress
-        )
+        folder = label_dataset(task, data=locate(dataset), seed=seed, name=name, out=out, progress=progress)
     typer.echo(f"finished: {folder}")

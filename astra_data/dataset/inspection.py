@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset.columns import STATE, Array, Column
+from astra_data.dataset.columns import STATE, TERMINATED, Array, Column
+from astra_data.dataset.endings import Endings
 from astra_data.dataset.format import STATS_PATH
 from astra_data.dataset.reader import Dataset
 
@@ -69,6 +70,7 @@ class Inspection:
         fps: steps per second.
         lengths: steps of each episode, (E,).
         success: number of successful episodes; None if unknown.
+        endings: how the episodes end; None if unknown.
         spreads: one per column.
         positions: the robot's positions, in m; None if the state has no such role.
         velocities: its planar velocities in m/s, likewise.
@@ -78,6 +80,7 @@ class Inspection:
     fps: int
     lengths: Ints
     success: int | None
+    endings: Endings | None
     spreads: tuple[Spread, ...]
     positions: Map | None
     velocities: Map | None
@@ -91,7 +94,10 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     """
     spreads = _empty_spreads(dataset, dataset.schema)
     maps = {role: _empty_map(spreads, role) for role in ("position", "vector")}
+    endings = Endings() if TERMINATED in dataset.features else None
     for episode in dataset.episodes():
+        if endings is not None:
+            endings.add(episode.columns)
         for spread in spreads:
             _count(spread, episode.columns[spread.column.name])
         for found in maps.values():
@@ -104,6 +110,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         fps=int(dataset.info["fps"]),
         lengths=dataset.lengths,
         success=None if successes is None else sum(value is True for value in successes),
+        endings=endings,
         spreads=tuple(spreads),
         positions=maps["position"] and maps["position"][0],
         velocities=maps["vector"] and maps["vector"][0],

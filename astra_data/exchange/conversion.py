@@ -59,7 +59,7 @@ class Converter:
             faults += self._size_faults()
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
-        self.columns = self.columns or _complete(self._converted)
+        self.columns = self.columns or _complete(self._converted, self._mapping.terminal)
         return columns, finite
 
     def _size_faults(self) -> list[str]:
@@ -89,12 +89,12 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
     return Column(name, dtype, size, spec.names or None, spec.meaning, astra or None)
 
 
-def _complete(converted: dict[str, Column]) -> tuple[Column, ...]:
+def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]:
     columns = dict(converted)
     if STATE in columns and NEXT_STATE not in columns:
         state = columns[STATE]
         meaning = f"{state.meaning or 'the state'}, one step later"
-        if TERMINATED in columns:
+        if TERMINATED in columns and terminal == "stand_still":
             meaning += "; where an episode terminates, not recorded: the state itself"
         columns[NEXT_STATE] = Column(NEXT_STATE, state.dtype, state.size, state.names, meaning, state.astra)
     derived = (

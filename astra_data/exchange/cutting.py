@@ -13,12 +13,14 @@ from astra_data.dataset.columns import (
     NEXT_STATE,
     REWARD,
     STATE,
+    SUCCESS,
     TERMINATED,
     TRUNCATED,
     Array,
     Column,
     Scalar,
 )
+from astra_data.dataset.endings import Endings
 from astra_data.exchange.conversion import Converter, Mask
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block
@@ -44,8 +46,10 @@ class Tally:
         rejected_first: where the first of them is.
         split_points: number of boundaries between episodes, by reason.
         last_rows: last rows of episodes, dropped because their next state was not recorded.
+        last_terminated: those of them that were terminated.
         last_reward: the sum of their rewards.
         short_rows: rows of episodes that were too short.
+        endings: how the episodes end.
     """
 
     rows: int = 0
@@ -53,8 +57,10 @@ class Tally:
     rejected_first: str = ""
     split_points: dict[str, int] = field(default_factory=dict)
     last_rows: int = 0
+    last_terminated: int = 0
     last_reward: float = 0.0
     short_rows: int = 0
+    endings: Endings = field(default_factory=Endings)
 
 
 class Cutter:
@@ -119,24 +125,33 @@ class Cutter:
             return
         episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
         self._pieces = []
-        length = len(next(iter(episode.values())))
         if STATE in episode and NEXT_STATE not in episode:
-            state = episode[STATE]
-            if TERMINATED in episode and episode[TERMINATED][-1]:
-                # Learners do not bootstrap from the state after a terminal step, but its reward counts.
-                episode[NEXT_STATE] = np.concatenate([state[1:], state[-1:]])
-            else:
-                self.tally.last_rows += 1
-                self.tally.last_reward += float(episode[REWARD][-1]) if REWARD in episode else 0.0
-                episode = {name: values[:-1] for name, values in episode.items()} | {NEXT_STATE: state[1:]}
-                length -= 1
+            episode = self._with_next_states(episode)
+        length = len(next(iter(episode.values())))
         if length < self._mapping.min_steps:
             self.tally.short_rows += length
             return
         terminated = episode.setdefault(TERMINATED, np.zeros(length, bool))
         truncated = episode.get(TRUNCATED, np.zeros(length, bool)).copy()
         truncated[-1] |= not terminated[-1]
-        yield episode | {TRUNCATED: truncated, DONE: terminated | truncated}, self._metadata
+        episode |= {TRUNCATED: truncated, DONE: terminated | truncated}
+        self.tally.endings.add(episode)
+        yield episode, self._metadata
+
+    def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
+        """Add the state of the next row to each row, and drop the last or let it stand still."""
+        state = episode[STATE]
+        terminated = TERMINATED in episode and bool(episode[TERMINATED][-1])
+        if terminated and self._mapping.terminal == "stand_still":
+            return episode | {NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
+        self.tally.last_rows += 1
+        self.tally.last_terminated += terminated
+        self.tally.last_reward += float(episode[REWARD][-1]) if REWARD in episode else 0.0
+        kept = {name: values[:-1] for name, values in episode.items()}
+        if terminated:
+            for name in {TERMINATED, SUCCESS} & kept.keys():
+                kept[name] = np.concatenate([kept[name][:-1], episode[name][-1:]])[: len(state) - 1]
+        return kept | {NEXT_STATE: state[1:]}
 
     def check_rate(self) -> None:
         """Compare fps to the rate measured from the times.

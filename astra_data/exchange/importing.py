@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +19,7 @@ from astra_data.dataset.versions import place
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter, Tally
 from astra_data.exchange.export_record import ExportRecord
+from astra_data.exchange.import_report import ImportReport, losses
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import (
@@ -42,39 +43,6 @@ FORMATS: Mapping[str, ModuleType] = {
 }
 IN_ARCHIVES = ("csv", "json")
 """Formats that are read sequentially, so that they can be read inside archives."""
-
-
-@dataclass(frozen=True)
-class ImportReport:
-    """Result of an import.
-
-    Attributes:
-        root: the dataset's folder.
-        episodes: number of episodes.
-        frames: number of steps.
-        tally: of the rows that were read and dropped.
-        wall_seconds: duration of the import.
-    """
-
-    root: Path
-    episodes: int
-    frames: int
-    tally: Tally
-    wall_seconds: float
-
-    def __str__(self) -> str:
-        """Summarise it in a few lines."""
-        tally = self.tally
-        points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
-        first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
-        return (
-            f"{self.root}: {self.episodes} episodes, {self.frames} frames "
-            f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
-            f"split points: {points}\n"
-            f"rejected rows: {tally.rejected_rows}{first}\n"
-            f"last rows without a next state: {_last_rows(tally)}; "
-            f"rows of episodes that were too short: {tally.short_rows}"
-        )
 
 
 def import_dataset(
@@ -138,7 +106,7 @@ def import_dataset(
     first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
-        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes ({_losses(cutter.tally)})")
+        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes ({losses(cutter.tally)})")
     description = {
         "name": settings.name,
         "version": settings.version,
@@ -273,15 +241,3 @@ def _refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
             f"{tally.rejected_rows} of {tally.rows} rows have values that are not finite, the first is "
             f'{tally.rejected_first}; set not_finite = "drop" or "split" in the mapping to leave them out'
         )
-
-
-def _losses(tally: Tally) -> str:
-    return (
-        f"rows {tally.rows}, rejected {tally.rejected_rows}, last ones without a next state "
-        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}"
-    )
-
-
-def _last_rows(tally: Tally) -> str:
-    lost = f" (with them a reward of {tally.last_reward:g} in sum)" if tally.last_reward else ""
-    return f"{tally.last_rows}{lost}"

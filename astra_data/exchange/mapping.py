@@ -108,10 +108,8 @@ class ImportMapping(Config):
     row is a step."""
     columns: Annotated[dict[str, ColumnMapping], Field(min_length=1)]
     """By name. next.observation.state is derived where it is left out: an episode then loses its last row,
-    whose next state was not recorded, unless it is terminated: then the state stands for the next state, from
-    which no learner bootstraps. A row with next.terminated or next.truncated ends its episode, even if the
-    flag stays set row after row: `min_steps` = 2 leaves out the rows after the first. next.done is always
-    derived."""
+    whose next state was not recorded (see `terminal`). A row with next.terminated or next.truncated ends its
+    episode, even if the flag stays set row after row. next.done is always derived."""
     version: str = "1.0.0"
     """The dataset's version."""
     format: str | None = None
@@ -125,6 +123,10 @@ class ImportMapping(Config):
     not_finite: Literal["refuse", "drop", "split"] = "refuse"
     """Handling of rows with values that are not finite. "refuse": nothing is imported. "drop": they are left
     out and their neighbours become consecutive. "split": they are left out and begin new episodes."""
+    terminal: Literal["drop", "stand_still"] = "drop"
+    """Handling of a terminated last row whose next state was not recorded. "drop": it is left out, and its
+    next.terminated and next.success become those of the step before, which led to it. "stand_still": it is
+    kept, and its state stands for the next state, which is made up."""
     min_steps: Count = 1
     """Episodes with fewer steps are left out."""
     episodes: str | None = None

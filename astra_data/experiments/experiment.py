@@ -18,6 +18,7 @@ from typing import Any
 from astra_data.core.config import did_you_mean, load_tables, validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import base_method, is_plus
+from astra_data.dataset.format import INFO_PATH
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
 from astra_data.experiments.renamed import with_current_keys
@@ -58,7 +59,8 @@ class Experiment:
             return set()
         changed = _differences(self.base.recipe.settings, self.recipe)
         absent = set() if self.recipe.sweep.percent else {"subset"}
-        absent |= set() if self.recipe.augment else {"augment"}
+        asked = {stage.name: stage.asked_by for stage in STAGES.values() if stage.asked_by}
+        absent |= {stage for stage, key in asked.items() if not getattr(self.recipe, key)}
         return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed)
 
     def maker(self, stage: str) -> "Experiment":
@@ -200,10 +202,14 @@ def load_experiment(path: Path, root: Path) -> Experiment:
 
 
 def _tables(path: Path) -> dict[str, Any]:
-    """Return the tables of a recipe; a task in a file is looked up beside it."""
+    """Return the tables of a recipe; a task in a file, and data in a folder, are looked up beside it."""
     tables = with_current_keys(load_tables(path), path)
-    task = tables.get("task")
-    return tables | {"task": str(path.parent / task)} if isinstance(task, str) and ".py:" in task else tables
+    task, data = tables.get("task"), tables.get("data")
+    if isinstance(task, str) and ".py:" in task:
+        tables["task"] = str(path.parent / task)
+    if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
+        tables["data"] = str(path.parent / data)
+    return tables
 
 
 def _reads(row: str, table: str) -> bool:
@@ -222,7 +228,8 @@ def _stale_stages(changed: set[str]) -> set[str]:
     """Return the stages that are affected when the keys `changed` of a recipe change."""
     stale: set[str] = set()
     for stage in STAGES:
-        sections = {"task", stage, *{"collect": ("sweep",), "train": ("plus",)}.get(stage, ())}
+        more = {"collect": ("sweep",), "label": ("data",), "train": ("plus",)}
+        sections = {"task", stage, *more.get(stage, ())}
         sections |= set() if stage == "collect" else {_SIMULATOR}
         sections |= {
             method.table.name for method in METHODS.values() if method.table and method.configures == stage

@@ -1,12 +1,13 @@
 """The artefacts that a recipe's rows, seeds and sizes need, each once.
 
-    collect ── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ── report
-                                   │            └── align ──┘
-                                   └── (rows without grounding train on the pairs alone)
+    collect ──┬── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ── report
+    or label ─┘                       │            └── align ──┘
+                                      └── (rows without grounding train on the pairs alone)
 
 A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` settings; it shares the
-grounding and the alignment of `<method>`. Where a recipe sweeps over sizes, collect and pair make the largest
-once, `subset` makes each size of it, and everything from ground on is made for each.
+grounding and the alignment of `<method>`. A recipe with `data` labels that, and collects nothing. Where a
+recipe sweeps over sizes, what comes before is made of the largest once, `subset` makes each size of it,
+and everything from ground on is made for each.
 """
 
 import inspect
@@ -15,6 +16,8 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method, place, reference_of
 from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
@@ -77,6 +80,26 @@ def stage_of(item: Item) -> str:
     return item.key.partition("/")[0]
 
 
+def stages_until(last: str | None) -> set[str]:
+    """Return the stages up to `last`, by default all.
+
+    Raises:
+        BadInputError: there is no such stage.
+    """
+    check_stage(last or "report")
+    return set(list(STAGES)[: list(STAGES).index(last or "report") + 1])
+
+
+def check_stage(stage: str) -> None:
+    """Refuse an unknown stage.
+
+    Raises:
+        BadInputError: there is no such stage.
+    """
+    if stage not in STAGES:
+        raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
+
+
 def grounded_as(base: str) -> str:
     """Return the method whose grounding and alignment a method uses."""
     return METHODS[base].grounded_as or base
@@ -125,7 +148,7 @@ class _Plan:
         """Return whether the recipe has a stage that makes datasets."""
         if stage.each == "size":
             return bool(self.selection.percents)
-        return not stage.is_optional or getattr(self.recipe, stage.name) is not None
+        return stage.asked_by is None or getattr(self.recipe, stage.asked_by) is not None
 
     def _item(self, stage: Stage, seed: int, percent: int | None, name: str = "") -> Item:
         """Return the artefact that a stage makes of a dataset, for a method or row if `name` is one."""
@@ -142,7 +165,8 @@ class _Plan:
             "settings": recipe.settings_of(name, stage.name) if name else None,
             "seed": seed,
             "percent": percent,
-            "of": recipe.collect.episodes,
+            "of": recipe.collect and recipe.collect.episodes,
+            "data": recipe.data,
             "out": self.folder / key,
             "device": self.device,
             **{parameter: made and self.folder / made for parameter, made in keys.items()},

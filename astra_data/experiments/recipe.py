@@ -32,7 +32,8 @@ class SweepConfig(Config):
     """The sizes of the dataset on which the rows are repeated."""
 
     percent: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
-    """In per cent of `collect.episodes`; smaller ones lie inside larger ones. By default the whole."""
+    """In per cent of `collect.episodes`, or of those of `data`; smaller ones lie inside larger ones. By
+    default the whole."""
 
 
 class Recipe(Config):
@@ -44,6 +45,9 @@ class Recipe(Config):
 
     task: str
     """A task of the package or of an installed one, or of a file beside the recipe: "cart.py:TASK"."""
+    data: str | None = Field(default=None, exclude_if=lambda data: data is None)
+    """A dataset in place of `[collect]`: a folder beside the recipe, what the commands on datasets take (a
+    folder, a name at home, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
     seeds: tuple[int, ...] = Field(min_length=1)
@@ -86,6 +90,15 @@ class Recipe(Config):
         config: Config | None = getattr(self, "plus" if stage == "train" and is_plus(row) else stage, None)
         return config
 
+    @model_validator(mode="before")
+    @classmethod
+    def _has_data_or_collects(cls, tables: Any) -> Any:  # noqa: ANN401 - checked next
+        if not isinstance(tables, dict) or tables.get("data") is None:
+            return tables
+        if tables.get("collect") is not None:
+            raise ValueError("data: it takes the place of [collect]: leave out one of them")
+        return tables | {"collect": None}
+
     @field_validator("plus", mode="before", check_fields=False)
     @classmethod
     def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
@@ -122,7 +135,8 @@ class Recipe(Config):
     def _fits_the_learner(self) -> Self:
         if self.train.learner != "ppo" and "rma" in map(base_method, self.methods):
             raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
-        if self.collect.behavior == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
+        collects_by = self.collect and self.collect.behavior
+        if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: take 'suboptimal_ppo'")
         return self
 
@@ -156,14 +170,23 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
+    def _has_the_target_that_it_needs(self) -> Self:
+        needing = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].steps_target]
+        needing += ['[collect] (give `data = "…"` in its place)'] if self.data is None else []
+        if needing and not task_named(self.task).has_target:
+            raise ValueError(f"{self.task} has no target, which these need: {', '.join(needing)}")
+        return self
+
+    @model_validator(mode="after")
     def _fits_the_task(self) -> Self:
         if task_named(self.task).plane is not None:
             return self
         faults = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].planar]
         asked = {
             "augment": self.augment is not None,
-            'collect.start = "anywhere" (the default; "task" does not)': self.collect.start == "anywhere",
-            "collect.clearance_m": self.collect.clearance_m > 0,
+            'collect.start = "anywhere" (the default; "task" does not)': self.collect
+            and self.collect.start == "anywhere",
+            "collect.clearance_m": self.collect and self.collect.clearance_m > 0,
             "train.support_penalty": self.train.support_penalty > 0,
             "train.command_limit_m_s": self.train.limits_commands,
             "plus.support_penalty": self.plus.support_penalty > 0,
@@ -186,6 +209,10 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_no_empty_size(self) -> Self:
+        if self.collect is None:
+            if self.largest > WHOLE:
+                raise ValueError(f"sweep.percent: expected at most {WHOLE} % of data, got {self.largest}")
+            return self
         for percent in self.sweep.percent:
             if not share(percent, self.collect.episodes):
                 raise ValueError(
@@ -195,7 +222,7 @@ class Recipe(Config):
 
     @property
     def largest(self) -> int:
-        """The largest size, in per cent of `collect.episodes`: as much is collected."""
+        """The largest size, in per cent of the episodes: as much is collected."""
         return max(self.sweep.percent, default=WHOLE)
 
 
@@ -218,7 +245,9 @@ _FILLED: Any = Field(default_factory=dict, validate_default=True)
 
 
 def _stage_field(stage: Stage) -> tuple[Any, Any]:
-    return (stage.config | None, None) if stage.is_optional else (stage.config, _FILLED)
+    if stage.name == "collect":
+        return stage.config | None, _FILLED
+    return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
 
 
 def _method_field(table: Table) -> tuple[Any, Any]:

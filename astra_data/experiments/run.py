@@ -21,8 +21,9 @@ from astra_data.experiments.condition import Condition, can_be_made_again, condi
 from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
+from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.local_executor import execute
-from astra_data.experiments.plan import grounded_as, plan, stage_of
+from astra_data.experiments.plan import check_stage, grounded_as, plan, stage_of, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
@@ -52,7 +53,7 @@ def run(
         root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
         device: torch device of the networks.
-        until: the last stage to run; by default all.
+        until: the last stage to run, by default all; after "ground" comes a page of held-out errors.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
@@ -68,13 +69,15 @@ def run(
         ...
         PosixPath('runs/small')
     """
-    _check_stage(until or "report")
+    stages = stages_until(until)
     experiment = load_experiment(recipe_path, root)
-    wanted = set(list(STAGES)[: list(STAGES).index(until or "report") + 1]) - experiment.borrowed
+    wanted = stages - experiment.borrowed
     part = Selection.of(experiment.recipe, seeds=seeds)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if stage_of(item) in wanted]
     make(experiment, items, jobs=jobs, device=device)
+    if until == "ground":
+        write_errors(experiment, part)
     return experiment.folder
 
 
@@ -101,7 +104,7 @@ def run_stage(
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
-    _check_stage(stage)
+    check_stage(stage)
     experiment = load_experiment(recipe_path, root)
     maker = experiment.maker(stage)
     if maker is not experiment:
@@ -109,6 +112,8 @@ def run_stage(
             f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` for that"
         )
     recipe, folder = experiment.recipe, experiment.folder
+    if stage == "collect" and recipe.data is not None:
+        raise BadInputError(f"{recipe_path} has data, {recipe.data}: there is nothing to collect")
     part = Selection.of(recipe, seeds=seeds)
     if add:
         experiment.published()
@@ -219,8 +224,8 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
         else:
             continue
         maker = experiment.maker(stage)
-        # Of the base, `run` makes what comes before the stage as well; the command `augment` takes no recipe.
-        alone = stage != "augment" and (maker is experiment or not STAGES[stage].reads)
+        # Of the base, `run` makes what comes before the stage as well; two commands take no recipe.
+        alone = stage not in ("augment", "label") and (maker is experiment or not STAGES[stage].reads)
         command = f"astra-data {stage if alone else 'run'} {maker.path}"
         option = "" if root == RUNS else f" --root {root}"
         raise MissingStageError(f"{experiment.place(key)} is {fault}: run `{command}{option}` first")
@@ -270,11 +275,6 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
     if not selected:
         raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
     return selected
-
-
-def _check_stage(stage: str) -> None:
-    if stage not in STAGES:
-        raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
 
 
 def _check_device(device: str, cluster: str | None) -> None:

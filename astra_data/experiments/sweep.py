@@ -22,7 +22,8 @@ from astra_data.experiments.board import board, progress_text
 from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import Experiment, load_experiment
-from astra_data.experiments.plan import plan, stage_of
+from astra_data.experiments.held_out import write_errors
+from astra_data.experiments.plan import plan, stage_of, stages_until
 from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
 from astra_data.experiments.run import RUNS, make
@@ -52,6 +53,7 @@ def sweep(
     device: str = "cpu",
     cluster: str | None = None,
     trackio: str | None = None,
+    until: str | None = None,
 ) -> Path:
     """Make every point of a recipe that is not finished yet, and its report; return the recipe's folder.
 
@@ -66,6 +68,7 @@ def sweep(
         device: torch device of the networks.
         cluster: address of a Ray cluster to work on, or "local" to start one; by default none.
         trackio: project of trackio to which each finished point is logged, if any.
+        until: the last stage to run, by default all; after "ground" comes a page of held-out errors.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
@@ -80,9 +83,15 @@ def sweep(
     points = part.points()
     if unpublished:
         points, items = _left(points, items, experiment.published())
-    wanted = [item for item in items if experiment.maker(stage_of(item)) is experiment]
+    wanted = [
+        item
+        for item in items
+        if experiment.maker(stage_of(item)) is experiment and stage_of(item) in stages_until(until)
+    ]
     show = partial(_shown, PointTable(experiment, points), log)
     make(experiment, wanted, jobs=jobs, device=device, cluster=cluster, show=show)
+    if until == "ground":
+        write_errors(experiment, part)
     return experiment.folder
 
 
@@ -145,7 +154,7 @@ class PointTable:
 
     def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
-        means = evaluation.target.means()
+        means = evaluation.outcomes.means()
         stages = {key: key.partition("/")[0] for key in sorted(set(_needed(point.key, self._items)))}
         timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
         # The artefacts that a point was made of may have been deleted since.

@@ -1,9 +1,12 @@
 """Paired episodes as tensors: whole episodes side by side, and windows cut from them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -15,11 +18,14 @@ from astra_data.dataset.columns import (
     ABSTRACT_STATE,
     ACTION,
     GOAL,
+    NEXT_STATE,
     REWARD,
     STATE,
     SUCCESS,
     TERMINATED,
+    Array,
 )
+from astra_data.dataset.endings import stands_still
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
@@ -69,6 +75,9 @@ class PairedEpisodes:
     def load(cls, root: str | Path, device: str = "cpu") -> "PairedEpisodes":
         """Read the paired dataset at `root`; actions become multiples of ±1 within the task's bounds.
 
+        A terminated last step whose next state was made up, as it is its own, is no step of the robot: its
+        reward, termination and success become those of the step before.
+
         Raises:
             BadInputError: the dataset has not been paired.
             CorruptDatasetError: it is incomplete.
@@ -77,22 +86,25 @@ class PairedEpisodes:
         if ABSTRACT_STATE not in dataset.features:
             raise BadInputError(f"{root} has no column {ABSTRACT_STATE}: expected a dataset that was paired")
         names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
-        lengths = dataset.lengths.tolist()
+        columns = dataset.columns(names)
+        lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
+        if (made_up := _made_up(dataset, columns)).any():
+            columns, lengths = _merged(columns, lengths, made_up)
+            held_out, lengths = held_out[lengths > 0] if len(held_out) else held_out, lengths[lengths > 0]
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
-        for name, values in dataset.columns(names).items():
+        for name, values in columns.items():
             steps = torch.from_numpy(values if values.dtype == bool else values.astype("float32", copy=False))
             if name not in (REWARD, TERMINATED, SUCCESS):
                 steps = steps.reshape(len(steps), -1)
             if name == ACTION and commands is not None:
                 steps = commands.normal(steps)
-            padded[name] = pad_sequence(steps.to(device).split(lengths), batch_first=True)
-        mask = torch.arange(max(lengths), device=device) < torch.tensor(lengths, device=device)[:, None]
+            padded[name] = pad_sequence(steps.to(device).split(lengths.tolist()), batch_first=True)
+        mask = torch.arange(lengths.max(), device=device) < torch.tensor(lengths, device=device)[:, None]
         action, terminated = padded[ACTION], padded[TERMINATED]
         reward = padded.get(REWARD, torch.zeros_like(terminated, dtype=action.dtype))
         failed = terminated & ~padded.get(SUCCESS, terminated)
-        held_out = [bool(flag) for flag in dataset.metadata.get("held_out", ())]
         return cls(
             target_state=padded[STATE],
             reward=reward,
@@ -110,7 +122,7 @@ class PairedEpisodes:
             ),
             reference=dataset.reference,
             content_hash=dataset.content_hash,
-            held_out=torch.tensor(held_out, device=device) if any(held_out) else None,
+            held_out=torch.tensor(held_out, device=device) if held_out.any() else None,
             dropped_place=_dropped_place(dataset),
             commands=commands,
             has_rewards=REWARD in padded,
@@ -181,6 +193,33 @@ class PairedEpisodes:
         episodes, steps, is_drawn = draw_steps(self.lengths, count, length)
         windows = _gather(self.windows, (episodes, steps))
         return replace(windows, mask=windows.mask * is_drawn), self.target_state[episodes, steps]
+
+
+def _made_up(dataset: Dataset, columns: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """Return which episodes (E,) end with a terminated step whose next state is its own, to the bit."""
+    last = dataset.lengths.cumsum() - 1
+    ended = np.flatnonzero(columns[TERMINATED][last])
+    made_up = np.zeros(len(dataset), dtype=bool)
+    if NEXT_STATE in dataset.features and len(ended):
+        after = dataset.columns([NEXT_STATE], ended.tolist())[NEXT_STATE]
+        after = after[dataset.lengths[ended].cumsum() - 1]
+        made_up[ended] = [*map(stands_still, columns[STATE][last[ended]], after)]
+    return made_up
+
+
+def _merged(
+    columns: Mapping[str, Array], lengths: NDArray[np.int64], merged: NDArray[np.bool_]
+) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    """Merge the last step of the episodes `merged` (E,) into the one before; return what is left."""
+    last = (lengths.cumsum() - 1)[merged & (lengths > 1)]
+    left = dict(columns)
+    for name in {REWARD, TERMINATED, SUCCESS} & left.keys():
+        values = left[name].copy()
+        values[last - 1] += values[last]
+        left[name] = values
+    kept = np.ones(int(lengths.sum()), dtype=bool)
+    kept[(lengths.cumsum() - 1)[merged]] = False
+    return {name: values[kept] for name, values in left.items()}, lengths - merged
 
 
 def _dropped_place(dataset: Dataset) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,9 @@ class Evaluation(Artefact):
     dataset_version: str | None = None
     dataset_hash: str | None = None
     target_steps_per_second: float | None = None
-    target: Outcomes
+    tested_in: Literal["target", "grounded", "raw"] = "target"
+    """Where the row was tested: a simulator, if the task has no target."""
+    target: Outcomes | None = None
     simulated: Outcomes | None = None
     """In the simulator that the policy was trained in; None if it was trained in none."""
     raw: Outcomes | None = None
@@ -86,7 +88,15 @@ class Evaluation(Artefact):
         ]
         if wrong:
             raise ValueError(f"expected {self.episodes} episodes, but {', '.join(wrong)}")
+        if getattr(self, self.tested_in) is None:
+            raise ValueError(f"expected outcomes in {self.tested_in}, got none")
         return self
+
+    @property
+    def outcomes(self) -> Outcomes:
+        """The outcomes where the row was tested."""
+        found: Outcomes = getattr(self, self.tested_in)
+        return found
 
 
 class CurvePoint(BaseModel):
@@ -188,13 +198,18 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
     return {name: tensor.astype(np.float64) for name, tensor in tensors.items()}
 
 
+def files_of(evaluations: Mapping[str, Mapping[int, Evaluation]]) -> list[Evaluation]:
+    """Return the evaluations of all rows and seeds."""
+    return [file for of_seeds in evaluations.values() for file in of_seeds.values()]
+
+
 def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
     """Return the number of episodes per row and seed, the same for all.
 
     Raises:
         BadInputError: rows were evaluated differently.
     """
-    files = [file for of_seeds in evaluations.values() for file in of_seeds.values()]
+    files = files_of(evaluations)
     episodes = files[0].episodes
     wrong = [f"{file.method} seed {file.seed} on {file.task}" for file in files if file.task != task]
     wrong += [
@@ -218,7 +233,8 @@ def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) 
 
 def way_to_success(path: Path, evaluation: Evaluation) -> float:
     """Return the robot's mean path length in m over the successful episodes at `path`; NaN without any."""
-    robot = read_tensors(path, ("target.position",))["target.position"][..., :2]
+    tested = f"{evaluation.tested_in}.position"
+    robot = read_tensors(path, (tested,))[tested][..., :2]
     ways = np.nansum(np.linalg.norm(np.diff(robot, axis=1), axis=-1), axis=1)
-    succeeded = ways[np.array(evaluation.target.success, dtype=bool)]
+    succeeded = ways[np.array(evaluation.outcomes.success, dtype=bool)]
     return float(succeeded.mean()) if len(succeeded) else float("nan")

@@ -18,6 +18,7 @@ from astra_data.reports.artefacts import (
     Gap,
     Metrics,
     check_alike,
+    files_of,
     way_to_success,
 )
 from astra_data.reports.comparing import SHARED_WORLDS
@@ -81,8 +82,8 @@ def _read(
     gaps = read.optional("ground", "gap.json", Gap)
     curves = read.optional("train", "curve.json", CurveFile)
     alignments = read.optional("align", "metrics.json", Metrics)
-    datasets = {stage: read.datasets(stage) for stage in ("collect", "pair", "subset")}
-    gap_means = {owner: _gap_means(of_seeds) for owner, of_seeds in gaps.items()}
+    datasets = {stage: read.datasets(stage) for stage in ("collect", "label", "pair", "subset")}
+    gap_means = {owner: mean_gap(of_seeds) for owner, of_seeds in gaps.items()}
     rows, uses = {}, {}
     for method, of_seeds in evaluations.items():
         encoders = [{name: sorted(of) for name, of in file.encoders.items()} for file in of_seeds.values()]
@@ -138,7 +139,8 @@ def _read(
         ],
         evaluated_with=dataset_uses(uses),
         episodes=episodes,
-        leg_scale=next(file.leg_scale for of_seeds in evaluations.values() for file in of_seeds.values()),
+        tested_in="target" if all(file.target for file in files_of(evaluations)) else "simulators",
+        leg_scale=files_of(evaluations)[0].leg_scale,
         methods=rows,
         throughput=throughput(files),
     )
@@ -152,7 +154,7 @@ def _values(
     evaluation: Evaluation, distance: float, curve: CurveFile | None, score: Score
 ) -> dict[str, object]:
     """Return the value of each field in `PER_SEED`."""
-    means = evaluation.target.means()
+    means = evaluation.outcomes.means()
     simulated = {} if evaluation.simulated is None else evaluation.simulated.means()
     shared = {world: getattr(evaluation, world) for world in SHARED_WORLDS}
     return {
@@ -182,7 +184,12 @@ def _require_alike(values: Sequence[object], what: str) -> None:
         raise BadInputError(f"expected the same {what} for all seeds of a row, got {values}; run them again")
 
 
-def _gap_means(of_seeds: Mapping[int, Gap]) -> GapMeans:
+def mean_gap(of_seeds: Mapping[int, Gap]) -> GapMeans:
+    """Return the mean over seeds, of the horizons that all of them have.
+
+    Raises:
+        BadInputError: they are of different quantities.
+    """
     gaps = list(of_seeds.values())
     _require_alike([sorted(gap.grounded) for gap in gaps], "quantities")
     # A seed whose episodes are short has no long horizons.

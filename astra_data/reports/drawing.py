@@ -30,6 +30,7 @@ from astra_data.reports.figures import (
 )
 from astra_data.reports.schema import BandMeans, Results
 from astra_data.reports.sizes import SizesResults
+from astra_data.reports.tested import where
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.score import SUCCESS, Score
 
@@ -106,6 +107,7 @@ def _bars(results: Results, score: Score) -> Figure:
         {method: np.array(row.measures()[score.measure]) for method, row in rows.items()},
         intervals,
         {method: row.summary[simulated].mean for method, row in rows.items() if simulated in row.summary},
+        where(results),
     )
 
 
@@ -123,13 +125,14 @@ def _with_trajectories(root: Path, results: Results, rows: Sequence[str]) -> dic
 
 def _panel(results: Results, row: str, folder: Path, episodes: int) -> Panel:
     evaluation = read_json(Evaluation, folder / EVALUATION)
-    tensors = read_tensors(folder / TRAJECTORIES, ("target.position", "goal"))
+    tested = f"{evaluation.tested_in}.position"
+    tensors = read_tensors(folder / TRAJECTORIES, (tested, "goal"))
     simulated = [] if evaluation.simulated is None else evaluation.simulated.success[:episodes]
     return Panel(
         method=row,
         success=results.methods[row].summary["success"].mean,
-        target=tensors["target.position"][:episodes],
-        target_success=np.array(evaluation.target.success[:episodes], dtype=bool),
+        target=tensors[tested][:episodes],
+        target_success=np.array(evaluation.outcomes.success[:episodes], dtype=bool),
         simulated=tensors.get("simulated.position", np.empty((0, 1, 2)))[: len(simulated)],
         simulated_success=np.array(simulated, dtype=bool),
         goal=tensors["goal"][:episodes],
@@ -147,7 +150,7 @@ def _pictures(folders: Mapping[str, Path], camera: Camera) -> dict[str, Figure]:
             pictures = camera.photograph(states[[moment for moment in moments if moment < len(states)]])
         except BadInputError:
             return {}
-        failed = bool(read_json(Evaluation, folder / EVALUATION).target.failed[0])
+        failed = bool(read_json(Evaluation, folder / EVALUATION).outcomes.failed[0])
         found[row] = Strip(pictures, (len(states) - 1) * camera.timestep_s, failed)
     return {"strips": strips(times_s, found)} if found else {}
 

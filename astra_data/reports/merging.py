@@ -46,7 +46,7 @@ def merge(
             "methods": rows,
             "unfinished": [method_title(method) for method in methods if method not in rows],
             "probability_of_improvement": improvement(rows, sources[-1].headline, replicates),
-            "predictive_validity": validity(rows, replicates),
+            "predictive_validity": validity(rows, replicates) if sources[-1].tested_in == "target" else {},
             "throughput": reduce(_sum, (source.throughput for source in sources)),
         }
     )
@@ -70,6 +70,7 @@ def _check_alike(sources: Sequence[Results]) -> None:
         compared = {
             "task": (first.task, other.task),
             "episodes per row and seed": (first.episodes, other.episodes),
+            "place of the tests": (first.tested_in, other.tested_in),
             "scale of the legs": (first.leg_scale, other.leg_scale),
         }
         wrong = [f"{what}: {before} and {now}" for what, (before, now) in compared.items() if before != now]

@@ -1,6 +1,6 @@
 """Results → Markdown; the text is in `templates/recipe.md.jinja`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from astra_data.core.naming import is_plus, reference_of
 from astra_data.methods import method_title
@@ -13,8 +13,9 @@ from astra_data.reports.cost_and_origin import (
     stage_costs,
 )
 from astra_data.reports.formatting import fill, interval, mean_std, spread
-from astra_data.reports.schema import BandMeans, Results
+from astra_data.reports.schema import BandMeans, MethodResults, Results
 from astra_data.reports.statistics import Correlation
+from astra_data.reports.tested import warning, where
 from astra_data.worlds.score import SUCCESS
 
 BESIDE = {
@@ -56,6 +57,8 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         rows=rows,
         seeds=seeds,
         headline=results.headline.measure,
+        warning=warning(results),
+        where=where(results),
         machines=" and ".join(dict.fromkeys(map(machine, stages))),
         scores=_scores(results),
         has_plus=any(map(is_plus, rows)),
@@ -78,6 +81,8 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 def _scores(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return head and lines of the table of scores."""
     rows, scores, beside = results.methods, results.scores, BESIDE[results.headline.measure]
+    if results.tested_in != "target":
+        beside = tuple(measure for measure in beside if any(map(_some(measure), rows.values())))
     best = {
         score: max((row.summary[score.measure].mean for row in rows.values() if not row.role), default=None)
         for score in scores
@@ -106,6 +111,11 @@ def _scores(results: Results) -> tuple[list[str], list[list[str]]]:
         for method, cells in zip(rows, lines, strict=True):
             cells.insert(place, f"{paper[method]:.2f}" if method in paper else "-")
     return head, lines
+
+
+def _some(measure: str) -> Callable[[MethodResults], bool]:
+    """Return whether a row has values of a measure other than 0: a robot without walls touches none."""
+    return lambda row: measure in row.summary and row.summary[measure].mean != 0.0
 
 
 def _encoders(results: Results) -> list[list[str]]:

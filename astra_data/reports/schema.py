@@ -179,6 +179,10 @@ class Results(Section):
     """Seeds that any row has finished."""
     episodes: int
     """Per row and seed."""
+    tested_in: Literal["target", "simulators"] = Field(
+        default="target", exclude_if=lambda place: place == "target"
+    )
+    """Where all rows were tested; a task may have no target."""
     leg_scale: float = 1.0
     """Leg length of the target's robot, relative to the one that collected the data."""
     stand_in: str | None = None

@@ -6,6 +6,7 @@ from typing import Literal
 from astra_data.reports.cost_and_origin import provenance
 from astra_data.reports.formatting import fill, interval, spread
 from astra_data.reports.schema import Results, Section
+from astra_data.reports.tested import warning, where
 
 SHARED = ("collect", "pair")
 """Stages that run once for all sizes."""
@@ -62,6 +63,8 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         found=found,
         first=first,
         figures=figures,
+        warning=warning(first),
+        where=where(first),
         wall_seconds=seconds,
         head=["method", *(f"{size.percent} %" for size in found.sizes)],
         means=means,

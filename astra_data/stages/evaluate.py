@@ -2,7 +2,7 @@
 
 The simulators are the one that it was trained in, and two that are the same for all policies, to measure how
 well each predicts the target: the raw simulator, and a grounded one as reference. These two give the task's
-own reward.
+own reward. Of a task without a target, there are the simulators alone.
 """
 
 import json
@@ -102,6 +102,8 @@ def evaluate(
     scores = world.objective.scores
     if base.trains and policy is None:
         raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
+    if not (base.trains or world.has_target):
+        raise BadInputError(f"method '{method}' acts in a target, and {world.name} has none")
     if base.grounds and grounding is None:
         raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     stopwatch = Stopwatch()
@@ -149,24 +151,30 @@ def evaluate(
         "reference": reference and reference / "grounding.safetensors",
     }
     read = {name: file_digest(file) for name, file in files.items() if file}
-    outcomes, filmed = {}, {}
-    for kind, robot in robots.items():
-        outcomes[kind], filmed[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
-    if policy is not None:
-        results["encoders"] = {
-            kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
-            for kind, outcome in outcomes.items()
-        }
-    results |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
-    tensors = {"target.position": outcomes[headline].position}
-    if world.photograph is not None:
-        tensors["target.state"] = filmed[headline]
+    tensors: dict[str, Tensor] = {}
+    tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
+    if world.has_target:
+        outcomes, filmed = {}, {}
+        for kind, robot in robots.items():
+            outcomes[kind], filmed[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
+        if policy is not None:
+            results["encoders"] = {
+                kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
+                for kind, outcome in outcomes.items()
+            }
+        results |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
+        tensors["target.position"] = outcomes[headline].position
+        if world.photograph is not None:
+            tensors["target.state"] = filmed[headline]
+    else:
+        results |= {"tested_in": tested_in, "encoder": "source"}
     for name, simulated in simulators.items():
-        outcome = _in_simulator(simulated, begin, world.objective.horizon, seed)
+        outcome, start_goal = _in_simulator(simulated, begin, world.objective.horizon, seed)
         results[name] = outcome.to_json()
-        if name == "simulated":
-            tensors["simulated.position"] = outcome.position
-    start_goal = _starts_and_goals(world, config, seed)
+        if name in ("simulated", tested_in):
+            tensors[f"{name}.position"] = outcome.position
+    if world.has_target:
+        start_goal = _starts_and_goals(world, config, seed)
     with finished_folder(out) as folder:
         save_tensors(folder / "trajectories.safetensors", tensors | start_goal, {})
         results |= stopwatch.spent()
@@ -174,7 +182,8 @@ def evaluate(
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         write_manifest(folder, read)
     first = scores[0]
-    progress(1.0, f"{first.title} in the target {first.text(fmean(results['target'][first.measure]))}")
+    where = "target" if world.has_target else f"{tested_in} simulator"
+    progress(1.0, f"{first.title} in the {where} {first.text(fmean(results[tested_in][first.measure]))}")
 
 
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
@@ -236,12 +245,15 @@ def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfi
 
 
 @torch.no_grad()
-def _in_simulator(world: SimulatorEnv, begin: Begin, horizon: int, seed: int) -> Outcome:
-    """Return the outcome in the simulator `world`, from starts that are the same in every simulator."""
+def _in_simulator(
+    world: SimulatorEnv, begin: Begin, horizon: int, seed: int
+) -> tuple[Outcome, dict[str, Tensor]]:
+    """Return the outcome in `world`, and its starts and goals, which are the same in every simulator."""
     torch.manual_seed(derive(seed, "simulated evaluation"))
     world.reset()
     act = begin(world.goal)
     record = EpisodeRecord(world.objective.places(world.simulator.state))
+    start_goal = {"start": world.objective.places(world.simulator.state).clone(), "goal": world.goal.clone()}
     for number in range(horizon):
         step = world.step(act(world.simulator.state, world.goal))
         success = world.objective.succeeded(step.success, world.failed, number + 1)
@@ -250,4 +262,4 @@ def _in_simulator(world: SimulatorEnv, begin: Begin, horizon: int, seed: int) ->
         record.add(places, step.reward, success, world.failed, blocked)
         if not record.active.any():
             break
-    return record.outcome()
+    return record.outcome(), start_goal

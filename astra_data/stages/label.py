@@ -25,6 +25,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
+from astra_data.exchange.sharing.pull import pull
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -32,36 +33,42 @@ from astra_data.worlds.task import Task
 def label(
     task: str,
     *,
-    dataset: str | Path,
+    data: str | Path,
     seed: int = 0,
     name: str | None = None,
     out: Path | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Add the columns of goals and outcomes that `dataset` lacks; return the new folder.
+    """Add the columns of goals and outcomes that a dataset lacks; return the new folder.
 
     Goals are drawn by the objective, one an episode. Episodes end where the goal is reached: later steps are
     dropped. An episode that its log ends as terminated, without a success, is a failure.
 
     Args:
         task: see `task_named`.
-        dataset: with states, actions and next states.
+        data: with states, actions and next states; a folder, a name, or an address to pull it from.
         seed: of the goals.
-        name: of the new dataset, by default that of `dataset`, whose next version it is.
-        out: its folder, by default its place at home.
+        name: of the new dataset, by default that of `data`, whose next version it is.
+        out: its folder, by default its place at home. Where `data` lacks nothing, it becomes a link to that.
         progress: called with the fraction done.
 
     Raises:
-        BadInputError: the dataset lacks states or actions, or these are not those of the task.
+        BadInputError: the dataset lacks states or actions, or these are not those of the task; or there is
+            nothing to label and no `out`.
         CorruptDatasetError: the dataset is incomplete.
+        SharingError: it cannot be pulled.
     """
-    world, source = task_named(task), open_dataset(dataset)
+    world, source = task_named(task), _opened(data)
     _check(source, world)
     more = [
         column
         for column in ((world.goal,) if world.goal else ()) + OUTCOME_COLUMNS
         if column.name not in source.features
     ]
+    if not more and out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.symlink_to(source.root.resolve())
+        return out
     if not more:
         raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
     description, out = successor(
@@ -128,6 +135,12 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
         {key: values[:length] for key, values in columns.items()},
         metadata | dict(episode.metadata),
     )
+
+
+def _opened(data: str | Path) -> Dataset:
+    """Open a dataset here, or pull it."""
+    is_address = "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))
+    return pull(str(data)) if is_address and not Path(data).is_dir() else open_dataset(data)
 
 
 def _goals(task: Task, episode: Episode, seed: int) -> torch.Tensor:

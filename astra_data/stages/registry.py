@@ -11,6 +11,7 @@ from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.ground import ground
+from astra_data.stages.label import label
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.report import ReportConfig, report
 from astra_data.stages.subset import subset
@@ -29,7 +30,7 @@ class Stage:
             policy, an aligned grounding or a row, each per dataset; or the recipe.
         reads: the stages whose artefacts it may read.
         config: the type of its table in a recipe; None where it has no settings.
-        is_optional: whether recipes without its table leave the stage out.
+        asked_by: the key of recipes without which the stage is left out; None if all have it.
         result: the file of its artefacts that other stages read; None for datasets and the report.
     """
 
@@ -38,7 +39,7 @@ class Stage:
     each: Literal["seed", "size", "grounding", "policy", "alignment", "row", "recipe"]
     reads: tuple[str, ...] = ()
     config: Any = None
-    is_optional: bool = False
+    asked_by: str | None = None
     result: str | None = None
 
     @property
@@ -53,9 +54,10 @@ _OF_GROUNDING = (*_OF_DATASET, "ground")
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("collect", collect, "seed", config=CollectConfig),
-        Stage("augment", augment, "seed", ("collect",), AugmentConfig, is_optional=True),
-        Stage("pair", pair, "seed", ("collect", "augment"), PairConfig),
+        Stage("collect", collect, "seed", config=CollectConfig, asked_by="collect"),
+        Stage("label", label, "seed", asked_by="data"),
+        Stage("augment", augment, "seed", ("collect", "label"), AugmentConfig, asked_by="augment"),
+        Stage("pair", pair, "seed", ("collect", "label", "augment"), PairConfig),
         Stage("subset", subset, "size", ("pair",)),
         Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result="grounding.safetensors"),
         Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result="policy.safetensors"),

@@ -7,13 +7,13 @@ from astra_data.dataset import edit
 from astra_data.dataset.reader import Dataset
 
 
-def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progress) -> Path:
+def subset(dataset: Path, *, percent: int, of: int | None = None, out: Path, progress: Progress) -> Path:
     """Write `percent` per cent of `of` episodes of `dataset` to `out`, as a dataset of its own.
 
     Args:
         dataset: its stored permutation decides which episodes are taken.
         percent: the size; may exceed 100.
-        of: number of episodes that count as 100 per cent.
+        of: number of episodes that count as 100 per cent, by default all.
         out: the folder to write.
         progress: called with the number of episodes.
 
@@ -24,5 +24,5 @@ def subset(dataset: Path, *, percent: int, of: int, out: Path, progress: Progres
     source = Dataset.open(dataset)
     name = f"{source.description['name']}-percent{percent:03d}"
     folder = edit.subset(source, percent=percent, of=of, name=name, out=out)
-    progress(1.0, f"{edit.share(percent, of)} of {len(source)} episodes")
+    progress(1.0, f"{edit.share(percent, of or len(source))} of {len(source)} episodes")
     return folder

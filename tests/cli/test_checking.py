@@ -19,7 +19,8 @@ def test_validate_and_repair(
 ) -> None:
     root = write_fake(tmp_path / "set").root
     assert run(monkeypatch, "validate", root) == 0
-    assert capsys.readouterr().out == f"{root} is whole: 5 episodes, 55 steps\n"
+    told = capsys.readouterr().out
+    assert told.startswith(f"{root} is whole: 5 episodes, 55 steps\nepisodes end: ")
     (root / "meta/tasks.parquet").unlink()
     (root / "meta/stats.json").write_text("{}")
     assert run(monkeypatch, "validate", root) == 1

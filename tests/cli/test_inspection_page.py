@@ -6,6 +6,7 @@ from rich.console import Console
 
 from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
 from astra_data.dataset.columns import Column
+from astra_data.dataset.endings import Endings
 from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
 
 
@@ -42,6 +43,7 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
         lengths=np.array([600, 1200, 1800]),
         fps=20,
         success=success,
+        endings=Endings(terminated=2, cut_off=1, made_up=1),
         spreads=(spread,),
         positions=plane([[1, 0], [0, 0]]),
         velocities=None,
@@ -52,6 +54,7 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     assert lines[0] == "fake@data-1.0.0: 3 episodes, 3,600 steps, 3.0 min"
     assert lines[1].startswith("lengths 600 to 1800, median 1200  ")
     assert ("success 1 of 3 episodes (0.33)" in lines) == (success is not None)
+    assert any(line.startswith("episodes end: 2 terminated, 1 cut off; 1 next states were") for line in lines)
     table = lines[lines.index("action (2) float32") + 1 :]
     assert table[0].split() == ["value", "unit", "min", "mean", "max", "spread"]
     assert table[1].split() == ["vx", "m/s", "-1", "0", "1"]

@@ -36,16 +36,24 @@ def test_all_is_made_by_processes_here_unless_told_otherwise(
 ) -> None:
     assert asked_of(recipe, monkeypatch) == {
         **{"methods": (), "seeds": (), "percents": (), "unpublished": False, "root": Path("runs")},
-        **{"jobs": None, "device": "cpu", "cluster": None, "trackio": None},
+        **{"jobs": None, "device": "cpu", "cluster": None, "trackio": None, "until": None},
     }
 
 
 def test_options_choose_points_and_where_they_are_made(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = ["--method", "nas", "--seed", "1", "--seed", "0", "--percent", "50", "--unpublished"]
     others = ["--jobs", "3", "--device", "cuda", "--root", "elsewhere", "--trackio", "ants"]
+    others += ["--until", "ground"]
     assert asked_of(recipe, monkeypatch, *points, *others) == {
         **{"methods": ["nas"], "seeds": [1, 0], "percents": [50], "unpublished": True},
-        **{"root": Path("elsewhere"), "jobs": 3, "device": "cuda", "cluster": None, "trackio": "ants"},
+        **{
+            "root": Path("elsewhere"),
+            "jobs": 3,
+            "device": "cuda",
+            "cluster": None,
+            "trackio": "ants",
+            "until": "ground",
+        },
     }
 
 

@@ -124,7 +124,7 @@ def test_next_states_and_ends_are_derived_where_they_are_left_out() -> None:
     assert columns[NEXT_STATE].names == ("x",)
     assert columns[NEXT_STATE].astra == {"unit": ["m"]}
     assert columns[NEXT_STATE].meaning == "the state, one step later"
-    ending = converter({STATE: {"fields": ("f",)}, TERMINATED: {"fields": ("f",)}})
+    ending = converter({STATE: {"fields": ("f",)}, TERMINATED: {"fields": ("f",)}}, terminal="stand_still")
     ending.convert(Block({"f": np.zeros(2)}, "log"))
     assert "where an episode terminates" in next(c.meaning for c in ending.columns if c.name == NEXT_STATE)
     whole = converter({STATE: {"fields": ("f",)}, NEXT_STATE: {"fields": ("f",)}})

@@ -8,7 +8,18 @@ import pytest
 from numpy.typing import ArrayLike
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+)
+from astra_data.dataset.endings import Endings
 from astra_data.exchange.cutting import Cutter
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block
@@ -67,8 +78,9 @@ def test_a_flag_ends_an_episode(block_rows: int) -> None:
 @BLOCKS
 def test_columns_that_are_flags_end_episodes_too(block_rows: int) -> None:
     fell = {"fields": ("alive",), "scale": (-1,), "offset": (1,)}
-    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
-    cutting = cutter(columns=columns | {TERMINATED: fell, TRUNCATED: {"fields": ("late",)}})
+    columns: dict[str, Any] = {name: {"fields": ("a",)} for name in (ACTION, REWARD)}
+    columns |= {STATE: {"fields": ("x",)}, TERMINATED: fell, TRUNCATED: {"fields": ("late",)}}
+    cutting = cutter(columns=columns, terminal="stand_still")
     episodes = cut(
         cutting, block_rows, x=np.arange(8) * 2, alive=[1, 1, 0, 1, 1, 1, 1, 1], late=[0, 0, 0, 0, 0, 1, 0, 0]
     )
@@ -83,6 +95,25 @@ def test_columns_that_are_flags_end_episodes_too(block_rows: int) -> None:
     assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False] * 3, [False, True], [True]]
     assert cutting.tally.split_points == {"end": 2}
     assert (cutting.tally.last_rows, cutting.tally.last_reward) == (2, 12)
+    assert cutting.tally.endings == Endings(terminated=1, cut_off=2, made_up=1)
+
+
+@BLOCKS
+def test_a_terminated_row_without_a_next_state_hands_its_flags_to_the_step_before(block_rows: int) -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
+    columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("there",)}}
+    cutting = cutter(columns=columns)
+    over, there = [0, 0, 1, 0, 1, 1, 0, 0], [0, 0, 1, 0, 0, 0, 0, 1]
+    episodes = cut(cutting, block_rows, x=np.arange(8) * 2, over=over, there=there)
+    # Row 5 is alone; row 7 is cut off, and what it says of a success is about a state that nobody saw left.
+    assert rows(episodes) == [[0, 1], [3], [6]]
+    assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4], [8], [14]]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [[False, True], [True], [False]]
+    assert [episode[SUCCESS].tolist() for episode in episodes] == [[False, True], [False], [False]]
+    assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False, False], [False], [True]]
+    assert cutting.tally.endings == Endings(terminated=2, cut_off=1)
+    tally = cutting.tally
+    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (4, 3, 2 + 4 + 5 + 7)
 
 
 @BLOCKS

@@ -194,3 +194,22 @@ def test_faults_are_told(tmp_path: Path, fake_recipe: type[Recipe], text: str, e
     with pytest.raises(RecipeError) as caught:
         load(tmp_path, fake_recipe, text)
     assert str(caught.value) == f"{tmp_path / 'r.toml'}: {expected}"
+
+
+def test_a_recipe_with_data_labels_that_and_collects_nothing(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = 'data = "walks@data-1.0.0"\n' + HEAD + "[sweep]\npercent = [50, 100]\n"
+    recipe = load(tmp_path, fake_recipe, text)
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    assert not [key for key in items if key.startswith("collect")]
+    label, subset = (items[key].call.keywords for key in ("label/seed_7", "subset/percent_050/seed_7"))  # type: ignore[attr-defined]
+    assert (label["data"], label["seed"], label["out"]) == ("walks@data-1.0.0", 7, tmp_path / "label/seed_7")
+    assert items["pair/seed_7"].inputs == ("label/seed_7",)
+    assert subset["of"] is None and "data" not in load(tmp_path, fake_recipe, HEAD).settings
+    for more, expected in (
+        ("[collect]\nepisodes = 9\n", r"data: it takes the place of \[collect\]: leave out one of them"),
+        ("[sweep]\npercent = [150]\n", "sweep.percent: expected at most 100 % of data, got 150"),
+    ):
+        with pytest.raises(RecipeError, match=expected):
+            load(tmp_path, fake_recipe, 'data = "walks"\n' + HEAD + more)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.run import check, run, run_stage
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
@@ -200,3 +201,20 @@ def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
     run_stage(recipe, "pair", seeds=[0], root=tmp_path)
     with pytest.raises(MissingStageError, match="collect/seed_1 is missing"):
         run_stage(recipe, "pair", root=tmp_path)
+
+
+def test_a_recipe_with_data_is_labelled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text('data = "walks"\n' + recipe.read_text())
+    with pytest.raises(BadInputError, match=r"r\.toml has data, walks: there is nothing to collect"):
+        run_stage(recipe, "collect", root=tmp_path)
+    folder = run(recipe, root=tmp_path, jobs=1, until="pair")
+    assert asked(folder / "label/seed_0")["data"] == "walks"
+    assert asked(folder / "pair/seed_0")["dataset"] == str(folder / "label/seed_0")
+    recipe.write_text(recipe.read_text().replace('"walks"', '"runs"'))
+    with pytest.raises(RecipeError, match="data changed in the recipe since"):
+        run(recipe, root=tmp_path, jobs=1, until="pair")
+    (tmp_path / "runs/meta").mkdir(parents=True)
+    (tmp_path / "runs/meta/info.json").touch()
+    with pytest.raises(RecipeError, match="data changed"):
+        run(recipe, root=tmp_path, jobs=1, until="pair")
+    assert load_experiment(recipe, tmp_path).recipe.data == str(tmp_path / "runs")

@@ -16,6 +16,7 @@ from astra_data.dataset.columns import (
     ACTION,
     DONE,
     GOAL,
+    NEXT_STATE,
     OUTCOME_COLUMNS,
     REWARD,
     STATE,
@@ -39,7 +40,9 @@ def label(episode: int, step: int) -> float:
 SIZES = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
 
 
-def write(folder: Path, sizes: dict[str, int], held_out: tuple[int, ...] | None = None) -> Path:
+def write(
+    folder: Path, sizes: dict[str, int], held_out: tuple[int, ...] | None = None, *, made_up: bool = False
+) -> Path:
     columns = [*(Column(name, size=size) for name, size in sizes.items()), *OUTCOME_COLUMNS]
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
     description |= {"environment": {"id": "toy"}, "simulator": {"id": "toy"}, "parents": []}
@@ -53,9 +56,27 @@ def write(folder: Path, sizes: dict[str, int], held_out: tuple[int, ...] | None 
             # The third episode succeeds, the fourth topples, the others run out of time.
             ended = last & (episode in (2, 3))
             values |= {REWARD: -steps, TERMINATED: ended, TRUNCATED: last & ~ended, DONE: last}
+            if NEXT_STATE in sizes:
+                values[NEXT_STATE] = values[STATE] + (~ended if made_up else np.ones(length))[:, None].astype(
+                    np.float32
+                )
             metadata = {} if held_out is None else {"held_out": episode in held_out}
             writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}, metadata))
     return folder
+
+
+def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
+    sizes = SIZES | {NEXT_STATE: 3}
+    episodes = PairedEpisodes.load(write(tmp_path / "pairs", sizes))
+    merged = PairedEpisodes.load(write(tmp_path / "made_up", sizes, held_out=(1, 3), made_up=True))
+    # The third and the fourth episode, which are terminated, lose their last step; the one of a step is kept.
+    assert episodes.lengths.tolist() == [7, 1, 12, 30, 5]
+    assert merged.lengths.tolist() == [7, 1, 11, 29, 5]
+    assert merged.terminated.nonzero().tolist() == [[2, 10], [3, 28]]
+    assert merged.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
+    assert merged.windows.reward[3, 28].tolist() == [0.0, -label(3, 28) - label(3, 29)]
+    assert merged.windows.next_state[3, 28, 0] == label(3, 28)
+    assert merged.held_out is not None and merged.held_out.tolist() == [False, True, False, True, False]
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_means_are_over_episodes_under_the_names_in_the_file(path: Path) -> None:
-    means = read_json(Evaluation, path).target.means()
+    means = read_json(Evaluation, path).outcomes.means()
     assert means == pytest.approx(
         {"success": 0.25, "failed": 0.75, "wall_contact": 0.2, "steps": 115.0, "return": 1.0}
     )

@@ -22,6 +22,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
+from astra_data.exchange.sharing.push import push
 from astra_data.stages.label import label
 
 CART = f"{Path(__file__).parents[1] / 'cart.py'}:LOGS_ALONE"
@@ -54,7 +55,7 @@ def write(
 
 def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     logs = write(tmp_path / "logs", [drive(0.5, 10), drive(4.0, 10)])
-    labelled = Dataset.open(label(CART, dataset=logs, out=tmp_path / "labelled"))
+    labelled = Dataset.open(label(CART, data=logs, out=tmp_path / "labelled"))
     slow, fast = labelled.episodes()
     assert len(slow) == 10 and not slow.columns[SUCCESS].any() and not slow.columns[TERMINATED].any()
     np.testing.assert_allclose(slow.columns[REWARD], 0.05, atol=1e-6)
@@ -80,7 +81,7 @@ def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
     given = drive(1.0, 10) | {TERMINATED: fell, GOAL: np.full(10, 0.95, np.float32)}
     more = (goal, *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
     logs = write(tmp_path / "logs", [given], more, driver="Ada")
-    labelled = Dataset.open(label(CART, dataset=logs, out=tmp_path / "labelled"))
+    labelled = Dataset.open(label(CART, data=logs, out=tmp_path / "labelled"))
     (episode,) = labelled.episodes()
     # It is at the goal when it falls: a failure.
     assert episode.columns[TERMINATED].tolist() == fell.tolist() and not episode.columns[SUCCESS].any()
@@ -95,7 +96,7 @@ def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
 def test_the_seed_decides_the_goals(tmp_path: Path) -> None:
     logs = write(tmp_path / "logs", [drive(0.1, 3)] * 3)
     goals = [
-        Dataset.open(label(CART, dataset=logs, seed=seed, out=tmp_path / f"{number}")).columns([GOAL])[GOAL]
+        Dataset.open(label(CART, data=logs, seed=seed, out=tmp_path / f"{number}")).columns([GOAL])[GOAL]
         for number, seed in enumerate((0, 0, 1))
     ]
     assert np.array_equal(goals[0], goals[1]) and not np.array_equal(goals[0], goals[2])
@@ -107,8 +108,17 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: 29"
     ):
-        label("antmaze-umaze", dataset=logs, out=tmp_path / "out")
-    labelled = label(CART, dataset=logs, out=tmp_path / "labelled")
+        label("antmaze-umaze", data=logs, out=tmp_path / "out")
+    labelled = label(CART, data=logs, out=tmp_path / "labelled")
     with pytest.raises(BadInputError, match="has goals and outcomes already: there is nothing to label"):
-        label(CART, dataset=labelled, out=tmp_path / "again")
-    assert not (tmp_path / "out").exists() and not (tmp_path / "again").exists()
+        label(CART, data=labelled)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(tmp_path: Path, home: Path) -> None:
+    labelled = label(CART, data=write(tmp_path / "logs", [drive(0.1, 3)]), out=tmp_path / "labelled")
+    link = label(CART, data=labelled, out=tmp_path / "run" / "seed_0")
+    assert link.is_symlink() and Dataset.open(link).content_hash == Dataset.open(labelled).content_hash
+    address = push(str(labelled), f"file://{tmp_path}/shared")
+    pulled = label(CART, data=address, out=tmp_path / "run" / "seed_1")
+    assert pulled.resolve() == home / "logs" / "data-2.0.0"

@@ -13,8 +13,9 @@ def test_a_stage_is_named_as_the_function_that_makes_it() -> None:
 def test_a_stage_reads_earlier_ones() -> None:
     assert {name: stage.reads for name, stage in STAGES.items()} == {
         "collect": (),
-        "augment": ("collect",),
-        "pair": ("collect", "augment"),
+        "label": (),
+        "augment": ("collect", "label"),
+        "pair": ("collect", "label", "augment"),
         "subset": ("pair",),
         "ground": ("pair", "subset"),
         "train": ("pair", "subset", "ground"),
@@ -29,6 +30,7 @@ def test_a_stage_reads_earlier_ones() -> None:
 
 def test_a_stage_asks_for_nothing_that_the_plan_does_not_know() -> None:
     known = {"task", "simulator", "method", "config", "settings", "seed", "percent", "of", "out", "device"}
+    known |= {"data"}
     for stage in STAGES.values():
         if stage.each == "recipe":
             continue
@@ -40,6 +42,8 @@ def test_a_stage_asks_for_nothing_that_the_plan_does_not_know() -> None:
 
 def test_datasets_are_made_of_seeds_and_sizes() -> None:
     assert [name for name, stage in STAGES.items() if stage.makes_dataset] == [
-        *("collect", "augment", "pair", "subset")
+        *("collect", "label", "augment", "pair", "subset")
     ]
-    assert [name for name, stage in STAGES.items() if stage.is_optional] == ["augment"]
+    assert {name: stage.asked_by for name, stage in STAGES.items() if stage.asked_by} == {
+        **{"collect": "collect", "label": "data", "augment": "augment"}
+    }

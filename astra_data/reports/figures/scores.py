@@ -42,6 +42,7 @@ def score_bars(
     scores: Mapping[str, Floats],
     intervals: Mapping[str, tuple[float, float, float]],
     simulated: Mapping[str, float],
+    where: str = "in the target",
 ) -> Figure:
     """Draw one bar per row, with a dot per seed.
 
@@ -50,6 +51,7 @@ def score_bars(
         scores: those of each row's seeds, (seeds,).
         intervals: (interquartile mean, low, high) of each row; low and high are NaN for a single seed.
         simulated: mean score of a row in the simulator that it was trained in, if any.
+        where: the scores were measured.
     """
     with style():
         figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(scores)), layout="constrained")
@@ -65,7 +67,7 @@ def score_bars(
         if score.limit is not None:
             axes.set_xlim(0, score.limit)
             axes.set_xticks(np.linspace(0, score.limit, 6))
-        axes.set_xlabel(f"{score.quantity} in the target")
+        axes.set_xlabel(f"{score.quantity} {where}")
         axes.grid(visible=False, axis="y")
         axes.grid(visible=True, axis="x")
         handles = [

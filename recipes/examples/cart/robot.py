@@ -1,6 +1,7 @@
 """The robot itself, which the toolkit does not see: a simulated cart stands in for it.
 
-python robot.py logs          records 60 drives by random commands as CSV, in millimetres and degrees
+python robot.py logs [drives]       records drives by random commands as CSV, in millimetres and degrees
+python robot.py play RUN [trials]   sends the cart to its goals by the policies of a run, and counts
 """
 
 import csv
@@ -8,6 +9,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
+
+from astra_data import load_policy
 
 TIPPED_RAD = 0.6
 
@@ -64,5 +68,29 @@ def record(folder, drives=60, seconds=15, seed=0):
                 state, tipped = cart.step(command)
 
 
+def play(run, trials=100, seed=0):
+    """Print which share of its trials each policy of a run delivers, and tips."""
+    for row in sorted(folder.name for folder in (Path(run) / "train").iterdir()):
+        policy = load_policy(run, row)
+        task, rng = policy.task, np.random.default_rng(seed)
+        goals = torch.tensor(task.objective.draw_goals(rng, trials), dtype=torch.float32)
+        carts = [TrueCart() for _ in range(trials)]
+        states = np.array([cart.reset(int(rng.integers(2**32))) for cart in carts])
+        delivered, tipped = np.zeros(trials, bool), np.zeros(trials, bool)
+        policy.start(trials)
+        for _ in range(task.objective.horizon):
+            action = policy.act(torch.tensor(states, dtype=torch.float32), goals)
+            commands = task.limits.in_units(action).numpy()
+            for number in np.flatnonzero(~delivered & ~tipped):
+                states[number], tipped[number] = carts[number].step(commands[number])
+            near = np.linalg.norm(states[:, :2] - goals.numpy(), axis=1) < 0.3
+            delivered |= near & ~tipped
+        print(f"{row}: delivered {delivered.mean():.2f}, tipped {tipped.mean():.2f}")
+
+
 if __name__ == "__main__":
-    record(Path(sys.argv[1]))
+    command, *rest = sys.argv[1:]
+    if command == "play":
+        play(rest[0], *map(int, rest[1:]))
+    else:
+        record(Path(command), *map(int, rest))

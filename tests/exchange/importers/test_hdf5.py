@@ -42,23 +42,17 @@ def test_d4rl_needs_no_mapping(tmp_path: Path) -> None:
     assert dataset.info["fps"] == 20
 
 
-def test_without_next_observations_a_terminal_step_is_kept_and_others_lose_their_last_row(
-    tmp_path: Path,
-) -> None:
+def test_without_next_observations_episodes_lose_their_last_row(tmp_path: Path) -> None:
     fields = d4rl(tmp_path / "ant.hdf5", next_observations=False)
     dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
-    assert dataset.lengths.tolist() == [7, 4]
-    assert report.tally.last_rows == 1
-    assert report.tally.last_reward == fields["rewards"][11]
+    assert dataset.lengths.tolist() == [6, 4]
+    assert (report.tally.last_rows, report.tally.last_terminated) == (2, 1)
+    assert report.tally.last_reward == pytest.approx(fields["rewards"][[6, 11]].sum())
     state, got = fields["observations"], dataset.columns([NEXT_STATE, TERMINATED, TRUNCATED, REWARD])
-    np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], state[6], *state[8:]])
-    np.testing.assert_array_equal(got[TERMINATED], fields["terminals"][:11])
-    np.testing.assert_array_equal(got[TRUNCATED], np.arange(11) == 10)
-    np.testing.assert_array_equal(got[REWARD], fields["rewards"][:11])
-    assert (
-        "where an episode terminates, not recorded"
-        in dataset.info["features"][NEXT_STATE]["astra"]["meaning"]
-    )
+    np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], *state[8:]])
+    np.testing.assert_array_equal(got[TERMINATED], np.arange(10) == 5)
+    np.testing.assert_array_equal(got[TRUNCATED], np.arange(10) == 9)
+    np.testing.assert_array_equal(got[REWARD], np.delete(fields["rewards"], [6, 11]))
 
 
 def test_d4rl_needs_a_name_and_fps(tmp_path: Path) -> None:
@@ -121,7 +115,7 @@ def test_d3rlpy_needs_no_mapping(tmp_path: Path) -> None:
         file.create_dataset("num_episodes", data=len(episodes))
         file.create_dataset("version", data="2.1")
     dataset, report = imported(tmp_path, tmp_path / "hopper.h5", None, name="hopper", fps=20)
-    assert dataset.lengths.tolist() == [3, 3, *[1] * 9]
+    assert dataset.lengths.tolist() == [3, 2, *[1] * 9]
     assert report.tally.split_points == {"source": 10}
     for number, (found, episode) in enumerate(zip(dataset.episodes(), episodes, strict=True)):
         state, steps = episode["observations"], len(found)

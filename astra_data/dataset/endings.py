@@ -1,0 +1,62 @@
+"""How the episodes of a dataset end, and which of their next states were made up.
+
+Version 0.1 kept a terminated last row of a log whose next state was not recorded, and let its state stand for
+it, as `terminal = "stand_still"` still does: that is no step of the robot.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from astra_data.dataset.columns import NEXT_STATE, STATE, TERMINATED, Array
+from astra_data.dataset.reader import Dataset
+
+NEEDED = (STATE, NEXT_STATE, TERMINATED)
+"""Columns that show how an episode ends."""
+
+
+@dataclass
+class Endings:
+    """How many episodes end in which way.
+
+    Attributes:
+        terminated: those that end in success or failure. cut_off: the others.
+        made_up: those whose last next state is the state itself, to the bit, where they are terminated.
+    """
+
+    terminated: int = 0
+    cut_off: int = 0
+    made_up: int = 0
+
+    def add(self, columns: Mapping[str, Array]) -> None:
+        """Count an episode with these columns, of which `NEEDED` are looked at."""
+        ended = TERMINATED in columns and bool(columns[TERMINATED][-1])
+        self.terminated += ended
+        self.cut_off += not ended
+        if STATE in columns and NEXT_STATE in columns:
+            self.made_up += ended and stands_still(columns[STATE][-1], columns[NEXT_STATE][-1])
+
+    def __str__(self) -> str:
+        """Summarise them in a line."""
+        return f"{self.terminated} terminated, {self.cut_off} cut off" + (
+            f"; {self.made_up} next states were made up, where an episode is terminated: the state stands "
+            "for its own"
+            if self.made_up
+            else ""
+        )
+
+
+def endings_of(dataset: Dataset) -> Endings:
+    """Return how the episodes of `dataset` end, reading one at a time.
+
+    Raises:
+        CorruptDatasetError: a file cannot be read.
+    """
+    found = Endings()
+    for episode in dataset.episodes([name for name in NEEDED if name in dataset.features]):
+        found.add(episode.columns)
+    return found
+
+
+def stands_still(state: Array, next_state: Array) -> bool:
+    """Return whether a next state is the state, to the bit."""
+    return bool((state == next_state).all())

@@ -1,0 +1,59 @@
+"""The result of an import, and what of the recordings was dropped or made up."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from astra_data.dataset.endings import Endings
+from astra_data.exchange.cutting import Tally
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """Result of an import.
+
+    Attributes:
+        root: the dataset's folder.
+        episodes: number of episodes.
+        frames: number of steps.
+        tally: of the rows that were read and dropped.
+        wall_seconds: duration of the import.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    tally: Tally
+    wall_seconds: float
+
+    def __str__(self) -> str:
+        """Summarise it in a few lines."""
+        tally = self.tally
+        points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
+        first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
+        ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
+        return (
+            f"{self.root}: {self.episodes} episodes, {self.frames} frames "
+            f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
+            f"split points: {points}\n"
+            f"{ends}"
+            f"rejected rows: {tally.rejected_rows}{first}\n"
+            f"last rows without a next state: {_last_rows(tally)}; "
+            f"rows of episodes that were too short: {tally.short_rows}"
+        )
+
+
+def losses(tally: Tally) -> str:
+    """Say what was dropped, in a line."""
+    return (
+        f"rows {tally.rows}, rejected {tally.rejected_rows}, last ones without a next state "
+        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}"
+    )
+
+
+def _last_rows(tally: Tally) -> str:
+    parts = [
+        f"{tally.last_terminated} of them terminated" if tally.last_terminated else "",
+        f"with them a reward of {tally.last_reward:g} in sum" if tally.last_reward else "",
+    ]
+    lost = ", ".join(filter(None, parts))
+    return f"{tally.last_rows} dropped ({lost})" if lost else f"{tally.last_rows} dropped"

@@ -1,0 +1,114 @@
+"""How good corrections are, and how much data is enough: errors on held-out episodes, without a target."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from astra_data.core.durable import write_file
+from astra_data.core.naming import place
+from astra_data.methods import method_title
+from astra_data.reports.artefacts import Gap, read_json
+from astra_data.reports.assembly import mean_gap
+from astra_data.reports.formatting import fill
+from astra_data.reports.schema import BandMeans, GapMeans
+
+PAGE = "gap.md"
+JUDGED_AT = 10
+"""Steps ahead, if the episodes are as long: the horizon at which sizes are compared."""
+
+
+def write_held_out(
+    recipe: str,
+    root: Path,
+    groundings: Sequence[str],
+    seeds: Sequence[int],
+    percents: Sequence[int],
+    *,
+    timestep_s: float,
+) -> Path | None:
+    """Write the page of all finished groundings to `root`; return it, None where there is no grounding.
+
+    Args:
+        recipe: its name.
+        root: its folder of runs.
+        groundings: the methods that ground.
+        seeds: of the recipe.
+        percents: sizes of the dataset; empty for the whole alone.
+        timestep_s: of the task.
+
+    Raises:
+        BadInputError: a file of errors is malformed.
+    """
+    found: dict[str, dict[int | None, GapMeans]] = {}
+    for method in groundings:
+        for percent in sorted(percents) or (None,):
+            files = {
+                seed: root / "ground" / method / place(seed, percent) / "gap.json" for seed in sorted(seeds)
+            }
+            gaps = {seed: read_json(Gap, file) for seed, file in files.items() if file.is_file()}
+            if gaps:
+                found.setdefault(method, {})[percent] = mean_gap(gaps)
+    if not found:
+        return None
+    every = [gap for sizes in found.values() for gap in sizes.values()]
+    horizons = [h for h in every[0].horizons if all(h in gap.horizons for gap in every)]
+    page = fill(
+        "held_out.md.jinja",
+        recipe=recipe,
+        seeds=sorted({seed for gap in every for seed in gap.seeds}),
+        head=[*(["size"] if percents else []), "simulator"],
+        horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
+        tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
+        enough=[
+            enough(method_title(method), name, sizes, horizons)
+            for method, sizes in found.items()
+            for name in every[0].raw
+            if len(sizes) > 1
+        ],
+    )
+    write_file(root / PAGE, page)
+    return root / PAGE
+
+
+def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], horizons: Sequence[int]) -> str:
+    """Say from which size on more data makes no difference that the intervals show.
+
+    That is the smallest one whose error, and those of all larger ones, are at most the upper end of the
+    interval of the largest.
+    """
+    horizon = max(h for h in horizons if h <= JUDGED_AT)
+    errors = {size: _at(gap.grounded[quantity], gap, horizon) for size, gap in sizes.items()}
+    *smaller, largest = errors
+    limit, least = errors[largest][2], largest
+    for size in reversed(smaller):
+        if errors[size][0] > limit:
+            break
+        least = size
+    where = f"{title}, `{quantity}`, {horizon} steps ahead: "
+    if least == largest:
+        return f"{where}the error still falls up to {largest} %: more data may help."
+    return f"{where}from {least} % on, the error is within the interval of {largest} %."
+
+
+def _lines(
+    found: Mapping[str, Mapping[int | None, GapMeans]],
+    quantity: str,
+    horizons: Sequence[int],
+    *,
+    has_sizes: bool,
+) -> list[list[str]]:
+    lines = []
+    for size in next(iter(found.values())):
+        sized = {method_title(method): sizes[size] for method, sizes in found.items() if size in sizes}
+        first = next(iter(sized.values()))
+        bands = {"No grounding": (first.raw[quantity], first)}
+        bands |= {title: (gap.grounded[quantity], gap) for title, gap in sized.items()}
+        for title, (band, gap) in bands.items():
+            ends = [_at(band, gap, horizon) for horizon in horizons]
+            cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]" for mean, low, high in ends]
+            lines.append([*([f"{size} %"] if has_sizes else []), title, *cells])
+    return lines
+
+
+def _at(band: BandMeans, gap: GapMeans, horizon: int) -> tuple[float, float, float]:
+    index = gap.horizons.index(horizon)
+    return band.mean[index], band.low[index], band.high[index]

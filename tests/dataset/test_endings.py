@@ -1,0 +1,25 @@
+from pathlib import Path
+
+import numpy as np
+
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.columns import NEXT_STATE, STATE, TERMINATED, Column, Episode
+from astra_data.dataset.endings import Endings, endings_of
+
+
+def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Path) -> None:
+    moves = np.arange(8, dtype=np.float32).reshape(4, 2)
+    stops = np.concatenate([moves[1:], moves[-1:]])
+    nearly = stops + np.array([0, 1e-6], np.float32) * np.array([[0], [0], [0], [1]], np.float32)
+    over, on = np.array([False, False, False, True]), np.zeros(4, bool)
+    columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(TERMINATED, "bool")]
+    kinds = [(stops, over), (nearly, over), (stops, on), (stops, on)]
+    description = {"name": "ends", "stage": "import"}
+    with DatasetWriter(tmp_path / "d", columns, fps=10, task="end", description=description) as writer:
+        for uid, (after, ended) in enumerate(kinds):
+            writer.add(Episode(uid, {STATE: moves, NEXT_STATE: after, TERMINATED: ended}))
+
+    found = endings_of(Dataset.open(tmp_path / "d"))
+    assert found == Endings(terminated=2, cut_off=2, made_up=1)
+    assert str(found).startswith("2 terminated, 2 cut off; 1 next states were made up")
+    assert str(Endings(3, 1)) == "3 terminated, 1 cut off"

@@ -1,0 +1,124 @@
+"""From CSV logs alone, with a task that has no target, to a policy and a page."""
+
+import json
+import re
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.core.progress import silent
+from astra_data.dataset.columns import GOAL, REWARD
+from astra_data.dataset.reader import Dataset
+from astra_data.exchange.importing import import_dataset
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.held_out import write_errors
+from astra_data.experiments.plan import plan
+from astra_data.experiments.points import Selection
+from astra_data.experiments.trained_policy import load_policy
+from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
+
+CART = Path(__file__).parents[2] / "recipes/examples/cart"
+SMALL = """
+[ground]
+updates = 2
+batch_windows = 4
+window = 5
+latent_size = 4
+held_out_share = 0.25
+[train]
+num_envs = 4
+rollout_steps = 8
+total_steps = 64
+hidden_sizes = [8]
+memory_size = 4
+[align]
+updates = 2
+batch_windows = 4
+window = 5
+held_out_share = 0.25
+[evaluate]
+episodes = 3
+[report]
+bootstrap_replicates = 100
+"""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the cart's task, a dataset of 8 drives, imported from CSV, and no target."""
+    folder = tmp_path_factory.mktemp("cart")
+    runpy.run_path(str(CART / "robot.py"))["record"](folder / "csv", drives=8, seconds=6)
+    (folder / "cart.py").write_text((CART / "cart.py").read_text())
+    import_dataset(sorted((folder / "csv").glob("*.csv")), CART / "logs.toml", out=folder / "logs")
+    return folder
+
+
+def made(
+    folder: Path, name: str, text: str, wanted: Callable[[str], bool] = lambda stage: True
+) -> tuple[Path, list[str]]:
+    """Make the artefacts of a recipe in this process; return its folder and their keys."""
+    path = folder / f"{name}.toml"
+    path.write_text(f'task = "cart.py:TASK"\ndata = "logs"\nseeds = [0]\n{text}{SMALL}')
+    experiment = load_experiment(path, folder / "runs")
+    items = [item for item in plan(experiment.recipe, path, experiment.folder) if wanted(item.key)]
+    for item in items:
+        item.call(progress=silent)
+    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    return experiment.folder, [item.key for item in items]
+
+
+def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
+    folder, keys = made(logs, "cart", 'methods = ["direct_transfer", "nas", "astra"]\n')
+    assert keys[:2] == ["label/seed_0", "pair/seed_0"] and not any(key.startswith("collect") for key in keys)
+    labelled = Dataset.open(folder / "label/seed_0")
+    assert {GOAL, REWARD} <= labelled.features.keys() and len(labelled) == 8
+    for row in ("direct_transfer", "nas", "astra"):
+        evaluation = read_json(Evaluation, folder / "evaluate" / row / "seed_0" / EVALUATION)
+        assert evaluation.tested_in == "grounded" and evaluation.target is None
+        assert evaluation.outcomes == evaluation.grounded and evaluation.raw is not None
+    assert evaluation.grounded != evaluation.simulated
+    page = (folder / "report/results.md").read_text().splitlines()
+    assert page[2].startswith(
+        "**Nothing was tested on a robot: the task has no target.** Figures were measured"
+    )
+    assert "in which no row was trained but NAS" in page[2]
+    text = "\n".join(page[3:])
+    assert "over seeds, in the simulator grounded by NAS" in text and "n the target." not in text
+    assert not re.search(r"wall contact|maze|way to success", text) and "Predictive validity" not in text
+    results = json.loads((folder / "report/results.json").read_text())
+    assert results["tested_in"] == "simulators" and results["predictive_validity"] == {}
+    assert [dataset["stage"] for dataset in results["datasets"]] == ["label", "pair"]
+    policy = load_policy(folder, "astra")
+    policy.start(2)
+    action = policy.act(torch.zeros(2, 7), torch.ones(2, 2))
+    assert action.shape == (2, 2) and bool(np.isfinite(action.numpy()).all())
+
+
+def test_rows_without_a_common_simulator_say_where_they_were_tested(logs: Path) -> None:
+    folder, _ = made(logs, "alone", 'methods = ["direct_transfer"]\n')
+    evaluation = read_json(Evaluation, folder / "evaluate/direct_transfer/seed_0" / EVALUATION)
+    assert evaluation.tested_in == "raw" and evaluation.outcomes == evaluation.raw
+    page = (folder / "report/results.md").read_text()
+    assert "in the very simulator that it was trained in" in page.splitlines()[2]
+
+
+def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
+    until = ("label", "pair", "subset", "ground")
+    text = 'methods = ["nas"]\n[sweep]\npercent = [50, 100]\n'
+    folder, keys = made(logs, "sizes", text, lambda key: key.split("/")[0] in until)
+    assert "subset/percent_050/seed_0" in keys
+    assert len(Dataset.open(folder / "subset/percent_050/seed_0")) == 4
+    experiment = load_experiment(logs / "sizes.toml", logs / "runs")
+    page = write_errors(experiment, Selection.of(experiment.recipe))
+    assert page is not None
+    lines = page.read_text().splitlines()
+    gap = json.loads((folder / "ground/nas/percent_050/seed_0/gap.json").read_text())
+    of_yaw = lines[next(i for i, line in enumerate(lines) if "`yaw`" in line) :]
+    assert of_yaw[2].startswith("| 50 % | No grounding |") and of_yaw[5].startswith("| 100 % | NAS |")
+    assert f"{gap['raw']['yaw']['mean'][0]:.3g} [" in of_yaw[2]
+    assert f"{gap['grounded']['yaw']['mean'][0]:.3g} [" in of_yaw[3]
+    assert sum(line.startswith("- NAS, `") for line in lines) == 3

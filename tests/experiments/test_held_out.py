@@ -1,0 +1,31 @@
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import RecipeError
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.held_out import write_errors
+from astra_data.experiments.points import Selection
+
+CART = Path(__file__).parents[1] / "cart.py"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "r.toml"
+    path.write_text(f'task = "{CART}:LOGS_ALONE"\nseeds = [0]\n{text}')
+    return path
+
+
+def test_without_groundings_there_is_no_page(tmp_path: Path) -> None:
+    path = written(tmp_path, 'data = "logs"\nmethods = ["direct_transfer", "nas"]\n')
+    experiment = load_experiment(path, tmp_path / "runs")
+    assert write_errors(experiment, Selection.of(experiment.recipe)) is None
+
+
+def test_what_needs_a_target_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = written(tmp_path, 'methods = ["nas", "target", "full_obs"]\n')
+    with pytest.raises(RecipeError) as caught:
+        load_experiment(path, tmp_path / "runs")
+    needing = 'methods: target, methods: full_obs, [collect] (give `data = "…"` in its place)'
+    assert str(caught.value).endswith(f"has no target, which these need: {needing}")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,51 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.reports.held_out import write_held_out
+
+
+def write(root: Path, percent: int, seed: int, error: float) -> None:
+    folder = root / f"ground/nas/percent_{percent:03d}/seed_{seed}"
+    folder.mkdir(parents=True)
+    ends = {"mean": 1.0, "low": 0.9, "high": 1.1}
+    bands = {
+        name: {"x": {key: [scale * end * error * h for h in (1, 10)] for key, end in ends.items()}}
+        for name, scale in (("raw", 2), ("grounded", 1))
+    }
+    (folder / "gap.json").write_text(json.dumps({"horizons": [1, 10], **bands}))
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [
+        ((0.3, 0.109, 0.1), "from 50 % on, the error is within the interval of 100 %."),
+        ((0.3, 0.2, 0.1), "the error still falls up to 100 %: more data may help."),
+        # A small size that is good by chance is not enough while a larger one is worse.
+        ((0.1, 0.2, 0.1), "the error still falls up to 100 %: more data may help."),
+    ],
+)
+def test_enough_is_where_more_makes_no_difference(
+    tmp_path: Path, errors: tuple[float, ...], expected: str
+) -> None:
+    for percent, error in zip((25, 50, 100), errors, strict=True):
+        for seed, factor in ((0, 0.5), (1, 1.5)):
+            write(tmp_path, percent, seed, error * factor)
+    page = write_held_out("r", tmp_path, ("nas",), (0, 1, 2), (100, 25, 50), timestep_s=0.05)
+    assert page == tmp_path / "gap.md"
+    lines = page.read_text().splitlines()
+    assert f"- NAS, `x`, 10 steps ahead: {expected}" in lines
+    assert "| size | `x` | 1 step (0.05 s) | 10 steps (0.5 s) |" in lines
+    first = " | ".join(["| 25 %", "NAS", f"{errors[0]:.3g} [{0.9 * errors[0]:.3g}, {1.1 * errors[0]:.3g}]"])
+    assert any(line.startswith(first) for line in lines)
+    assert "averaged over seeds 0, 1." in page.read_text()
+
+
+def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Path) -> None:
+    assert write_held_out("r", tmp_path, ("nas",), (0,), (25,), timestep_s=0.1) is None
+    write(tmp_path, 25, 0, 0.1)
+    (tmp_path / "ground/nas/percent_025/seed_0/gap.json").write_text("{}")
+    with pytest.raises(BadInputError, match="is not what its stage writes"):
+        write_held_out("r", tmp_path, ("nas",), (0,), (25,), timestep_s=0.1)
