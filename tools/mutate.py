@@ -86,11 +86,15 @@ def draw_mutants(path: Path, count: int, draw: random.Random) -> list[Mutant]:
 
 
 def tests_of(path: Path) -> list[str]:
-    """Return the test files that import the module at `path`, the mirrored one first."""
+    """Return the mirrored test file, that of the room, and those that import the module at `path`."""
     module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
     package, _, name = module.rpartition(".")
-    mirrored = Path("tests", *path.parts[1:-1], f"test_{path.name}")
-    found = [mirrored] if (ROOT / mirrored).exists() else []
+    folder = Path("tests", *path.parts[1:-1])
+    found = [
+        test
+        for test in (folder / f"test_{path.name}", folder / f"test_{folder.name}.py")
+        if (ROOT / test).exists()
+    ]
     for test in sorted(ROOT.glob("tests/**/test_*.py")):
         names = {
             f"{node.module}.{alias.name}"
