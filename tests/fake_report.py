@@ -23,7 +23,14 @@ CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
 
 
 def task(**changes: object) -> SimpleNamespace:
-    usual = {"photograph": None, "maze": U_MAZE, "plane": object(), "ball_index": None, "facts": {}}
+    usual = {
+        "name": "antmaze-u",
+        "photograph": None,
+        "maze": U_MAZE,
+        "plane": object(),
+        "ball_index": None,
+        "facts": {},
+    }
     return SimpleNamespace(**usual | {"objective": SimpleNamespace(scores=(SUCCESS,))} | changes)
 
 

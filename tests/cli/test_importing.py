@@ -41,5 +41,5 @@ def test_a_known_layout_needs_no_mapping_but_a_name_and_a_rate(tmp_path: Path) -
     assert isinstance(result.exception, BadInputError)
     assert "pass --name and --fps, or --mapping FILE.toml" in str(result.exception)
     result = CliRunner().invoke(cli.app, [*arguments, "--name", "set", "--fps", "20"])
-    assert result.output.startswith(f"finished: {tmp_path / 'out'}: 1 episodes, 6 frames from 6 rows in ")
+    assert result.output.startswith(f"finished: {tmp_path / 'out'}: 1 episodes, 5 frames from 6 rows in ")
     assert Dataset.open(tmp_path / "out").task == "set"

@@ -39,7 +39,7 @@ from astra_data.worlds.score import RETURN, SURVIVED_STEPS
 def tasks() -> Iterator[None]:
     """Give the report a task of its own, and no target to replay commands in."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "TASKS", {"antmaze-u": task()})
+        patch.setattr(stage, "task_named", {"antmaze-u": task()}.__getitem__)
         patch.setattr(stage, "replay_commands", lambda _: REPLAY)
         yield
 
@@ -207,7 +207,7 @@ def test_rows_that_were_tested_in_no_simulator_have_no_predictive_validity(root:
 
 
 def test_the_page_says_that_a_robot_is_a_stand_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(facts={"stand_in": "mujoco"})})
+    monkeypatch.setattr(stage, "task_named", {"antmaze-u": task(facts={"stand_in": "mujoco"})}.__getitem__)
     make(root)
     text = "**A simulated stand-in (`mujoco`) takes the physical robot's place"
     assert text in (root / "report/results.md").read_text()
@@ -245,7 +245,7 @@ def test_page_holds_the_table_and_only_figures_that_exist(folder: Path) -> None:
 def test_without_a_maze_or_with_a_ball_some_figures_make_no_sense(
     root: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], missing: set[str]
 ) -> None:
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": task(**changes)})
+    monkeypatch.setattr(stage, "task_named", {"antmaze-u": task(**changes)}.__getitem__)
     make(root)
     assert images(root / "report") == FIGURES - missing
 
@@ -254,7 +254,7 @@ def test_of_lasting_tasks_the_page_tells_survived_steps_and_return(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lasting = task(plane=None, objective=SimpleNamespace(scores=(SURVIVED_STEPS, RETURN)))
-    monkeypatch.setattr(stage, "TASKS", {"antmaze-u": lasting})
+    monkeypatch.setattr(stage, "task_named", {"antmaze-u": lasting}.__getitem__)
     points = [
         {"steps": steps, "success": None, "episode_steps": lasted}
         for steps, lasted in ((1000, 30.0), (2000, None), (3000, 90.0))

@@ -227,7 +227,7 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    monkeypatch.setattr("astra_data.exchange.recording.SMALL_BYTES", 10**5)
     path = tmp_path / "log.h5"
     with h5py.File(path, "w") as file:
         for field in rows():
@@ -237,7 +237,7 @@ def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
 
 
 def test_a_chunk_far_larger_than_its_rows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    monkeypatch.setattr("astra_data.exchange.recording.SMALL_BYTES", 10**5)
     path = write_table(tmp_path / "log.h5", rows())
     with h5py.File(path, "a") as file:
         values = file["x"][:]

@@ -73,7 +73,7 @@ fields = ["command"]
 def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.exchange.importing.SMALL_BYTES", 10**5)
+    monkeypatch.setattr("astra_data.exchange.recording.SMALL_BYTES", 10**5)
     path = bomb(tmp_path / "log.npz", 10**5)
     with pytest.raises(BadInputError, match=r"holds values of 2400384 bytes or more, .* --max-bytes"):
         imported(tmp_path, path, BOMB_MAPPING)
