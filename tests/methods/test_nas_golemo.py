@@ -70,9 +70,13 @@ def test_the_bar_shows_the_figure_of_the_last_epoch(tmp_path: Path) -> None:
     torch.manual_seed(0)
     both, notes = episodes(25, torch.randn(25, STEPS, 4), torch.randn(25, STEPS, 2)), list[str]()
     config = GolemoConfig(epochs=4, hidden_size=4, layers=1, learning_rate=0.05)
-    given = replace(fitting(both, tmp_path, config), progress=lambda _, note="": notes.append(note))
+
+    def note(_: float, text: str = "") -> None:
+        notes.append(text)
+
+    given = replace(fitting(both, tmp_path, config), progress=note)
     _, metrics = fit_residual(given)
-    shown = [note.rpartition("correction ")[2] for note in notes if "correction" in note]
+    shown = [text.rpartition("correction ")[2] for text in notes if "correction" in text]
     found = [f"{point['r2_state']:.3f}" for point in metrics["epochs"]]
     assert len(set(found)) > 2 and [*dict.fromkeys(shown)] == [*dict.fromkeys(found[:-1])]
 
