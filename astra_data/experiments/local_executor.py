@@ -147,6 +147,7 @@ class _Worker:
 
 
 def _serve(connection: Connection) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a forked process would have the parent's handler
     Thread(target=_exit_with_parent, daemon=True).start()
     while True:
         key, work, log = connection.recv()
