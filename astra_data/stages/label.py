@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from astra_data.core.durable import make_folder
 from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
@@ -66,7 +67,7 @@ def label(
         if column.name not in source.features
     ]
     if not more and out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         out.symlink_to(source.root.resolve())
         return out
     if not more:
