@@ -1,5 +1,6 @@
 """The commands that are tried, each on data so small that it does tens to hundreds of operations on files."""
 
+import json
 import shutil
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from mcap.writer import Writer
 
 from astra_data.dataset import DatasetWriter
 from astra_data.dataset.columns import (
@@ -70,6 +72,17 @@ fields = ["command"]
 [split]
 field = "trial"
 """
+MCAP_MAPPING = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["/pose:x", "/pose:y"]
+[columns.action]
+fields = ["/pose:command"]
+[split]
+gap_s = 0.35
+"""
 STAGES = ("collect", "pair", "ground", "train", "align", "evaluate", "report")
 
 
@@ -123,14 +136,18 @@ COMMANDS = {
     "delete": Command("delete GIVEN/walks --episode 7 --out out"),
     "filter": Command("filter GIVEN/walks --min-length 6 --out out"),
     "repair": Command("repair GIVEN/broken --out out"),
+    "repair --like": Command("repair GIVEN/stripped --like GIVEN/walks --out out"),
     "import csv": Command("import GIVEN/log.csv --mapping GIVEN/mapping.toml --out out"),
     "import npz": Command("import GIVEN/log.npz --mapping GIVEN/mapping.toml --out out"),
+    "import json": Command("import GIVEN/log.json --mapping GIVEN/mapping.toml --out out"),
+    "import mcap": Command("import GIVEN/log.mcap --mapping GIVEN/mcap_mapping.toml --out out"),
     "import hdf5": Command("import GIVEN/log.h5 --mapping GIVEN/mapping.toml --out out"),
     "import d4rl": Command("import GIVEN/walks.hdf5 --name back --fps 20 --out out"),
     "export d4rl": Command("export GIVEN/walks --format d4rl --out out.h5", looks.hdf5, "out.h5"),
     "export robomimic": Command("export GIVEN/walks --format robomimic --out out.h5", looks.hdf5, "out.h5"),
     "export d3rlpy": Command("export GIVEN/walks --format d3rlpy --out out.h5", looks.hdf5, "out.h5"),
     "pull": Command("pull GIVEN/shared/walks --out out", adds=True),
+    "import minari": _on_collected("import GIVEN/minari-v0 --name back --out out"),
     "export minari": _on_collected("export GIVEN/walks --format minari --out out-v0", looks.files, "out-v0"),
     "card": _on_collected("card GIVEN/walks --out out.md", looks.card, "out.md", adds=True),
     "push": _on_collected("push GIVEN/walks ./shared", looks.remote, "shared/walks", adds=True),
@@ -148,7 +165,10 @@ def write_inputs(given: Path) -> None:
     _write_walks(given / "others", "others", (7, 5))
     shutil.copytree(given / "walks", given / "broken")
     (given / "broken/meta/stats.json").unlink()
+    shutil.copytree(given / "walks", given / "stripped")
+    shutil.rmtree(given / "stripped/meta/astra")
     (given / "mapping.toml").write_text(MAPPING)
+    (given / "mcap_mapping.toml").write_text(MCAP_MAPPING)
     (given / "tiny.toml").write_text(RECIPE)
     _write_logs(given)
 
@@ -156,6 +176,8 @@ def write_inputs(given: Path) -> None:
 def make_inputs(given: Path, run: Callable[[str], object], names: Collection[str]) -> None:
     """Make of them what the commands with these `names` read; `run` runs a command line."""
     run(f"export {given}/walks --format d4rl --out {given}/walks.hdf5")
+    if "import minari" in names:
+        run(f"export {given}/walks --format minari --out {given}/minari-v0")
     if "pull" in names:
         run(f"push {given}/walks {given}/shared")
     if {"pair", "augment"} & set(names):
@@ -200,6 +222,16 @@ def _write_logs(given: Path) -> None:
     log = {name: rng.normal(size=12) for name in ("x", "y", "command")} | {"trial": np.repeat([0, 1, 2], 4)}
     rows = [",".join(log), *(",".join(map(str, row)) for row in zip(*log.values(), strict=True))]
     (given / "log.csv").write_text("\n".join(rows) + "\n")
+    (given / "log.json").write_text(json.dumps({name: values.tolist() for name, values in log.items()}))
+    with (given / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/pose", "json", schema_id=0)
+        for row in range(12):
+            time_ns = (row + row // 6 * 10) * 10**8  # two episodes, a second apart
+            message = {name: float(values[row]) for name, values in log.items()}
+            writer.add_message(channel, time_ns, json.dumps(message).encode(), time_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
     with (given / "log.npz").open("wb") as file:
         np.savez(file, **log)
     with h5py.File(given / "log.h5", "w") as table:

@@ -1,14 +1,16 @@
 """D4RL: one HDF5 file with all transitions one after another."""
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset.columns import REWARD, TERMINATED, TRUNCATED
+from astra_data.dataset.columns import REWARD, TERMINATED, TRUNCATED, Array, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
 from astra_data.exchange.hdf5_file import hdf5_file
 from astra_data.exchange.layouts import D4RL, RECORD, extra_fields
+from astra_data.exchange.recording import BLOCK_ROWS
 
 
 def write(dataset: Dataset, path: Path, out: Path) -> None:
@@ -30,12 +32,29 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         if REWARD not in fields:
             file[D4RL[REWARD]] = np.zeros(rows, np.float32)
         first = 0
-        for episode in disk.until_it_fails(exported.episodes()):
-            part = slice(first, first + len(episode))
-            for name, values in episode.columns.items():
-                file[fields[name]][part] = values
-            is_last = np.arange(len(episode)) == len(episode) - 1
-            timeouts = (episode.columns[TRUNCATED] | is_last) & ~episode.columns[TERMINATED]
-            file[D4RL[TRUNCATED]][part] = timeouts
-            first += len(episode)
+        for block in disk.until_it_fails(_blocks(exported.episodes())):
+            part = slice(first, first + sum(map(len, block)))
+            for name in block[0].columns:
+                file[fields[name]][part] = np.concatenate([episode.columns[name] for episode in block])
+            file[D4RL[TRUNCATED]][part] = np.concatenate([_timeouts(episode) for episode in block])
+            first = part.stop
         file[RECORD] = exported.text()
+
+
+def _blocks(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
+    """Yield successive episodes in lists of about `BLOCK_ROWS` rows: each write to HDF5 has its price."""
+    block: list[Episode] = []
+    rows = 0
+    for episode in episodes:
+        block.append(episode)
+        rows += len(episode)
+        if rows >= BLOCK_ROWS:
+            yield block
+            block, rows = [], 0
+    if block:
+        yield block
+
+
+def _timeouts(episode: Episode) -> Array:
+    is_last = np.arange(len(episode)) == len(episode) - 1
+    return (episode.columns[TRUNCATED] | is_last) & ~episode.columns[TERMINATED]
