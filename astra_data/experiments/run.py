@@ -13,7 +13,7 @@ from rich.console import Console
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.cores import cores
-from astra_data.core.durable import make_folder, move, write_file
+from astra_data.core.durable import clean, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
@@ -183,6 +183,7 @@ def make(
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
+        clean(folder)
         again = to_make_again(items, experiment)
         for key, reason in again.items():
             if not can_be_made_again(key, experiment):

@@ -49,6 +49,17 @@ def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.Captur
     assert (folder / "train/astra/seed_0/attempts").read_text() == "."
 
 
+def test_what_a_killed_run_left_is_removed_by_the_next(recipe: Path, tmp_path: Path) -> None:
+    folder = run(recipe, root=tmp_path, jobs=1)
+    left = folder / "collect/.seed_0.tmp-999999999"
+    (left / "episodes").mkdir(parents=True)
+    staged = folder / "collect/.seed_1.staged"
+    staged.mkdir()
+    run(recipe, root=tmp_path, jobs=1)
+    assert not left.exists()
+    assert staged.exists()
+
+
 @pytest.mark.parametrize(("jobs", "each_of_two"), [(None, 1), (1, 3)])
 def test_items_side_by_side_share_the_cores(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int | None, each_of_two: int
