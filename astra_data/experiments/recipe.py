@@ -184,7 +184,7 @@ class Recipe(Config):
         faults = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].planar]
         asked = {
             "augment": self.augment is not None,
-            'collect.start = "anywhere" (the default; "task" does not)': self.collect
+            'collect.start = "anywhere" (the default: write start = "task")': self.collect
             and self.collect.start == "anywhere",
             "collect.clearance_m": self.collect and self.collect.clearance_m > 0,
             "train.support_penalty": self.train.support_penalty > 0,

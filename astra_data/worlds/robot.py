@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.seeding import derive
+from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import Column
 from astra_data.worlds.batched import Step
 from astra_data.worlds.commands import Commands
@@ -96,11 +96,11 @@ class RobotEnv:
         """Restart the robots in `mask` (B,), by default all; return observations (B, O)."""
         rows = range(self.num_envs) if mask is None else mask.nonzero().squeeze(1).tolist()
         for row in rows:
-            seed = derive(self._seed, f"episode {self._episodes}")
+            episode = f"episode {self._episodes}"
             self._episodes += 1
-            options = {"seed": seed} if self._takes_seed else {}
+            options = {"seed": derive(self._seed, episode)} if self._takes_seed else {}
             self._state[row] = self._checked(self._robots[row].reset(**options), "reset")
-            goal = self._objective.draw_goals(np.random.default_rng(seed), 1)
+            goal = self._objective.draw_goals(generator(self._seed, f"goal of {episode}"), 1)
             self.goal[row] = torch.from_numpy(goal[0]).float()
             self.failed[row] = False
         return self._observe()

@@ -62,6 +62,19 @@ def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
     assert -1 not in Noted.seeds
 
 
+def test_goals_are_not_drawn_as_the_robot_draws_its_start() -> None:
+    """A robot that draws its start as goals are drawn would stand on its goal, were both of one seed."""
+
+    class Drawn(Cart):
+        def reset(self, seed: int = 0) -> list[float]:
+            super().reset()
+            return [float(TASK.objective.draw_goals(np.random.default_rng(seed), 1)[0, 0]), 0.0]
+
+    env = replace(TASK, robot=Drawn).target(4, seed=0)
+    env.reset()
+    assert not (env.state[:, 0] == env.goal[:, 0]).any()
+
+
 @pytest.mark.parametrize("state", [[0.0], [0.0, float("nan")], [0.0, 0.0, 0.0], None])
 def test_a_state_of_another_kind_is_refused(state: Any) -> None:  # noqa: ANN401
     class Broken(Cart):
