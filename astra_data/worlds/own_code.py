@@ -53,6 +53,8 @@ def _of_file(path: Path) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
+    if (folder := str(path.resolve().parent)) not in sys.path:
+        sys.path.append(folder)  # so that a file may import those beside it, as a script may
     try:
         with explained(f"importing {path}"):
             spec.loader.exec_module(module)

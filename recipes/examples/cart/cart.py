@@ -6,65 +6,65 @@ import torch
 from astra_data import Column, Objective, Task
 
 TIMESTEP_S = 0.1
+DOCK_M = (3.0, 0.0)
+POSE = {"names": ("x", "y", "heading_x", "heading_y"), "astra": {"unit": ["m", "m", "1", "1"]}}
 
 
 class Unicycle:
-    """Carts [x, y, yaw] that do at once what they are told, and carry nothing."""
+    """Carts [x, y, heading] that do at once what they are told, and carry nothing."""
 
-    abstract_state = Column(
-        "abstract.state", size=3, names=("x", "y", "yaw"), astra={"unit": ["m", "m", "rad"]}
-    )
+    abstract_state = Column("abstract.state", size=4, **POSE)
     parameters = {"timestep_s": TIMESTEP_S}
 
     def __init__(self, num_envs):
-        self.state = torch.zeros(num_envs, 3)
+        self.state = torch.tensor([0.0, 0.0, 1.0, 0.0]).repeat(num_envs, 1)
 
     @staticmethod
-    def abstraction(state):  # φ: of [x, y, yaw, v, w, tilt, tilt rate] keep the pose
-        return state[..., :3]
+    def abstraction(state):  # φ: of [pose, v, w, tilt, tilt rate] keep the pose
+        return state[..., :4]
 
     def reset_to(self, state, rows=None):
         self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
 
     def step(self, command):
-        (x, y, yaw), (v, w) = self.state.unbind(-1), command.unbind(-1)
-        way = v * TIMESTEP_S
-        self.state = torch.stack([x + way * yaw.cos(), y + way * yaw.sin(), yaw + w * TIMESTEP_S], dim=-1)
+        (x, y, heading_x, heading_y), (v, w) = self.state.unbind(-1), command.unbind(-1)
+        yaw, way = torch.atan2(heading_y, heading_x), v * TIMESTEP_S
+        turned = yaw + w * TIMESTEP_S
+        self.state = torch.stack([x + way * yaw.cos(), y + way * yaw.sin(), turned.cos(), turned.sin()], -1)
         return self.state
 
 
 class Deliver(Objective):
-    """Drive to the goal, 3 m away, without losing the payload."""
+    """Drive to the dock, 3 m away, without losing the payload."""
 
-    action_size, goal_size = 2, 2
+    action_size = 2
 
     def draw_starts(self, rng, count):
-        return np.column_stack([np.zeros((count, 2)), rng.uniform(-np.pi, np.pi, count)])
+        yaw = rng.uniform(-np.pi, np.pi, count)
+        return np.column_stack([np.zeros((count, 2)), np.cos(yaw), np.sin(yaw)])
 
-    def draw_goals(self, rng, count):
-        angle = rng.uniform(-np.pi, np.pi, count)
-        return 3.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    def observe(self, state, goal):  # the dock as the cart sees it
+        x, y, heading_x, heading_y = state.unbind(-1)
+        east, north = DOCK_M[0] - x, DOCK_M[1] - y
+        ahead, left = heading_x * east + heading_y * north, heading_x * north - heading_y * east
+        return torch.stack([ahead, left], dim=-1) / 3.0
 
-    def observe(self, state, goal):  # the goal as the cart sees it
-        x, y, yaw = state.unbind(-1)
-        ahead, left = goal[..., 0] - x, goal[..., 1] - y
-        cos, sin = yaw.cos(), yaw.sin()
-        return torch.stack([cos * ahead + sin * left, cos * left - sin * ahead], dim=-1) / 3.0
+    def far(self, state):
+        return (state[:, :2] - torch.tensor(DOCK_M)).norm(dim=-1)
 
     def reached(self, state, goal):
-        return (state[:, :2] - goal).norm(dim=-1) < 0.3
+        return self.far(state) < 0.3
 
     def reward(self, before, after, goal, failed):
-        closer = (before[:, :2] - goal).norm(dim=-1) - (after[:, :2] - goal).norm(dim=-1)
         ends = self.success_reward * (self.reached(after, goal) & ~failed) + self.failure_reward * failed
-        return closer + ends
+        return self.far(before) - self.far(after) + ends
 
 
 TASK = Task(
     name="cart",
     timestep_s=TIMESTEP_S,
-    state=Column("observation.state", size=7, names=("x", "y", "yaw", "v", "w", "tilt", "tilt_rate")),
+    state=Column("observation.state", size=8, names=(*POSE["names"], "v", "w", "tilt", "tilt_rate")),
     commands={"v": (-0.2, 1.0), "w": (-1.5, 1.5)},
     make_simulator=Unicycle,
-    objective=Deliver(horizon=150),
+    objective=Deliver(horizon=150, failure_reward=-3.0),
 )

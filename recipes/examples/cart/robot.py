@@ -1,15 +1,17 @@
-"""The robot itself, which the toolkit does not see: a simulated cart stands in for it.
+"""The robot itself: a simulated cart stands in for it.
 
 python robot.py logs [drives]       records drives by random commands as CSV, in millimetres and degrees
-python robot.py play RUN [trials]   sends the cart to its goals by the policies of a run, and counts
+python robot.py play RUN [trials]   sends the cart to its dock by the policies of a run, and counts
 """
 
 import csv
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from cart import DOCK_M, TASK
 
 from astra_data import load_policy
 
@@ -17,38 +19,42 @@ TIPPED_RAD = 0.6
 
 
 class TrueCart:
-    """A differential drive that lags by 0.2 s and slips, with a payload on a spring that tips."""
+    """A differential drive that lags by 0.2 s and slips, with a payload on a spring that tips in fast curves."""
 
     def __init__(self):
         self.rng = np.random.default_rng()
 
     def reset(self, seed=None):
         self.rng = np.random.default_rng(seed)
-        self.pose = np.array([0.0, 0.0, self.rng.uniform(-np.pi, np.pi)])
+        self.x, self.y, self.yaw = 0.0, 0.0, self.rng.uniform(-np.pi, np.pi)
         self.wheels, self.tilt = np.zeros(2), np.zeros(2)
         return self.state()
 
     def state(self):
-        return np.concatenate([self.pose, self.wheels, self.tilt])
+        return [self.x, self.y, np.cos(self.yaw), np.sin(self.yaw), *self.wheels, *self.tilt]
 
     def step(self, command):
         for _ in range(10):
             pull = (np.asarray(command) - self.wheels) / 0.2
             self.wheels = self.wheels + 0.01 * pull
             v, w = self.wheels * [0.95, 0.9 - 0.15 * abs(self.wheels[0])]
-            self.pose = self.pose + 0.01 * np.array([v * np.cos(self.pose[2]), v * np.sin(self.pose[2]), w])
-            sway = 3.5 * pull[0] + 5.0 * v * w - 16.0 * self.tilt[0] - 1.2 * self.tilt[1]
+            self.x += 0.01 * v * np.cos(self.yaw)
+            self.y += 0.01 * v * np.sin(self.yaw)
+            self.yaw += 0.01 * w
+            sway = 3.0 * pull[0] + 40.0 * v * w - 36.0 * self.tilt[0] - 8.0 * self.tilt[1]
             self.tilt = self.tilt + 0.01 * np.array([self.tilt[1], sway])
         self.tilt[1] += self.rng.normal(0.0, 0.01)
         return self.state(), bool(abs(self.tilt[0]) > TIPPED_RAD)
 
 
-FIELDS = ["t_ms", "x_mm", "y_mm", "yaw_deg", "v_mm_s", "w_deg_s", "tilt_deg", "tilt_rate_deg_s"]
-UNITS = [1e-3, 1e-3, np.pi / 180, 1e-3, np.pi / 180, np.pi / 180, np.pi / 180]
+TASK = replace(TASK, robot=TrueCart)  # the same task, with a target to collect and to test in
+
+FIELDS = ["x_mm", "y_mm", "heading_x", "heading_y", "v_mm_s", "w_deg_s", "tilt_deg", "tilt_rate_deg_s"]
+UNITS = [1e-3, 1e-3, 1.0, 1.0, 1e-3, np.pi / 180, np.pi / 180, np.pi / 180]
 
 
 def record(folder, drives=60, seconds=15, seed=0):
-    """Drive by random commands, each held for 0.3 to 2 s, until the payload tips."""
+    """Drive by random commands, each held for 0.1 to 2 s, until the payload tips."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
     for drive in range(drives):
@@ -56,13 +62,13 @@ def record(folder, drives=60, seconds=15, seed=0):
         state, tipped, left = cart.reset(int(rng.integers(2**32))), False, 0
         with open(folder / f"drive_{drive:02d}.csv", "w", newline="") as file:
             log = csv.writer(file)
-            log.writerow([*FIELDS, "cmd_v_mm_s", "cmd_w_deg_s", "tipped"])
+            log.writerow(["t_ms", *FIELDS, "cmd_v_mm_s", "cmd_w_deg_s", "tipped"])
             for step in range(10 * seconds):
                 if left == 0:
-                    command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]), rng.integers(3, 20)
+                    command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]), rng.integers(1, 21)
                 left -= 1
-                row = [*(state / UNITS), command[0] / 1e-3, np.degrees(command[1])]
-                log.writerow([100 * step, *(f"{value:.3f}" for value in row), int(tipped)])
+                row = [*np.divide(state, UNITS), command[0] / 1e-3, np.degrees(command[1])]
+                log.writerow([100 * step, *(f"{value:.4f}" for value in row), int(tipped)])
                 if tipped:
                     break
                 state, tipped = cart.step(command)
@@ -71,20 +77,17 @@ def record(folder, drives=60, seconds=15, seed=0):
 def play(run, trials=100, seed=0):
     """Print which share of its trials each policy of a run delivers, and tips."""
     for row in sorted(folder.name for folder in (Path(run) / "train").iterdir()):
-        policy = load_policy(run, row)
-        task, rng = policy.task, np.random.default_rng(seed)
-        goals = torch.tensor(task.objective.draw_goals(rng, trials), dtype=torch.float32)
+        policy, rng = load_policy(run, row), np.random.default_rng(seed)
         carts = [TrueCart() for _ in range(trials)]
         states = np.array([cart.reset(int(rng.integers(2**32))) for cart in carts])
         delivered, tipped = np.zeros(trials, bool), np.zeros(trials, bool)
         policy.start(trials)
-        for _ in range(task.objective.horizon):
-            action = policy.act(torch.tensor(states, dtype=torch.float32), goals)
-            commands = task.limits.in_units(action).numpy()
+        for _ in range(policy.task.objective.horizon):
+            action = policy.act(torch.tensor(states, dtype=torch.float32), torch.empty(trials, 0))
+            commands = policy.task.limits.in_units(action).numpy()
             for number in np.flatnonzero(~delivered & ~tipped):
                 states[number], tipped[number] = carts[number].step(commands[number])
-            near = np.linalg.norm(states[:, :2] - goals.numpy(), axis=1) < 0.3
-            delivered |= near & ~tipped
+            delivered |= (np.linalg.norm(states[:, :2] - DOCK_M, axis=1) < 0.3) & ~tipped
         print(f"{row}: delivered {delivered.mean():.2f}, tipped {tipped.mean():.2f}")
 
 
