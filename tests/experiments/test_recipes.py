@@ -85,7 +85,9 @@ def test_what_needs_a_maze_is_refused_where_there_is_none(
     path.write_text(HUMANOID.format(""))
     assert load_experiment(path, tmp_path).recipe.task == "humanoid-walker2d"
     path.write_text(HUMANOID.format("").replace('"task"', '"anywhere"'))
-    with pytest.raises(RecipeError, match=r'collect.start = "anywhere" \(the default: write start = "task"\)'):
+    with pytest.raises(
+        RecipeError, match=r'collect.start = "anywhere" \(the default: write start = "task"\)'
+    ):
         load_experiment(path, tmp_path)
     path.write_text(HUMANOID.format(more) + end)
     with pytest.raises(RecipeError, match=f"humanoid-walker2d has no maze, which these need: {asked};"):

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from astra_data.core.disk import writing
+from astra_data.core.durable import hidden_folder, move, sync
 from astra_data.core.errors import AstraDataError, BadInputError, SharingError
 from astra_data.core.optional import cure
 from astra_data.core.progress import Progress
@@ -31,10 +32,10 @@ class UrlStore:
 
         self._url = url
         protocol = url.partition("://")[0].lower()
-        options = {"auto_mkdir": True} if protocol in ("file", "local") else {}
+        self._is_local = protocol in ("file", "local")
         with _explained(url):
             try:
-                self._filesystem, self._path = fsspec.core.url_to_fs(url, **options)
+                self._filesystem, self._path = fsspec.core.url_to_fs(url)
             except ImportError as error:
                 extra = EXTRAS.get(protocol)
                 how = cure(extra) if extra else error
@@ -78,14 +79,30 @@ class UrlStore:
         files[layout.DATASET_PATH] = files.pop(layout.DATASET_PATH)
         with _explained(self._url):
             self._filesystem.invalidate_cache()
-            if not self._filesystem.find(remote.path):
-                self._filesystem.put_file(str(sums), f"{remote.path}/{SUMS_PATH}")
+            if not self._is_begun(remote):
+                self._put(sums, f"{remote.path}/{SUMS_PATH}")
             for number, (path, file) in enumerate(files.items()):
                 # Checked before every file: a push of other values may have begun at the same time.
                 self._refuse_others(remote, sums.read_bytes())
                 progress(number / len(files), path)
-                self._filesystem.put_file(str(file), f"{remote.path}/{path}")
+                self._put(file, f"{remote.path}/{path}")
         progress(1.0, f"{len(files)} files")
+
+    def _is_begun(self, remote: RemoteFolder) -> bool:
+        """Return whether there are files, but for hidden ones, which a killed push may leave in a folder."""
+        found = (str(path).removeprefix(remote.path) for path in self._filesystem.find(remote.path))
+        return any("/." not in path for path in found)
+
+    def _put(self, file: Path, path: str) -> None:
+        """Upload `file`; in a folder of this machine it is there whole, or not at all."""
+        if not self._is_local:
+            self._filesystem.put_file(str(file), path)
+            return
+        with hidden_folder(Path(path)) as folder:
+            part = folder / file.name
+            self._filesystem.put_file(str(file), str(part))
+            sync(part)
+            move(part, Path(path))
 
     def _refuse_others(self, remote: RemoteFolder, sums: bytes) -> None:
         try:

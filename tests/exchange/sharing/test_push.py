@@ -92,7 +92,7 @@ def test_a_full_disk_is_told_with_the_folder_there(
 
     with monkeypatch.context() as patched:
         patched.setattr(LocalFileSystem, "put_file", full)
-        with pytest.raises(DiskError, match=r"shared/fake cannot be written: the disk is full"):
+        with pytest.raises(DiskError, match=r"shared/fake/\S+ cannot be written: the disk is full"):
             push(fake.root, f"file://{tmp_path}/shared")
     push(fake.root, f"file://{tmp_path}/shared")
     assert contents(tmp_path / "shared/fake/data-1.0.0").keys() > contents(fake.root).keys()

@@ -178,7 +178,12 @@ def test_a_second_push_at_once_takes_nothing_from_the_first(
 def test_two_pushes_of_the_same_at_once_both_succeed(
     fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at_the_third_file(monkeypatch, lambda: push(fake.root, f"file://{tmp_path}/shared"))
+    def second() -> None:
+        with monkeypatch.context() as other_process:
+            other_process.setattr("os.getpid", lambda: 1)
+            push(fake.root, f"file://{tmp_path}/shared")
+
+    at_the_third_file(monkeypatch, second)
     push(fake.root, f"file://{tmp_path}/shared")
     assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
 
@@ -209,7 +214,7 @@ def test_the_mark_is_uploaded_last(fake: Dataset, tmp_path: Path, monkeypatch: p
     store.upload(fake, tmp_path / "card", lambda fraction, note: None)
     assert len(sent) == len(contents(fake.root)) + 2
     assert sent[0].endswith("SHA256SUMS")
-    assert sent[-1].endswith("meta/astra/dataset.json")
+    assert sent[-1].endswith("dataset.json")
 
 
 def test_a_bucket_that_does_not_exist_is_told_and_not_made(s3: str, fake: Dataset) -> None:
@@ -264,3 +269,12 @@ def test_a_folder_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) 
     (tmp_path / "file").touch()
     with pytest.raises(SharingError, match="fake: "):
         push(fake.root, f"file://{tmp_path}/file")
+
+
+def test_what_a_killed_push_left_does_not_stop_the_next(fake: Dataset, tmp_path: Path) -> None:
+    left = tmp_path / "shared/fake/data-1.0.0/.SHA256SUMS.tmp-999999999"
+    left.mkdir(parents=True)
+    (left / "SHA256SUMS").write_text("hal")
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
+    assert not left.exists()
