@@ -19,7 +19,7 @@ TIPPED_RAD = 0.6
 
 
 class TrueCart:
-    """A differential drive that lags by 0.2 s and slips, with a payload on a spring that tips in fast curves."""
+    """A differential drive that lags by 0.2 s and slips, with a payload on a spring that fast curves tip."""
 
     def __init__(self):
         self.rng = np.random.default_rng()
