@@ -13,11 +13,11 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.worlds import registry
 
-CART = Path(__file__).parents[1] / "cart.py"
+CART = Path(__file__).parents[1] / "small_cart.py"
 
 
 def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    offered = EntryPoint("rail-cart", "cart:LOGS_ALONE", registry.ENTRY_POINTS)
+    offered = EntryPoint("rail-cart", "small_cart:LOGS_ALONE", registry.ENTRY_POINTS)
     monkeypatch.setattr(registry, "entry_points", lambda group: [offered])
     result = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output

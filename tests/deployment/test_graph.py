@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cart import GIVEN, Rail, Reach
-from cart import TASK as CART
+from small_cart import GIVEN, Rail, Reach
+from small_cart import TASK as CART
 from torch import Tensor
 
 import astra_data

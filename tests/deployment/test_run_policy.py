@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cart import TASK
+from small_cart import TASK
 
 from astra_data.deployment.folder import describe
 from astra_data.deployment.graph import write_graphs

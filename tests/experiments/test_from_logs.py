@@ -51,7 +51,9 @@ bootstrap_replicates = 100
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the cart's task, a dataset of 8 drives, imported from CSV, and no target."""
     folder = tmp_path_factory.mktemp("cart")
-    runpy.run_path(str(CART / "robot.py"))["record"](folder / "csv", drives=8, seconds=6)
+    with pytest.MonkeyPatch.context() as as_a_script:
+        as_a_script.syspath_prepend(CART)
+        runpy.run_path(str(CART / "robot.py"))["record"](folder / "csv", drives=8, seconds=6)
     (folder / "cart.py").write_text((CART / "cart.py").read_text())
     import_dataset(sorted((folder / "csv").glob("*.csv")), CART / "logs.toml", out=folder / "logs")
     return folder
@@ -75,7 +77,7 @@ def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
     folder, keys = made(logs, "cart", 'methods = ["direct_transfer", "nas", "astra"]\n')
     assert keys[:2] == ["label/seed_0", "pair/seed_0"] and not any(key.startswith("collect") for key in keys)
     labelled = Dataset.open(folder / "label/seed_0")
-    assert {GOAL, REWARD} <= labelled.features.keys() and len(labelled) == 8
+    assert REWARD in labelled.features and GOAL not in labelled.features and len(labelled) == 8
     for row in ("direct_transfer", "nas", "astra"):
         evaluation = read_json(Evaluation, folder / "evaluate" / row / "seed_0" / EVALUATION)
         assert evaluation.tested_in == "grounded" and evaluation.target is None
@@ -94,7 +96,7 @@ def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
     assert [dataset["stage"] for dataset in results["datasets"]] == ["label", "pair"]
     policy = load_policy(folder, "astra")
     policy.start(2)
-    action = policy.act(torch.zeros(2, 7), torch.ones(2, 2))
+    action = policy.act(torch.zeros(2, 8), torch.ones(2, 0))
     assert action.shape == (2, 2) and bool(np.isfinite(action.numpy()).all())
 
 
@@ -117,8 +119,8 @@ def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
     assert page is not None
     lines = page.read_text().splitlines()
     gap = json.loads((folder / "ground/nas/percent_050/seed_0/gap.json").read_text())
-    of_yaw = lines[next(i for i, line in enumerate(lines) if "`yaw`" in line) :]
+    of_yaw = lines[next(i for i, line in enumerate(lines) if "`heading_x`" in line) :]
     assert of_yaw[2].startswith("| 50 % | No grounding |") and of_yaw[5].startswith("| 100 % | NAS |")
-    assert f"{gap['raw']['yaw']['mean'][0]:.3g} [" in of_yaw[2]
-    assert f"{gap['grounded']['yaw']['mean'][0]:.3g} [" in of_yaw[3]
-    assert sum(line.startswith("- NAS, `") for line in lines) == 3
+    assert f"{gap['raw']['heading_x']['mean'][0]:.3g} [" in of_yaw[2]
+    assert f"{gap['grounded']['heading_x']['mean'][0]:.3g} [" in of_yaw[3]
+    assert sum(line.startswith("- NAS, `") for line in lines) == 4

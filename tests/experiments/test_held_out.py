@@ -7,7 +7,7 @@ from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.points import Selection
 
-CART = Path(__file__).parents[1] / "cart.py"
+CART = Path(__file__).parents[1] / "small_cart.py"
 
 
 def written(folder: Path, text: str) -> Path:

@@ -25,7 +25,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.sharing.push import push
 from astra_data.stages.label import label
 
-CART = f"{Path(__file__).parents[1] / 'cart.py'}:LOGS_ALONE"
+CART = f"{Path(__file__).parents[1] / 'small_cart.py'}:LOGS_ALONE"
 COLUMNS = (
     Column(STATE, size=2, names=("x", "speed")),
     Column(ACTION, size=1, names=("v",)),

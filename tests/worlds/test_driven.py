@@ -1,5 +1,5 @@
 import torch
-from cart import TASK, Rail
+from small_cart import TASK, Rail
 
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.driven import DrivenSimulator, VariedCommands

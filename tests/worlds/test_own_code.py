@@ -1,4 +1,6 @@
 import hashlib
+import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,7 +10,7 @@ from astra_data.worlds.own_code import file_of, is_own_code, own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
-CART = Path(__file__).parents[1] / "cart.py"
+CART = Path(__file__).parents[1] / "small_cart.py"
 
 
 @pytest.mark.parametrize(
@@ -33,6 +35,17 @@ def test_a_file_is_run_once_and_its_objects_are_found() -> None:
     assert isinstance(task, Task) and task.name == "rail-cart"
     assert task_named(f"{CART}:TASK") is task
     assert task_named(f"{CART}:LOGS_ALONE") is own_object(f"{CART}:LOGS_ALONE")
+
+
+def test_a_file_imports_those_beside_it_but_hides_no_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.path", [*sys.path])
+    (tmp_path / "wheels_of_mine.py").write_text("COUNT = 4\n")
+    (tmp_path / "json.py").write_text("dumps = None\n")
+    (tmp_path / "robot.py").write_text("import json\nfrom wheels_of_mine import COUNT\nDUMPS = json.dumps\n")
+    assert own_object(f"{tmp_path / 'robot.py'}:COUNT") == 4
+    assert own_object(f"{tmp_path / 'robot.py'}:DUMPS") is json.dumps
 
 
 def test_a_module_of_an_installed_package_is_found() -> None:

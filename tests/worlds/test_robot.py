@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cart import TASK, Cart
+from small_cart import TASK, Cart
 
 from astra_data.core.errors import BadInputError
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from cart import GIVEN, LOGS_ALONE, TASK
+from small_cart import GIVEN, LOGS_ALONE, TASK
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
