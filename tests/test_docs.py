@@ -75,9 +75,12 @@ def blocks(page: str) -> list[Block]:
 
 @pytest.fixture(scope="session")
 def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `runs/quickstart` as the quickstart leaves it, but for tiny episodes and networks."""
+    """A folder with `runs/antmaze_quick` as its recipe leaves it, but for tiny episodes and networks.
+
+    `runs/quickstart`, of which the pages show no more than that it is a run, is the same.
+    """
     folder = tmp_path_factory.mktemp("docs")
-    run = folder / "runs" / "quickstart"
+    run = folder / "runs" / "antmaze_quick"
     out = {stage: run / stage / "astra" / "seed_0" for stage in ("ground", "train", "align")}
     collected, pairs = run / "collect" / "seed_0", run / "pair" / "seed_0"
     made = {"seed": 0, "device": "cpu", "progress": silent}
@@ -91,6 +94,7 @@ def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
         inputs: dict[str, Any] = {"dataset": pairs, "grounding": out["ground"], **made}
         train(TASK, "astra", TRAIN, out=out["train"], **inputs)
         align(ALIGN.model_copy(update={"updates": 2}), out=out["align"], **inputs)
+    (run.parent / "quickstart").symlink_to(run.name)
     return folder
 
 
@@ -116,6 +120,7 @@ def run_script(words: list[str]) -> None:
     """Run a script of a page, for a smaller number than by default."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", [*words, "6"])
+        patch.syspath_prepend(Path(words[0]).parent)
         runpy.run_path(words[0], run_name="__main__")
 
 

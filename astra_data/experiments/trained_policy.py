@@ -28,7 +28,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
 
     Example:
         >>> from astra_data import load_policy
-        >>> policy = load_policy("runs/quickstart", "astra")
+        >>> policy = load_policy("runs/antmaze_quick", "astra")
         >>> policy.start(1)
         >>> velocity = policy.act(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
     """
