@@ -37,6 +37,13 @@ def test_help_loads_none_of_the_large_packages() -> None:
     assert not loaded & large
 
 
+def test_the_package_runs_as_a_module_does(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "astra_data", "inspect", str(tmp_path / "none")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
 def test_version() -> None:
     result = CliRunner().invoke(cli.app, ["--version"])
     assert result.exit_code == 0
