@@ -202,11 +202,15 @@ def load_experiment(path: Path, root: Path) -> Experiment:
 
 
 def _tables(path: Path) -> dict[str, Any]:
-    """Return the tables of a recipe; a task in a file, and data in a folder, are looked up beside it."""
+    """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
     tables = with_current_keys(load_tables(path), path)
     task, data = tables.get("task"), tables.get("data")
     if isinstance(task, str) and ".py:" in task:
         tables["task"] = str(path.parent / task)
+    if isinstance(own := tables.get("own_methods"), dict):
+        tables["own_methods"] = {
+            name: str(path.parent / place) if ".py:" in str(place) else place for name, place in own.items()
+        }
     if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
         tables["data"] = str(path.parent / data)
     return tables

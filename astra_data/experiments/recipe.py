@@ -18,7 +18,7 @@ from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
-from astra_data.methods import METHODS, tables
+from astra_data.methods import METHODS, add_method, method_named, tables
 from astra_data.methods.method import Table
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.worlds.registry import task_named
@@ -48,6 +48,9 @@ class Recipe(Config):
     data: str | None = Field(default=None, exclude_if=lambda data: data is None)
     """A dataset in place of `[collect]`: a folder beside the recipe, what the commands on datasets take (a
     folder, a name at home, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
+    own_methods: dict[str, str] = Field(default_factory=dict, exclude_if=lambda places: not places)
+    """Methods of one's own by the names of their rows: "delta.py:METHOD", a file beside the recipe, or
+    "package.module:METHOD"; their code is run."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
     seeds: tuple[int, ...] = Field(min_length=1)
@@ -118,12 +121,27 @@ class Recipe(Config):
             raise ValueError(str(error)) from None
         return task
 
+    @field_validator("own_methods")
+    @classmethod
+    def _add_own_methods(cls, places: dict[str, str]) -> dict[str, str]:
+        for name, place in places.items():
+            try:
+                add_method(name, place)
+            except BadInputError as error:
+                raise ValueError(str(error)) from None
+        return places
+
     @field_validator("methods")
     @classmethod
-    def _are_known_methods(cls, rows: tuple[str, ...]) -> tuple[str, ...]:
+    def _are_known_methods(cls, rows: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if "own_methods" not in info.data:
+            return rows  # told already
         for row in rows:
-            if base_method(row) not in METHODS:
-                raise ValueError(f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}")
+            try:
+                method_named(row)
+            except BadInputError:
+                unknown = f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}"
+                raise ValueError(unknown) from None
             if is_plus(row) and not METHODS[base_method(row)].in_simulator:
                 raise ValueError(
                     f"'{row}' trains nothing in a simulator, so the [plus] settings are without effect: "

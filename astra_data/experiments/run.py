@@ -27,6 +27,7 @@ from astra_data.experiments.plan import check_stage, grounded_as, plan, stage_of
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
+from astra_data.methods import add_method
 from astra_data.stages.registry import STAGES
 
 RUNS = Path("runs")
@@ -199,8 +200,7 @@ def make(
             line = f"{key} is made again: {reason}; the old one is in {_set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
-        # One thread for the networks: they are small, and idle threads would slow down other items.
-        prepare, logs = partial(torch.set_num_threads, 1), folder / "logs"
+        prepare, logs = partial(_prepare, dict(recipe.own_methods)), folder / "logs"
         with show(len(items), console) as watch:
             if cluster is None:
                 jobs = jobs or _default_jobs(device)
@@ -208,6 +208,14 @@ def make(
             else:
                 items = [_with_threads(item, 1) for item in items]
                 execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+
+
+def _prepare(own_methods: dict[str, str]) -> None:
+    """Make a process ready for an item of a recipe with these methods of its own."""
+    # One thread for the networks: they are small, and idle threads would slow down other items.
+    torch.set_num_threads(1)
+    for name, place in own_methods.items():
+        add_method(name, place)
 
 
 def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:

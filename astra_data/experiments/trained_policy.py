@@ -8,7 +8,7 @@ from astra_data.core.naming import base_method, place
 from astra_data.experiments.plan import grounded_as
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.methods import method_named
+from astra_data.methods import add_method, method_named
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.worlds.registry import task_named
@@ -62,6 +62,9 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
         BadInputError: as `load_policy`.
     """
     task_of(run)
+    settings = json.loads((Path(run) / "recipe.json").read_text())
+    for name, place_of in settings.get("own_methods", {}).items():
+        add_method(name, place_of)
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")

@@ -1,7 +1,12 @@
-"""All methods by name; each file defines one method, or a family of them."""
+"""All methods by name; each file defines one method, or a family of them. Those of the user's are added."""
+
+import re
+from dataclasses import replace
+from importlib.metadata import entry_points
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
+from astra_data.grounding.files import KINDS
 from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
 from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
@@ -13,6 +18,7 @@ from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
+from astra_data.worlds.own_code import own_object
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -39,6 +45,47 @@ METHODS: dict[str, Method] = {
 """By name. Recipes list the methods' tables, and results the settings in them, in this order."""
 
 
+ENTRY_POINTS = "astra_data.methods"
+"""The group of entry points under which installed packages offer methods."""
+_NAME = re.compile("[a-z][a-z0-9_]*")
+_PLACES: dict[str, str] = {}
+"""Where the methods come from that are none of the package's."""
+_OWN_KINDS: set[str] = set()
+"""The kinds of their groundings."""
+
+
+def add_method(name: str, place: str) -> None:
+    """Add a method of the user's to `METHODS`, until this process ends.
+
+    Args:
+        name: of its rows.
+        place: "file.py:METHOD" or "package.module:METHOD", whose code is run.
+
+    Raises:
+        BadInputError: the name is taken or cannot be that of a folder; or what is there is no method.
+    """
+    if _PLACES.get(name) == place:
+        return
+    if not _NAME.fullmatch(name) or is_plus(name):
+        raise BadInputError(f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS}")
+    if name in METHODS and name not in _PLACES:
+        raise BadInputError(f"method '{name}' is one of the package: give {place} another name")
+    method = own_object(place)
+    if not isinstance(method, Method):
+        raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
+    if method.table is not None:
+        raise BadInputError(f"{place} has a table of settings, which only methods of the package have")
+    if kind := method.grounding:
+        if kind.kind in KINDS and kind.kind not in _OWN_KINDS:
+            raise BadInputError(
+                f"{place}: groundings of kind '{kind.kind}' are the package's: rename its kind"
+            )
+        _OWN_KINDS.add(kind.kind)
+        KINDS[kind.kind] = kind
+    METHODS[name] = replace(method, name=name)
+    _PLACES[name] = place
+
+
 def tables() -> dict[str, Table]:
     """Return every table of a recipe that methods read, by its name."""
     return {method.table.name: method.table for method in METHODS.values() if method.table}
@@ -62,6 +109,13 @@ def method_named(row: str) -> Method:
         BadInputError: there is no such method.
     """
     name = base_method(row)
+    if name not in METHODS and (point := _installed().get(name)):
+        add_method(name, point)
     if name not in METHODS:
         raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with {PLUS}")
     return METHODS[name]
+
+
+def _installed() -> dict[str, str]:
+    """Return where the methods are that installed packages offer, by name."""
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}

@@ -5,6 +5,7 @@ from typing import Literal
 
 from astra_data.core.config import Config
 from astra_data.grounding.fit import Fit
+from astra_data.grounding.protocols import FittedGrounding
 from astra_data.training.simulator_env import RewardSource
 from astra_data.training.train import InSimulator, Learn
 
@@ -48,6 +49,7 @@ class Method:
         aligns: whether a target encoder is fitted for deployment.
         initial: the method from whose policy its own training starts, if any.
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
+        grounding: the class of what its fit returns, where this is none of the package's.
         table: its settings in a recipe, if it has any. configures: the stage that takes them.
         fit_rates: the speeds that its fit records. learn_rates: those that its training records.
         planar: whether it is for tasks in a maze only.
@@ -64,6 +66,7 @@ class Method:
     aligns: bool = False
     initial: str | None = None
     grounded_as: str = ""
+    grounding: type[FittedGrounding] | None = None
     table: Table | None = None
     configures: Literal["ground", "train"] = "train"
     fit_rates: tuple[str, ...] = ("windows_per_second",)

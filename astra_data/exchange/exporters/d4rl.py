@@ -57,4 +57,5 @@ def _blocks(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
 
 def _timeouts(episode: Episode) -> Array:
     is_last = np.arange(len(episode)) == len(episode) - 1
-    return (episode.columns[TRUNCATED] | is_last) & ~episode.columns[TERMINATED]
+    timeouts: Array = (episode.columns[TRUNCATED] | is_last) & ~episode.columns[TERMINATED]
+    return timeouts
