@@ -1,7 +1,6 @@
 """Walk through a task, and name what is wrong with it, before anything long begins."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -91,15 +90,16 @@ def _goals(task: Task) -> Tensor:
 
 def _abstraction(task: Task) -> None:
     state = generator(0, "states").normal(size=(_COUNT, task.state.size)).astype(np.float32)
+    wanted, what = (_COUNT, task.abstract_state.size), f"abstraction (φ) of states {state.shape}"
     for given in (state, torch.from_numpy(state)):
-        kind = "a NumPy array" if given is state else "a tensor"
-        what = f"abstraction (φ) of {kind} of states {state.shape}"
         with explained(what):
             found = task.abstraction(given)
-        wanted = (_COUNT, task.abstract_state.size)
-        shape: Any = tuple(found.shape) if hasattr(found, "shape") else type(found).__name__
+        shape = tuple(getattr(found, "shape", ()))
         if not isinstance(found, type(given)) or shape != wanted:
-            raise BadInputError(f"{what}: expected the same kind of shape {wanted}, got {shape}")
+            raise BadInputError(
+                f"{what}: expected a {type(given).__name__} of shape {wanted}, got a {type(found).__name__} "
+                f"of {shape}"
+            )
 
 
 def _robot(task: Task) -> None:

@@ -9,7 +9,7 @@ import my_simulator
 import numpy as np
 import pytest
 import torch
-from cart import GIVEN
+from small_cart import GIVEN
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
