@@ -28,7 +28,7 @@ SMALL = {
     "held_out_share = 0.2": "held_out_share = 0.34",
     "num_envs = 64": "num_envs = 4\nhidden_sizes = [8]\nmemory_size = 4",
     "rollout_steps = 64": "rollout_steps = 8",
-    "total_steps = 200_000": "total_steps = 64",
+    "total_steps = 1_000_000": "total_steps = 64",
 }
 
 
