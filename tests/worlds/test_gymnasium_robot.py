@@ -4,23 +4,24 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.gymnasium_robot import Env, GymnasiumRobot
 from astra_data.worlds.robot import State
 
 
-def torque(command: np.ndarray, state: State) -> np.ndarray:
+def torque(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
     """Push half as hard, and less where the pendulum turns fast."""
-    return 0.5 * command - 0.1 * np.asarray(state)[1]
+    return np.asarray(0.5 * command - 0.1 * state[1])
 
 
-def angle_and_speed(env: Env, observation: np.ndarray) -> State:
+def angle_and_speed(env: Env, observation: NDArray[np.float64]) -> State:
     return [env.unwrapped.state[0], float(observation[2])]  # type: ignore[attr-defined]
 
 
 def is_fast(state: State, terminated: bool) -> bool:
-    return abs(state[1]) > 2.0
+    return bool(abs(state[1]) > 2.0)
 
 
 def test_equals_the_environment_stepped_by_hand() -> None:
