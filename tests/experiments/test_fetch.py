@@ -14,6 +14,7 @@ from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.plan import plan
 from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
 from astra_data.worlds.registry import task_named
+from astra_data.worlds.walk_through import check_task
 
 FETCH = Path(__file__).parents[2] / "recipes/examples/fetch"
 SMALL = {
@@ -74,3 +75,18 @@ def test_the_simulator_does_at_once_what_it_is_told() -> None:
     simulator = task.simulator(1)
     simulator.reset_to(torch.tensor([[1.0, 2.0, 3.0]]))
     assert simulator.step(torch.tensor([[1.0, 0.0, -0.5]]))[0].tolist() == pytest.approx([1.05, 2.0, 2.975])
+
+
+def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:
+    """In the environment; and in the simulator by what the gripper would overlap."""
+    task = task_named(f"{FETCH}/push.py:TASK")
+    assert check_task(task) == []
+    assert task.robot is not None
+    robot = task.robot()
+    robot.reset(seed=0)  # type: ignore[call-arg]
+    for _ in range(60):
+        state, failed = robot.step(np.array([0.0, 0.0]))
+    assert state[2] == pytest.approx(0.425, abs=0.01) and not failed
+    simulator = task.simulator(1)
+    simulator.reset_to(torch.tensor([[0.0, 0.0, 0.08, 0.0]]))
+    assert simulator.step(torch.tensor([[1.0, 0.0]]))[0].tolist() == pytest.approx([0.05, 0.0, 0.095, 0.0])
