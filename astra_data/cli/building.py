@@ -123,8 +123,8 @@ def pair(
     simulator: Annotated[
         str | None,
         typer.Option(
-            help="A task, for its abstract simulator, or your own class: path.py:MySimulator, whose code "
-            "is run.",
+            help="A task, for its abstract simulator, one of an installed package, or your own class: "
+            "path.py:MySimulator, whose code is run.",
             show_default=False,
         ),
     ] = None,

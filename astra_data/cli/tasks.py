@@ -7,22 +7,39 @@ import typer
 from astra_data.cli.arguments import DatasetName, NewName, Out
 
 
-def tasks() -> None:
-    """List the tasks that can be named, and what they have."""
+def tasks(
+    task: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[TASK]",
+            help="Walk through this one, by name or place, cart.py:TASK, and name what is wrong with it.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """List the tasks that can be named, and what they have; or walk through one."""
     from rich.console import Console
     from rich.table import Table
 
-    from astra_data.worlds.registry import TASKS, known_tasks
+    from astra_data.core.errors import BadInputError
+    from astra_data.worlds.registry import TASKS, known_tasks, task_named
 
+    if task is not None:
+        from astra_data.worlds.walk_through import check_task
+
+        if faults := check_task(task_named(task)):
+            raise BadInputError("\n".join(f"task {task}: {fault}" for fault in faults))
+        typer.echo(f"{task}: nothing is wrong with its states, simulator, objective and robot")
+        return
     table = Table("task", "from", "commands", "abstract states", "target", "steps/s")
-    for name, task in known_tasks().items():
+    for name, known in known_tasks().items():
         table.add_row(
             name,
             "astra-data" if name in TASKS else "an installed package",
-            ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in task.commands.items()),
-            ", ".join(task.abstract_state.names or (f"{task.abstract_state.size} values",)),
-            "yes" if task.has_target else "no",
-            str(task.fps),
+            ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in known.commands.items()),
+            ", ".join(known.abstract_state.names or (f"{known.abstract_state.size} values",)),
+            "yes" if known.has_target else "no",
+            str(known.fps),
         )
     Console(soft_wrap=True).print(table)
     typer.echo("A task of your own is named by its place, cart.py:TASK or package.module:TASK; it is run.")

@@ -29,6 +29,8 @@ from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
 from astra_data.methods import add_method
 from astra_data.stages.registry import STAGES
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.walk_through import check_task
 
 RUNS = Path("runs")
 SET_ASIDE = "set_aside"
@@ -134,12 +136,17 @@ def run_stage(
 def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict[str, Condition]:
     """Validate a recipe without running it; return each planned artefact and its condition.
 
-    With `verify`, every byte of the artefacts is read; otherwise their sizes are compared.
+    Its task is walked through, as by `check_task`. With `verify`, every byte of the artefacts is read;
+    otherwise their sizes are compared.
 
     Raises:
         RecipeError: the recipe has faults.
+        BadInputError: its task has faults; lists them all.
     """
     experiment = load_experiment(recipe_path, root)
+    name = experiment.recipe.task
+    if faults := check_task(task_named(name)):
+        raise BadInputError("\n".join(f"{recipe_path}: task {name}: {fault}" for fault in faults))
     planned = plan(experiment.recipe, recipe_path, experiment.folder)
     return {item.key: condition(item, experiment, verify=verify) for item in planned}
 

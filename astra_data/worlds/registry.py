@@ -20,8 +20,15 @@ ENTRY_POINTS = "astra_data.tasks"
 """The group of entry points under which installed packages offer tasks."""
 
 
-def task_named(name: str) -> Task:
+def known_names() -> tuple[str, ...]:
+    """Return the names of the tasks of this package and of installed ones, without running these."""
+    return (*TASKS, *(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in TASKS))
+
+
+def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     """Return a task of this or an installed package, or that of "cart.py:TASK" or "package.module:TASK".
+
+    `besides` are other names that an unknown one may have meant.
 
     Raises:
         BadInputError: there is no such task, file or module, or it is no task.
@@ -33,7 +40,7 @@ def task_named(name: str) -> Task:
     installed = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
     if name in installed:
         return _a_task(name, own_object(installed[name].value))
-    known = (*TASKS, *installed)
+    known = (*known_names(), *besides)
     raise BadInputError(
         f"unknown task '{name}'{did_you_mean(name, known)}; a task of your own is named as cart.py:TASK"
     )
@@ -45,8 +52,7 @@ def known_tasks() -> dict[str, Task]:
     Raises:
         BadInputError: a package offers something else, or it fails.
     """
-    installed = entry_points(group=ENTRY_POINTS)
-    return TASKS | {point.name: task_named(point.name) for point in installed if point.name not in TASKS}
+    return {name: task_named(name) for name in known_names()}
 
 
 def _a_task(name: str, found: object) -> Task:

@@ -1,7 +1,9 @@
-"""Load the abstract simulator that a dataset is paired with: of a task, or from a file of the user's."""
+"""Load the abstract simulator that a dataset is paired with: of a task, a package or a file."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +13,11 @@ from astra_data.worlds.commands import Commands
 from astra_data.worlds.own_code import explained, file_of, is_own_code, own_object
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
-from astra_data.worlds.registry import TASKS, task_named
+from astra_data.worlds.registry import TASKS, known_names, task_named
 from astra_data.worlds.task import Task
+
+ENTRY_POINTS = "astra_data.simulators"
+"""The group of entry points under which installed packages offer abstract simulators."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +26,7 @@ class Pairing:
 
     Attributes:
         id: the simulator's name in the dataset.
-        origin: the task that it belongs to, or the sha256 of its file.
+        origin: the task that it belongs to, the sha256 of its file, or its place in a package.
         maze: that of the task; None where there is none.
         abstract_state: the column of abstract states, with names, units, frames and roles.
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
@@ -39,16 +44,17 @@ class Pairing:
 
 
 def pairing_named(name: str) -> Pairing:
-    """Return the simulator of the task `name`, or the class `path.py:MySim` of a user's file.
+    """Return the simulator of the task `name`, of an installed package, or of a file as `path.py:MySim`.
 
-    The class is a `Simulator` of `astra_data.worlds.protocols`; the file is run.
+    A simulator is a class as `Simulator` of `astra_data.worlds.protocols`; its file or package is run. A task
+    comes before a simulator of the same name.
 
     Raises:
         BadInputError: there is no such task, file or class, or the class lacks an attribute.
     """
     if name not in TASKS and name.endswith(".py"):
         raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
-    made = own_object(name) if is_own_code(name) else task_named(name)
+    made = _made_by(name)
     if isinstance(made, Task):
         maze = None if made.plane is None else made.maze
         origin = {"task": made.name, **file_of(name)}
@@ -73,7 +79,22 @@ def pairing_named(name: str) -> Pairing:
         raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
     kind = name.rpartition(":")[2]
     column = replace(column, name=ABSTRACT_STATE)
-    return Pairing(kind, file_of(name), None, column, made.abstraction, made)
+    origin = file_of(name) if is_own_code(name) else {"package": _installed()[name]}
+    return Pairing(kind, origin, None, column, made.abstraction, made)
+
+
+def _made_by(name: str) -> Any:  # noqa: ANN401 - a task or a class of the user's
+    if is_own_code(name):
+        return own_object(name)
+    installed = _installed()
+    if name in installed and name not in known_names():
+        return own_object(installed[name])
+    return task_named(name, besides=tuple(installed))
+
+
+def _installed() -> dict[str, str]:
+    """Return the places of the simulators that installed packages offer, by name."""
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
 
 
 def built(pairing: Pairing, count: int) -> AbstractSimulator:

@@ -30,6 +30,43 @@ def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pyte
         registry.task_named("rail-crat")
 
 
+SETTINGS = """
+[collect]
+episodes = 1
+start = "task"
+[ground]
+updates = 1
+held_out_share = 0.5
+[train]
+total_steps = 64
+"""
+WRONG = """
+from dataclasses import replace
+from small_cart import TASK as RIGHT, Reach
+class Wrong(Reach):
+    def reward(self, before, after, goal, failed):
+        return after - before
+TASK = replace(RIGHT, objective=Wrong(horizon=40))
+"""
+
+
+def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = CliRunner().invoke(app, ["tasks", f"{CART}:TASK"])
+    assert result.exit_code == 0 and "small_cart.py:TASK: nothing is wrong" in result.output
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "wrong.py").write_text(WRONG)
+    told = "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)"
+    result = CliRunner().invoke(app, ["tasks", "wrong.py:TASK"])
+    assert result.exit_code == 1
+    assert str(result.exception) == f"task wrong.py:TASK: {told}"
+    (tmp_path / "wrong.toml").write_text(
+        'task = "wrong.py:TASK"\nmethods = ["nas"]\nseeds = [0]\n' + SETTINGS
+    )
+    result = CliRunner().invoke(app, ["check", "wrong.toml"])
+    assert result.exit_code == 1
+    assert str(result.exception).startswith("wrong.toml: task ") and str(result.exception).endswith(told)
+
+
 def test_a_log_is_labelled_by_a_task_in_a_file(tmp_path: Path) -> None:
     state = np.column_stack([0.1 * np.arange(6), np.ones(6)]).astype(np.float32)
     columns = [Column(STATE, size=2), Column(ACTION), Column(NEXT_STATE, size=2)]

@@ -1,17 +1,25 @@
 import hashlib
 import sys
+from functools import partial
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import mujoco
 import my_simulator
 import numpy as np
 import pytest
 import torch
+from small_cart import GIVEN
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Column
+from astra_data.worlds import simulator_loader
+from astra_data.worlds.mujoco_model import MujocoModel
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.registry import TASKS
-from astra_data.worlds.simulator_loader import built, checked_abstraction, pairing_named
+from astra_data.worlds.simulator_loader import ENTRY_POINTS, built, checked_abstraction, pairing_named
+from astra_data.worlds.task import Task
 
 MINE = Path(my_simulator.__file__)
 STATES = np.arange(87, dtype=np.float32).reshape(3, 29)
@@ -111,3 +119,36 @@ def test_errors_of_the_users_code_keep_their_cause() -> None:
     ):
         raise ValueError("flat")
     assert isinstance(caught.value.__cause__, ValueError)
+
+
+def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = [EntryPoint(name, "my_simulator:Glider", ENTRY_POINTS) for name in ("glider", "antmaze-umaze")]
+    monkeypatch.setattr(simulator_loader, "entry_points", lambda group: {ENTRY_POINTS: offered}[group])
+    pairing = pairing_named("glider")
+    assert (pairing.id, pairing.origin) == ("glider", {"package": "my_simulator:Glider"})
+    assert pairing.simulator(2).step(torch.ones(2, 2)).tolist() == pytest.approx(np.full((2, 2), 0.05))
+    assert pairing_named("antmaze-umaze").id == "point_mass"
+    with pytest.raises(BadInputError, match=r"unknown task 'glidr': did you mean 'glider'"):
+        pairing_named("glidr")
+
+
+def test_a_mujoco_model_is_the_simulator_of_a_task() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep="0.01"/><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/>'
+        '<geom size="0.1" mass="2"/></body></worldbody><actuator><motor joint="rail"/></actuator></mujoco>'
+    )
+    task = Task(
+        **{**GIVEN, "make_simulator": partial(MujocoModel, model, substeps=10)},
+        abstraction=lambda state: state,
+        abstract_state=Column("abstract.state", size=2, names=("x", "v")),
+    )
+    simulator = task.simulator(2)
+    simulator.reset_to(torch.tensor([[0.0, 1.0], [5.0, 0.0]]))
+    landed = simulator.step(torch.tensor([[1.0], [-1.0]]))  # 4 N and -1 N on 2 kg, for 0.1 s
+    by_hand = []
+    for x, v, force in ((0.0, 1.0, 4.0), (5.0, 0.0, -1.0)):
+        for _ in range(10):
+            v += 0.01 * force / 2.0
+            x += 0.01 * v
+        by_hand.append([x, v])
+    assert landed.numpy() == pytest.approx(np.array(by_hand), rel=1e-5)

@@ -1,0 +1,195 @@
+"""Walk through a task, and name what is wrong with it, before anything long begins."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import generator
+from astra_data.worlds.own_code import explained
+from astra_data.worlds.protocols import AbstractSimulator
+from astra_data.worlds.task import Task
+
+_COUNT = 3
+_TOLERANCE = 1e-4
+"""Between states, relative to their size: simulators compute in single precision."""
+
+
+def check_task(task: Task) -> list[str]:
+    """Return one line for each piece of a task that is not as it should be; none if all is well.
+
+    Three states are drawn, set, stepped and judged. A robot is reset once and is given no command; target
+    environments that the task builds itself are left out.
+    """
+    faults: list[str] = []
+
+    def tried[T](check: Callable[..., T], *given: object) -> T | None:
+        try:
+            return check(task, *given)
+        except BadInputError as error:
+            faults.append(str(error))
+            return None
+
+    starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator)
+    tried(_abstraction)
+    tried(_robot)
+    if starts is not None and simulator is not None and tried(_reset, simulator, starts):
+        landed = tried(_step, simulator, starts)
+        if landed is not None and goals is not None:
+            tried(_observation, landed, goals)
+            if tried(_ends, landed, goals):
+                tried(_reward, starts, landed, goals)
+    return faults
+
+
+def _expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype | None = None) -> Tensor:
+    """Return `found`, a finite tensor of `shape`, where -1 stands for any length.
+
+    Raises:
+        BadInputError: it is something else.
+    """
+    if not isinstance(found, Tensor):
+        raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
+    fits = found.dim() == len(shape) and all(
+        size in (-1, length) for size, length in zip(shape, found.shape, strict=True)
+    )
+    if not fits:
+        expected = str(shape).replace("-1", "any")
+        raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
+    if dtype is not None and found.dtype != dtype:
+        raise BadInputError(f"{what}: expected {dtype}, got {found.dtype}")
+    if not found.isfinite().all():
+        raise BadInputError(f"{what}: expected finite numbers, got {_first(found[~found.isfinite()])}")
+    return found
+
+
+def _first(values: Tensor) -> float:
+    return float(values.flatten()[0])
+
+
+def _of_numpy(what: str, found: object, shape: tuple[int, ...]) -> Tensor:
+    if not isinstance(found, np.ndarray):
+        raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
+    return _expect(what, torch.from_numpy(np.ascontiguousarray(found)), shape).float()
+
+
+def _starts(task: Task) -> Tensor:
+    what = f"objective.draw_starts(rng, {_COUNT})"
+    with explained(what):
+        found = task.objective.draw_starts(generator(0, "starts"), _COUNT)
+    return _of_numpy(what, found, (_COUNT, task.abstract_state.size))
+
+
+def _goals(task: Task) -> Tensor:
+    what = f"objective.draw_goals(rng, {_COUNT})"
+    with explained(what):
+        found = task.objective.draw_goals(generator(0, "goals"), _COUNT)
+    return _of_numpy(what, found, (_COUNT, task.objective.goal_size))
+
+
+def _abstraction(task: Task) -> None:
+    state = generator(0, "states").normal(size=(_COUNT, task.state.size)).astype(np.float32)
+    wanted, what = (_COUNT, task.abstract_state.size), f"abstraction (φ) of states {state.shape}"
+    for given in (state, torch.from_numpy(state)):
+        with explained(what):
+            found = task.abstraction(given)
+        shape = tuple(getattr(found, "shape", ()))
+        if not isinstance(found, type(given)) or shape != wanted:
+            raise BadInputError(
+                f"{what}: expected a {type(given).__name__} of shape {wanted}, got a {type(found).__name__} "
+                f"of {shape}"
+            )
+
+
+def _robot(task: Task) -> None:
+    if task.robot is None:
+        return
+    with explained("robot: to build and to reset it"):
+        env = task.target(1, seed=0)
+        env.reset()
+        abstract = task.abstraction(env.state)
+    _expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
+
+
+def _simulator(task: Task) -> AbstractSimulator:
+    what = f"make_simulator({_COUNT})"
+    with explained(what):
+        simulator = task.own_simulator(_COUNT)
+        state = simulator.state
+    _expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size))
+    return simulator
+
+
+def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
+    with explained("make_simulator: reset_to(state)"):
+        simulator.reset_to(starts.clone())
+        shown = simulator.state
+    _same("make_simulator: after reset_to(state), state", shown, starts)
+    with explained("make_simulator: reset_to(state, rows)"):
+        simulator.reset_to(starts[[0, 1]], torch.tensor([2, 0]))
+        shown = simulator.state
+    _same("make_simulator: after reset_to(state, rows), state", shown, starts[[1, 1, 0]])
+    return True
+
+
+def _step(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
+    what = "make_simulator: step(command)"
+    drawn = generator(0, "actions").uniform(-1.0, 1.0, (_COUNT, len(task.limits)))
+    command = task.limits.in_units(torch.from_numpy(drawn).float())
+
+    def stepped(rows: slice) -> Tensor:
+        count = len(starts[rows])
+        batch = simulator if count == _COUNT else task.own_simulator(count)
+        with explained(what):
+            batch.reset_to(starts[rows].clone())
+            before = batch.state
+            kept = before.clone()
+            landed = batch.step(command[rows].clone())
+        _expect(f"{what} of shape {tuple(command[rows].shape)}", landed, (count, starts.shape[1]))
+        if not torch.equal(before, kept):
+            raise BadInputError(f"{what} changes the states handed out before: expected a new tensor")
+        return landed.clone()
+
+    landed = stepped(slice(None))
+    if torch.equal(landed, stepped(slice(None))):  # otherwise it is noisy, and rows cannot be compared
+        for row in range(_COUNT):
+            alone = stepped(slice(row, row + 1))
+            _same(f"{what}: row {row} by itself and", alone, landed[row : row + 1], "in the batch")
+    return landed
+
+
+def _same(what: str, shown: Tensor, expected: Tensor, where: str = "") -> None:
+    _expect(what, shown, tuple(expected.shape))
+    if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
+        row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
+        raise BadInputError(
+            f"{what} {where}".rstrip()
+            + f": expected {_first(expected[row, entry]):g} in row {row}, entry {entry}, got "
+            f"{_first(shown[row, entry]):g}"
+        )
+
+
+def _observation(task: Task, state: Tensor, goal: Tensor) -> None:
+    what = "objective.observe(state, goal)"
+    with explained(what):
+        found = task.objective.observe(state, goal)
+    _expect(what, found, (_COUNT, -1))
+
+
+def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:
+    for name in ("reached", "missed"):
+        what = f"objective.{name}(state, goal)"
+        with explained(what):
+            found = getattr(task.objective, name)(state, goal)
+        _expect(what, found, (_COUNT,), torch.bool)
+    return True
+
+
+def _reward(task: Task, before: Tensor, after: Tensor, goal: Tensor) -> None:
+    what = "objective.reward(before, after, goal, failed)"
+    for failed in (False, True):
+        with explained(what):
+            found = task.objective.reward(before, after, goal, torch.full((_COUNT,), failed))
+        _expect(what, found, (_COUNT,))

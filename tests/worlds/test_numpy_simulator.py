@@ -1,0 +1,39 @@
+from functools import partial
+
+import numpy as np
+import torch
+
+from astra_data.worlds.numpy_simulator import Floats, NumpySimulator
+
+
+def turn(state: Floats, command: Floats) -> Floats:
+    """Points [x, y] that are turned about the origin by the commanded angle."""
+    cos, sin = np.cos(command[:, 0]), np.sin(command[:, 0])
+    return np.stack([cos * state[:, 0] - sin * state[:, 1], sin * state[:, 0] + cos * state[:, 1]], axis=-1)
+
+
+def test_equals_the_function_by_hand() -> None:
+    simulator = partial(NumpySimulator, function=turn, size=2, parameters={"timestep_s": 0.1})(3)
+    assert simulator.state.tolist() == [[0.0, 0.0]] * 3 and simulator.parameters == {"timestep_s": 0.1}
+    rng = np.random.default_rng(0)
+    points, angles = rng.normal(size=(3, 2)), rng.normal(size=(2, 3, 1))
+    simulator.reset_to(torch.from_numpy(points).float())
+    for angle in angles:
+        landed = simulator.step(torch.from_numpy(angle).float())
+    z = (points[:, 0] + 1j * points[:, 1]) * np.exp(1j * angles.sum(axis=0)[:, 0])
+    assert landed.dtype == torch.float32 and torch.equal(landed, simulator.state)
+    np.testing.assert_allclose(landed.numpy(), np.column_stack([z.real, z.imag]), atol=1e-6)
+
+
+def test_the_function_may_change_its_arguments() -> None:
+    """States that were handed out stay as they were, and so do the caller's commands."""
+
+    def push(state: Floats, command: Floats) -> Floats:
+        command *= 2.0
+        state += command
+        return state
+
+    simulator, command = NumpySimulator(1, function=push, size=1), torch.ones(1, 1)
+    before, first = simulator.state, simulator.step(command)
+    second = simulator.step(command)
+    assert [float(state) for state in (before, first, second, command)] == [0.0, 2.0, 4.0, 1.0]

@@ -1,0 +1,174 @@
+"""Each wrong piece of a task is named by one line, and what is right by none."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_cart import TASK, Cart, Rail, Reach
+from torch import Tensor
+
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
+from astra_data.worlds.walk_through import check_task
+
+
+@pytest.mark.parametrize("task", [TASK, *TASKS.values()], ids=lambda task: task.name)
+def test_nothing_is_wrong_with_the_tasks_of_the_package(task: Task) -> None:
+    assert check_task(task) == []
+
+
+def simulator(**methods: object) -> Task:
+    return replace(TASK, make_simulator=type("Own", (Rail,), methods))
+
+
+def objective(**methods: object) -> Task:
+    return replace(TASK, objective=type("Own", (Reach,), methods)(horizon=40))
+
+
+def robot(**methods: object) -> Task:
+    return replace(TASK, robot=type("Own", (Cart,), methods))
+
+
+def abstraction(made: Callable[[Any], Any]) -> Task:
+    return replace(TASK, abstraction=made)
+
+
+class Own:
+    """Ways to be wrong, as methods of a simulator."""
+
+    def single(self, num_envs: int) -> None:
+        self.state = torch.zeros(1)
+
+    def deaf(self, state: Tensor, rows: Tensor | None = None) -> None:
+        self.state = self.state.clone()
+
+    def whole(self, state: Tensor, rows: Tensor | None = None) -> None:
+        self.state = state if rows is None else self.state
+
+    def lost(self, command: Tensor) -> Tensor:
+        return Rail.step(self, command) * torch.nan  # type: ignore[arg-type]
+
+    def flat(self, command: Tensor) -> Tensor:
+        return Rail.step(self, command)[:, 0]  # type: ignore[arg-type]
+
+    def coupled(self, command: Tensor) -> Tensor:
+        return Rail.step(self, command.mean(dim=0).expand_as(command))  # type: ignore[arg-type]
+
+    def in_place(self, command: Tensor) -> Tensor:
+        self.state += 0.1 * command
+        return self.state
+
+    def stuck(self, command: Tensor) -> Tensor:
+        raise ValueError("flat battery")
+
+
+WRONG: list[tuple[Task, str]] = [
+    (
+        simulator(__init__=Own.single),
+        "make_simulator(3).state, 3 states at once: expected shape (3, 1), got (1,)",
+    ),
+    (
+        simulator(reset_to=Own.deaf),
+        "make_simulator: after reset_to(state), state: expected 3 in row 2, entry 0, got 0",
+    ),
+    (
+        simulator(reset_to=Own.whole),
+        "make_simulator: after reset_to(state, rows), state: expected 1 in row 2, entry 0, got 3",
+    ),
+    (
+        simulator(step=Own.lost),
+        "make_simulator: step(command) of shape (3, 1): expected finite numbers, got nan",
+    ),
+    (
+        simulator(step=Own.flat),
+        "make_simulator: step(command) of shape (3, 1): expected shape (3, 1), got (3,)",
+    ),
+    (
+        simulator(step=Own.coupled),
+        "make_simulator: step(command): row 0 by itself and in the batch: expected ",
+    ),
+    (simulator(step=Own.in_place), "make_simulator: step(command) changes the states handed out before"),
+    (simulator(step=Own.stuck), "make_simulator: step(command) fails with ValueError: flat battery"),
+    (
+        objective(reward=lambda self, before, after, goal, failed: after - before),
+        "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)",
+    ),
+    (
+        objective(reward=lambda self, before, after, goal, failed: failed / torch.zeros(3)),
+        "objective.reward(before, after, goal, failed): expected finite numbers, got nan",
+    ),
+    (
+        objective(reward=lambda self, before, after, goal, failed: 1.0 / (~failed).float()),
+        "objective.reward(before, after, goal, failed): expected finite numbers, got inf",
+    ),
+    (
+        objective(reached=lambda self, state, goal: state[:, 0].clamp(0, 1)),
+        "objective.reached(state, goal): expected torch.bool, got torch.float32",
+    ),
+    (
+        objective(missed=lambda self, state, goal: state < 0.0),
+        "objective.missed(state, goal): expected shape (3,), got (3, 1)",
+    ),
+    (
+        replace(objective(observe=lambda self, state, goal: state[:, 0]), robot=None),
+        "objective.observe(state, goal): expected shape (3, any), got (3,)",
+    ),
+    (
+        objective(draw_starts=lambda self, rng, count: np.zeros(count)),
+        "objective.draw_starts(rng, 3): expected shape (3, 1), got (3,)",
+    ),
+    (
+        objective(draw_starts=lambda self, rng, count: torch.zeros(count, 1)),
+        "objective.draw_starts(rng, 3): expected a NumPy array, got a Tensor",
+    ),
+    (
+        replace(objective(draw_goals=lambda self, rng, count: np.zeros((count, 2))), robot=None),
+        "objective.draw_goals(rng, 3): expected shape (3, 1), got (3, 2)",
+    ),
+    (
+        robot(reset=lambda self: [0.0, 0.0, 0.0]),
+        "reset of the robot: expected a finite state of 2 numbers, got [0.0, 0.0, 0.0]",
+    ),
+    (
+        replace(abstraction(lambda state: state), robot=None),
+        "abstraction (φ) of states (3, 2): expected a ndarray of shape (3, 1), got a ndarray of (3, 2)",
+    ),
+    (
+        replace(abstraction(lambda state: np.asarray(state)[:, :1]), robot=None),
+        "abstraction (φ) of states (3, 2): expected a Tensor of shape (3, 1), got a ndarray of (3, 1)",
+    ),
+]
+
+
+@pytest.fixture(autouse=True)
+def starts_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Reach, "draw_starts", lambda self, rng, count: 1.0 + np.arange(float(count))[:, None])
+
+
+@pytest.mark.parametrize(("task", "line"), WRONG, ids=[line for _, line in WRONG])
+def test_the_wrong_piece_is_named_in_one_line(task: Task, line: str) -> None:
+    faults = check_task(task)
+    assert len(faults) == 1 and faults[0].startswith(line) and "\n" not in faults[0]
+
+
+def test_every_wrong_piece_is_named() -> None:
+    wrong = replace(
+        objective(draw_goals=lambda self, rng, count: np.zeros((count, 2))),
+        make_simulator=type("Own", (Rail,), {"step": Own.flat}),
+        robot=type("Own", (Cart,), {"reset": lambda self: 1.0}),
+    )
+    assert [fault.split()[0] for fault in check_task(wrong)] == [
+        "objective.draw_goals(rng,",
+        "reset",
+        "make_simulator:",
+    ]
+
+
+def test_noisy_simulators_are_no_fault() -> None:
+    def noisy(self: Rail, command: Tensor) -> Tensor:
+        return Rail.step(self, command + torch.randn_like(command))
+
+    assert check_task(simulator(step=noisy)) == []
