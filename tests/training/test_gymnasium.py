@@ -11,6 +11,7 @@ import astra_data.envs
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import TASKS
 
 gymnasium.register_envs(astra_data.envs)
@@ -73,7 +74,7 @@ def test_one_env_is_truncated_and_tells_of_walls() -> None:
     for _ in range(60):
         _, _, terminated, truncated, info = env.step(np.array([-1.0, 1.0], dtype=np.float32))
     assert (terminated, truncated) == (False, True)
-    assert info == {"success": False, "wall_contact": True}
+    assert info == {"success": False, "failed": False, "wall_contact": True}
 
 
 def test_the_same_seed_repeats_all_episodes() -> None:
@@ -115,7 +116,8 @@ def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
     )
     for env in (ours, theirs):
         observation, infos = env.reset(seed=1)
-        assert set(infos) == {"success", "_success", "wall_contact", "_wall_contact"}
+        facts = ("success", "failed", "wall_contact")
+        assert set(infos) == {*facts, *(f"_{fact}" for fact in facts)}
         successes = 0
         for _ in range(500):
             observation, rewards, terminated, _, infos = env.step(goal_ward(observation))
@@ -147,7 +149,7 @@ def test_a_grounded_simulator_shows_its_latents() -> None:
     task = TASKS["antmaze-umaze"]
     model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
     grounded = HistoryGrounding(model.requires_grad_(False)).simulator(task, 3)
-    env = BatchedVectorEnv(SeededSimulatorEnv(task.objective, grounded), max_episode_steps=5)
+    env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(task.objective, grounded)), max_episode_steps=5)
     raw = point_mazes(3, max_episode_steps=5)
     first, _ = env.reset(seed=1)
     expected, _ = raw.reset(seed=1)
