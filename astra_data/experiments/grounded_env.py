@@ -3,6 +3,7 @@
 Gymnasium's "astra_data/Grounded-v0" is made here.
 """
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.training.build_env import EnvConfig
@@ -106,6 +108,7 @@ def evaluate_policy(
     episodes = training.episodes
     tested = {"methods": [row], "seeds": [seed]} | settings_of(run)
     evaluate = _planned(run, tested, "evaluate", row, seed, percent)
+    _check_made(evaluate.keywords, ("target_encoder", "reference"))
     evaluate(
         policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash),
         out=Path(out),
@@ -132,13 +135,11 @@ def _world(
     settings, table = settings_of(run), "plus" if is_plus(row) else "train"
     changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | options}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
-    paths = {name: of_train[name] for name in ("dataset", "grounding") if of_train[name]}
-    if missing := [f"{path} ({name})" for name, path in paths.items() if not path.is_dir()]:
-        raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
+    _check_made(of_train, ("dataset", "grounding"))
     episodes = PairedEpisodes.load(of_train["dataset"])
-    grounding = NO_GROUNDING
-    if "grounding" in paths:
-        grounding = load_grounding(paths["grounding"] / "grounding.safetensors")
+    grounding: Grounding = NO_GROUNDING
+    if of_train["grounding"]:
+        grounding = load_grounding(of_train["grounding"] / "grounding.safetensors")
     training = Training(
         task=task_named(of_train["task"]),
         config=of_train["config"],
@@ -161,6 +162,13 @@ def _planned(
     recipe = validated(settings, Recipe, f"{run}")
     only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
     items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
-    call = items[f"{stage}/{row}/{place(seed, percent)}"]
-    assert isinstance(call, partial)
+    call = items.get(f"{stage}/{row}/{place(seed, percent)}")
+    if not isinstance(call, partial):
+        raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
     return call
+
+
+def _check_made(given: dict[str, Any], artefacts: Iterable[str]) -> None:
+    """Refuse a call to which one of the `artefacts` is given that is not there."""
+    if missing := [str(given[name]) for name in artefacts if given[name] and not given[name].is_dir()]:
+        raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")

@@ -59,9 +59,8 @@ class OwnPolicy(Policy):
         with explained(f"{self.name}.act"):
             action = np.asarray(self.acting.act(features.numpy()), dtype=np.float32)
         expected = (len(features), self.shape.action_size)
-        if action.shape != expected or not np.isfinite(action).all():
-            got = (
-                f"of shape {action.shape}" if action.shape != expected else "with values that are not finite"
-            )
-            raise BadInputError(f"{self.name}.act: expected actions of shape {expected}, got some {got}")
+        if action.shape != expected:
+            raise BadInputError(f"{self.name}.act: expected actions of shape {expected}, got {action.shape}")
+        if not np.isfinite(action).all():
+            raise BadInputError(f"{self.name}.act: expected finite actions, got NaN or infinity")
         return torch.from_numpy(action).clamp(-1.0, 1.0)
