@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -9,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 
 import astra_data.envs
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.simulator_env import SimulatorEnv
@@ -44,6 +46,30 @@ def goal_ward(observation: Array) -> Array:
 def test_registration_loads_no_world() -> None:
     code = "import sys, astra_data.envs; assert not {'torch', 'mujoco', 'torchrl'} & set(sys.modules)"
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
+def test_without_gymnasium_one_line_says_how_to_install_it() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None; import astra_data.envs"
+    ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 1
+    last = ran.stderr.splitlines()[-1]
+    assert "BadInputError: gymnasium is needed and not installed: " in last and "astra-data[sim]" in last
+
+
+def test_failures_are_told_apart_from_successes() -> None:
+    task = TASKS["antmaze-umaze"]
+    walls = replace(task.objective, ends_at_walls=True)
+    simulator = NO_GROUNDING.simulator(task, 2)
+    env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(walls, simulator)), max_episode_steps=200)
+    env.reset(seed=0)
+    commands = np.array([[0.0, 0.0], [-1.0, 1.0]], dtype=np.float32)
+    for _ in range(100):
+        *_, terminated, _, infos = env.step(commands)
+        if terminated.any():
+            break
+    assert terminated.tolist() == [False, True]
+    assert infos["final_info"]["failed"].tolist() == [False, True]
+    assert not infos["failed"].any() and not infos["final_info"]["success"].any()
 
 
 @pytest.mark.filterwarnings("ignore:.*infinity")
