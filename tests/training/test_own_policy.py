@@ -33,7 +33,7 @@ def test_it_acts_in_batches_within_the_bounds_and_remembers_nothing() -> None:
     [
         (lambda seen: seen, r"Mine\.act: expected actions of shape \(2, 2\), got \(2, 3\)"),
         (lambda seen: seen[:, :2] * np.nan, r"Mine\.act: expected finite actions, got NaN or infinity"),
-        (lambda seen: {}[0], r"Mine\.act fails with KeyError: 0"),
+        (lambda seen: dict[int, int]()[0], r"Mine\.act fails with KeyError: 0"),
         (lambda seen: "left", r"Mine\.act fails with ValueError"),
         (None, r"Mine is no policy: expected act\(observation\) -> action"),
     ],
