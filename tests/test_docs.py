@@ -85,7 +85,7 @@ def quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     collected, pairs = run / "collect" / "seed_0", run / "pair" / "seed_0"
     made = {"seed": 0, "device": "cpu", "progress": silent}
     run.mkdir(parents=True)
-    (run / "recipe.json").write_text('{"task": "antmaze-umaze"}')
+    (run / "recipe.json").write_text('{"task": "antmaze-umaze", "evaluate": {"episodes": 2}}')
     with short_task():
         collect(TASK, CollectConfig(episodes=100, max_steps=25), seed=0, out=collected, progress=silent)
         pair(TASK, PairConfig(), dataset=collected, out=pairs, progress=silent)

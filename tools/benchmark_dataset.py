@@ -38,6 +38,7 @@ from astra_data.dataset.frames import Frames
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.stages.pair import pair_steps
 from astra_data.training.gymnasium import SeededSimulatorEnv, SingleEnv
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.mujoco_model import MujocoModel
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.simulator_loader import Pairing, pairing_named
@@ -189,7 +190,7 @@ def point_mass_pairs() -> Candidates:
     action = rng.uniform(-1, 1, size=(PAIRED, 2)).astype(np.float32)
     pairing = pairing_named(TASK)
     batch, simulator = pairing.simulator(BATCH_OF_PAIRS), task.simulator(1)
-    env = SingleEnv(SeededSimulatorEnv(task.objective, EpisodeSimulator(simulator)))
+    env = SingleEnv(SeededSimulatorEnv(SimulatorEnv(task.objective, EpisodeSimulator(simulator))))
     env.reset(seed=0)
     abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
 

@@ -114,10 +114,39 @@ align = _of_networks("align", "Fit the encoder of target histories to that of si
 
 
 def evaluate(
-    recipe: RecipePath, method: Method = None, seeds: Seeds = None, jobs: Jobs = None, root: Root = RUNS
+    recipe: RecipePath,
+    method: Method = None,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            help="Test this policy of your own in place of the row's: path.py:POLICY, whose code is run.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="With --policy, the folder to write.", show_default=False)
+    ] = None,
 ) -> None:
-    """Run the policies in the target environment."""
-    run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
+    """Run the policies in the target environment, or where it has none in simulators."""
+    if policy is None:
+        if out is not None:
+            raise BadInputError("evaluate: --out is for --policy: a recipe's evaluations have their places")
+        run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
+        return
+    if method is None or out is None or len(seeds or ()) != 1 or jobs is not None:
+        raise BadInputError("evaluate: --policy expects --method, one --seed and --out, and no --jobs")
+    from astra_data.experiments.display import shown
+    from astra_data.experiments.grounded_env import evaluate_policy
+    from astra_data.worlds.own_code import own_object
+
+    with shown("evaluate") as progress:
+        evaluate_policy(
+            root / recipe.stem, method, own_object(policy), out=out, seed=(seeds or [0])[0], progress=progress
+        )
+    typer.echo(f"finished: {out}")
 
 
 def report(

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method, place
@@ -47,12 +48,22 @@ def task_of(run: str | Path) -> str:
     Raises:
         BadInputError: it is not the folder of a run.
     """
+    return str(settings_of(run)["task"])
+
+
+def settings_of(run: str | Path) -> dict[str, Any]:
+    """Return the settings of a run's recipe, as it recorded them.
+
+    Raises:
+        BadInputError: it is not the folder of a run.
+    """
     recipe = Path(run) / "recipe.json"
     if not recipe.is_file():
         raise BadInputError(
             f"{run}: expected the folder of a run, which holds recipe.json: make it with astra-data run"
         )
-    return str(json.loads(recipe.read_text())["task"])
+    settings: dict[str, Any] = json.loads(recipe.read_text())
+    return settings
 
 
 def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = None) -> dict[str, Path]:

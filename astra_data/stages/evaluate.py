@@ -34,6 +34,7 @@ from astra_data.methods.follower import careful
 from astra_data.training.build_env import EnvParts, training_env
 from astra_data.training.deployment import DeployedPolicy, EncoderKind
 from astra_data.training.episode_record import EpisodeRecord, Outcome
+from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.policy_file import PolicyFile, Simulation, deploy
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import task_named
@@ -60,7 +61,7 @@ def evaluate(
     method: str,
     config: EvaluateConfig = EvaluateConfig(),
     *,
-    policy: Path | None = None,
+    policy: Path | PolicyFile | None = None,
     grounding: Path | None = None,
     target_encoder: Path | None = None,
     reference: Path | None = None,
@@ -77,7 +78,7 @@ def evaluate(
         task: see `task_named`.
         method: a row.
         config: the recipe's `[evaluate]`.
-        policy: what `train` made, for a row that trains.
+        policy: what `train` made, for a row that trains; or a policy in its place.
         grounding: what `ground` made for it, for a row that grounds.
         target_encoder: what `align` made for it, for a row that aligns.
         reference: the grounding of the reference simulator, if there is one.
@@ -122,7 +123,9 @@ def evaluate(
         robots: dict[EncoderKind, Begin] = {headline: partial(_careful_in_target, world)}
         shown_abstract = True
     else:
-        trained = PolicyFile.load(policy / "policy.safetensors")
+        trained = PolicyFile.load(policy / "policy.safetensors") if isinstance(policy, Path) else policy
+        if isinstance(trained.policy, OwnPolicy):
+            results["policy"] = trained.policy.name
         model: Grounding = NO_GROUNDING
         if grounding:
             model = load_grounding(grounding / "grounding.safetensors")
@@ -145,7 +148,7 @@ def evaluate(
     if shown_abstract:
         simulators |= _shared_simulators(world, reference, config)
     files = {
-        "policy": policy and policy / "policy.safetensors",
+        "policy": policy / "policy.safetensors" if isinstance(policy, Path) else None,
         "grounding": grounding and grounding / "grounding.safetensors",
         "target_encoder": target_encoder and target_encoder / "target_encoder.safetensors",
         "reference": reference and reference / "grounding.safetensors",

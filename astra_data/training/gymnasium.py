@@ -1,8 +1,10 @@
-"""Gymnasium adapters of the batched environments: an `Env` of one robot and a `VectorEnv` of B.
+"""Gymnasium adapters of the batched environments of any task: an `Env` of one robot, a `VectorEnv` of B.
 
-Observations are (31,) in the target (state, goal) and (8,) in the abstract simulator (see
-`simulator_env.policy_observation`); actions are velocity commands (2,) in [-1, 1] m/s. `info` has whether the
-step reached the goal ("success") and whether it touched a wall ("wall_contact").
+Observations (O,) are those that policies are given: in a simulator the latent, if it has one, and what the
+task's objective shows of the abstract state and the goal; in a target the state and the goal. Actions (A,)
+are in [-1, 1] along each axis; `task.limits.in_units` returns them in the units of the robot's commands.
+`info` has whether the step reached the goal ("success"), whether it was a failure ("failed"), and whether it
+touched a wall ("wall_contact"; never, where there are none).
 """
 
 from typing import Any, Protocol
@@ -17,10 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv, Step
-from astra_data.worlds.objective import Objective
 from astra_data.worlds.registry import task_named
 
 Array = NDArray[Any]
@@ -28,6 +28,11 @@ Array = NDArray[Any]
 
 class SeededEnv(BatchedEnv, Protocol):
     """A batched environment with its own randomness."""
+
+    @property
+    def failed(self) -> Tensor:
+        """Which rows failed in the last step, (B,) bool."""
+        ...
 
     @property
     def wall_contact(self) -> Tensor:
@@ -39,37 +44,55 @@ class SeededEnv(BatchedEnv, Protocol):
         ...
 
 
-class SeededSimulatorEnv(SimulatorEnv):
-    """The task in an abstract simulator, with starts and goals from a seed of its own."""
+class SeededSimulatorEnv:
+    """A simulated environment whose starts, goals and noise come from a seed of its own."""
 
-    def __init__(self, objective: Objective, simulator: EpisodeSimulator) -> None:
-        """Set the task in `simulator`."""
-        super().__init__(objective, simulator)
+    def __init__(self, env: SimulatorEnv) -> None:
+        """Wrap `env`, which draws from torch's global generator."""
+        self.env = env
+        self.num_envs = env.num_envs
+        self.observation_size, self.action_size = env.observation_size, env.action_size
         self.reseed(_fresh_seed())
+
+    @property
+    def failed(self) -> Tensor:
+        """Which rows failed in the last step, (B,) bool."""
+        return self.env.failed
 
     @property
     def wall_contact(self) -> Tensor:
         """Which rows the walls stopped in the last step, (B,) bool."""
-        return self.simulator.blocked
+        return self.env.simulator.blocked
 
     def reseed(self, seed: int) -> None:
-        """Draw later starts and goals from `seed`."""
+        """Draw later starts, goals and noise from `seed`."""
         self._rng = np.random.default_rng(seed)
+        self._noise = torch.Generator().manual_seed(seed).get_state()
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
-        """Reset the rows in `mask` (B,), by default all; return observations (B, 8)."""
+        """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(self._rng.integers(2**62)))
-            return super().reset(mask)
+            return self.env.reset(mask)
+
+    def step(self, action: Tensor) -> Step:
+        """Apply `action` (B, A), clipped to ±1."""
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._noise)
+            step = self.env.step(action)
+            self._noise = torch.get_rng_state()
+        return step
 
 
 class SingleEnv(gymnasium.Env[Array, Array]):
-    """One row of a batched environment. There is no time limit here: `gymnasium.make` adds it."""
+    """One row of a batched environment."""
 
-    def __init__(self, env: SeededEnv) -> None:
-        """Wrap `env`, which has one row."""
+    def __init__(self, env: SeededEnv, max_episode_steps: int | None = None) -> None:
+        """Wrap `env`, which has one row; its episodes are truncated after `max_episode_steps`, if given."""
         self.env = env
+        self.max_episode_steps = max_episode_steps
         self.observation_space, self.action_space = _spaces(env)
+        self._age = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -78,13 +101,16 @@ class SingleEnv(gymnasium.Env[Array, Array]):
         super().reset(seed=seed)
         if seed is not None:
             self.env.reseed(seed)
-        return self.env.reset()[0].numpy(), {"success": False, "wall_contact": False}
+        self._age = 0
+        return self.env.reset()[0].numpy(), dict.fromkeys(_FACTS, False)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Apply a command (2,) for one control step."""
+        """Apply an action (A,) for one control step."""
         step = self.env.step(torch.tensor(action, dtype=torch.float32)[None])
-        info = {"success": bool(step.success[0]), "wall_contact": bool(self.env.wall_contact[0])}
-        return step.observation[0].numpy(), float(step.reward[0]), bool(step.terminated[0]), False, info
+        self._age += 1
+        info = {name: bool(values[0]) for name, values in _facts(self.env, step).items()}
+        truncated = self.max_episode_steps is not None and self._age >= self.max_episode_steps
+        return step.observation[0].numpy(), float(step.reward[0]), bool(step.terminated[0]), truncated, info
 
 
 class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
@@ -115,11 +141,10 @@ class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             self.env.reseed(first)
         self._age.zero_()
         nothing = np.zeros(self.num_envs, dtype=bool)
-        everyone = np.ones(self.num_envs, dtype=bool)
-        return self.env.reset().numpy(), _info(nothing, nothing, everyone)
+        return self.env.reset().numpy(), _info(dict.fromkeys(_FACTS, nothing), ~nothing)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Apply commands (B, 2) for one control step."""
+        """Apply actions (B, A) for one control step."""
         step = self.env.step(torch.tensor(actions, dtype=torch.float32))
         self._age += 1
         truncated = self._age >= self.max_episode_steps
@@ -128,21 +153,31 @@ class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         return observation, rewards, step.terminated.numpy(), truncated.numpy(), infos
 
     def _restart(self, step: Step, done: Tensor) -> tuple[Array, dict[str, Any]]:
-        success, contact, ended = step.success.numpy(), self.env.wall_contact.numpy().copy(), done.numpy()
-        infos = _info(success & ~ended, contact & ~ended, np.ones_like(ended))
+        facts, ended = _facts(self.env, step), done.numpy()
+        infos = _info({name: values & ~ended for name, values in facts.items()}, np.ones_like(ended))
         if not ended.any():
             return step.observation.numpy(), infos
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(ended):
             final[row] = step.observation[row].numpy()
         infos |= {"final_obs": final, "_final_obs": ended}
-        infos |= {"final_info": _info(success & ended, contact & ended, ended), "_final_info": ended}
+        final_info = _info({name: values & ended for name, values in facts.items()}, ended)
+        infos |= {"final_info": final_info, "_final_info": ended}
         self._age[done] = 0
         return self.env.reset(done).numpy(), infos
 
 
-def _info(success: Array, wall_contact: Array, known: Array) -> dict[str, Any]:
-    return {"success": success, "_success": known, "wall_contact": wall_contact, "_wall_contact": known}
+_FACTS = ("success", "failed", "wall_contact")
+
+
+def _facts(env: SeededEnv, step: Step) -> dict[str, Array]:
+    """Return what `info` says of each row, (B,) bool."""
+    values = (step.success, env.failed, env.wall_contact)
+    return {name: of_rows.numpy().copy() for name, of_rows in zip(_FACTS, values, strict=True)}
+
+
+def _info(facts: dict[str, Array], known: Array) -> dict[str, Any]:
+    return facts | {f"_{name}": known for name in facts}
 
 
 def _spaces(env: SeededEnv) -> tuple[Box, Box]:
@@ -172,12 +207,14 @@ def ant_maze_vector(
 
 def point_maze(task: str) -> SingleEnv:
     """Build one abstract environment of `task`."""
-    found = task_named(task)
-    return SingleEnv(SeededSimulatorEnv(found.objective, NO_GROUNDING.simulator(found, 1)))
+    return SingleEnv(_abstract(task, 1))
 
 
 def point_maze_vector(num_envs: int, task: str, max_episode_steps: int) -> BatchedVectorEnv:
     """Build `num_envs` abstract environments of `task`."""
+    return BatchedVectorEnv(_abstract(task, num_envs), max_episode_steps)
+
+
+def _abstract(task: str, num_envs: int) -> SeededSimulatorEnv:
     found = task_named(task)
-    simulator = NO_GROUNDING.simulator(found, num_envs)
-    return BatchedVectorEnv(SeededSimulatorEnv(found.objective, simulator), max_episode_steps)
+    return SeededSimulatorEnv(SimulatorEnv(found.objective, NO_GROUNDING.simulator(found, num_envs)))

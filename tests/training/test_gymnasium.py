@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -9,8 +10,10 @@ from gymnasium.vector import AutoresetMode
 
 import astra_data.envs
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import TASKS
 
 gymnasium.register_envs(astra_data.envs)
@@ -45,6 +48,30 @@ def test_registration_loads_no_world() -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
+def test_without_gymnasium_one_line_says_how_to_install_it() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None; import astra_data.envs"
+    ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 1
+    last = ran.stderr.splitlines()[-1]
+    assert "BadInputError: gymnasium is needed and not installed: " in last and "astra-data[sim]" in last
+
+
+def test_failures_are_told_apart_from_successes() -> None:
+    task = TASKS["antmaze-umaze"]
+    walls = replace(task.objective, ends_at_walls=True)
+    simulator = NO_GROUNDING.simulator(task, 2)
+    env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(walls, simulator)), max_episode_steps=200)
+    env.reset(seed=0)
+    commands = np.array([[0.0, 0.0], [-1.0, 1.0]], dtype=np.float32)
+    for _ in range(100):
+        *_, terminated, _, infos = env.step(commands)
+        if terminated.any():
+            break
+    assert terminated.tolist() == [False, True]
+    assert infos["final_info"]["failed"].tolist() == [False, True]
+    assert not infos["failed"].any() and not infos["final_info"]["success"].any()
+
+
 @pytest.mark.filterwarnings("ignore:.*infinity")
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_own_checks_pass(name: str) -> None:
@@ -73,7 +100,7 @@ def test_one_env_is_truncated_and_tells_of_walls() -> None:
     for _ in range(60):
         _, _, terminated, truncated, info = env.step(np.array([-1.0, 1.0], dtype=np.float32))
     assert (terminated, truncated) == (False, True)
-    assert info == {"success": False, "wall_contact": True}
+    assert info == {"success": False, "failed": False, "wall_contact": True}
 
 
 def test_the_same_seed_repeats_all_episodes() -> None:
@@ -115,7 +142,8 @@ def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
     )
     for env in (ours, theirs):
         observation, infos = env.reset(seed=1)
-        assert set(infos) == {"success", "_success", "wall_contact", "_wall_contact"}
+        facts = ("success", "failed", "wall_contact")
+        assert set(infos) == {*facts, *(f"_{fact}" for fact in facts)}
         successes = 0
         for _ in range(500):
             observation, rewards, terminated, _, infos = env.step(goal_ward(observation))
@@ -147,7 +175,7 @@ def test_a_grounded_simulator_shows_its_latents() -> None:
     task = TASKS["antmaze-umaze"]
     model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
     grounded = HistoryGrounding(model.requires_grad_(False)).simulator(task, 3)
-    env = BatchedVectorEnv(SeededSimulatorEnv(task.objective, grounded), max_episode_steps=5)
+    env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(task.objective, grounded)), max_episode_steps=5)
     raw = point_mazes(3, max_episode_steps=5)
     first, _ = env.reset(seed=1)
     expected, _ = raw.reset(seed=1)

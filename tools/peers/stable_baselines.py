@@ -25,6 +25,7 @@ from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.train import PpoTrainConfig
 from astra_data.worlds.registry import TASKS
 
@@ -59,7 +60,7 @@ def main(algorithm: Algorithm, face: Face) -> None:
     horizon = task.objective.horizon
 
     def world(num_envs: int) -> SeededSimulatorEnv:
-        return SeededSimulatorEnv(task.objective, grounding.simulator(task, num_envs))
+        return SeededSimulatorEnv(SimulatorEnv(task.objective, grounding.simulator(task, num_envs)))
 
     def single() -> gymnasium.Env[Array, Array]:
         return gymnasium.wrappers.TimeLimit(SingleEnv(world(1)), horizon)

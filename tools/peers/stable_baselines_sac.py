@@ -15,6 +15,7 @@ from stable_baselines3 import SAC
 
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
+from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import TASKS
 
 
@@ -22,7 +23,7 @@ def main(count: int, updates: int, steps: int) -> None:
     """Train on demand."""
     torch.set_num_threads(1)
     task = TASKS["humanoid-walker2d"]
-    world = SeededSimulatorEnv(task.objective, NO_GROUNDING.simulator(task, count))
+    world = SeededSimulatorEnv(SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, count)))
     learner = SAC(
         "MlpPolicy",
         Rows(BatchedVectorEnv(world, task.objective.horizon)),

@@ -1,15 +1,19 @@
-"""Gymnasium ids of the target environments and of the abstract simulators, registered on import.
+"""Gymnasium ids of targets, of abstract simulators and of what a run grounded, registered on import.
 
     import astra_data.envs
     gymnasium.make("astra_data/AntMazeUMaze-v0")
     gymnasium.make_vec("astra_data/AntMazeUMaze-v0", num_envs=64)
+    gymnasium.make("astra_data/Grounded-v0", run="runs/cart", row="nas", seed=0)
 
 Everything else stays unloaded until an environment is made.
 """
 
-import gymnasium
+from astra_data.core.optional import optional
+
+gymnasium = optional("gymnasium", "sim")
 
 _FACES = "astra_data.training.gymnasium"
+_GROUNDED = "astra_data.experiments.grounded_env"
 
 for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaze-long", 1000)):
     for _world, _faces in (("AntMaze", "ant_maze"), ("PointMaze", "point_maze")):
@@ -20,3 +24,9 @@ for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaz
             max_episode_steps=_horizon,
             kwargs={"task": _task},
         )
+
+gymnasium.register(
+    "astra_data/Grounded-v0",
+    entry_point=f"{_GROUNDED}:grounded",
+    vector_entry_point=f"{_GROUNDED}:grounded_vector",
+)

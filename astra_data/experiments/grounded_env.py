@@ -1,0 +1,174 @@
+"""The environment in which a row of a run is trained, for learners of other libraries; their policies tested.
+
+Gymnasium's "astra_data/Grounded-v0" is made here.
+"""
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.config import did_you_mean, validated
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import is_plus, place
+from astra_data.core.progress import Progress, silent
+from astra_data.experiments.plan import plan
+from astra_data.experiments.points import Selection
+from astra_data.experiments.recipe import Recipe
+from astra_data.experiments.trained_policy import settings_of
+from astra_data.grounding.files import load_grounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.methods import method_named
+from astra_data.training.build_env import EnvConfig
+from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.training.own_policy import ActingPolicy, OwnPolicy
+from astra_data.training.policy_file import PolicyFile, Simulation
+from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.train import InSimulator, Training
+from astra_data.worlds.registry import task_named
+
+OPTIONS = tuple(name for name in EnvConfig.model_fields if name != "ramp")
+"""The keywords of an environment; a ramp is the training's, not the environment's."""
+
+
+def grounded(
+    run: str | Path,
+    row: str,
+    seed: int = 0,
+    percent: int | None = None,
+    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+) -> SingleEnv:
+    """Build the environment of one robot in which a row of a run is trained.
+
+    Args:
+        run: the folder of a run, such as "runs/cart", made at least until `ground`.
+        row: a row that is trained in a simulator; "direct_transfer" for the raw one.
+        seed: one of the recipe's seeds: that of the data and the grounding.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+        options: those of `OPTIONS` that are not to be as in the recipe, see `EnvConfig`.
+
+    Raises:
+        BadInputError: the row is not trained in a simulator, an artefact is not there, or an option does not
+            fit the row or the task.
+    """
+    env, _, training = _world(run, row, seed, percent, num_envs=1, **options)
+    return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
+
+
+def grounded_vector(
+    num_envs: int,
+    run: str | Path,
+    row: str,
+    seed: int = 0,
+    percent: int | None = None,
+    max_episode_steps: int | None = None,
+    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+) -> BatchedVectorEnv:
+    """Build `num_envs` of the environments that `grounded` builds, stepped at once.
+
+    Raises:
+        BadInputError: as `grounded`.
+    """
+    env, _, training = _world(run, row, seed, percent, num_envs=num_envs, **options)
+    steps = training.simulated_steps
+    return BatchedVectorEnv(SeededSimulatorEnv(env), min(steps, max_episode_steps or steps))
+
+
+def evaluate_policy(
+    run: str | Path,
+    row: str,
+    policy: ActingPolicy,
+    *,
+    out: str | Path,
+    seed: int = 0,
+    percent: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Test a policy of another learner as `evaluate` tests that of a row, and write the figures to `out`.
+
+    It is shown what the row's environment shows; the latent, if the row has one, comes from the row's
+    encoder, in the target from the aligned one. Starts and goals are those of the rows of this seed.
+
+    Args:
+        run: the folder of a run, such as "runs/cart".
+        row: the row in whose environment it was trained.
+        policy: has `act(observation) -> action`, see `ActingPolicy`.
+        out: the folder to write.
+        seed: one of the recipe's seeds.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: as `grounded`, or the policy returns something else than actions.
+    """
+    env, simulation, training = _world(run, row, seed, percent, num_envs=1)
+    own = OwnPolicy(policy, env.observation_size, env.action_size)
+    episodes = training.episodes
+    tested = {"methods": [row], "seeds": [seed]} | settings_of(run)
+    evaluate = _planned(run, tested, "evaluate", row, seed, percent)
+    _check_made(evaluate.keywords, ("target_encoder", "reference"))
+    evaluate(
+        policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash),
+        out=Path(out),
+        progress=progress,
+    )
+
+
+def _world(
+    run: str | Path,
+    row: str,
+    seed: int,
+    percent: int | None,
+    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+) -> tuple[SimulatorEnv, Simulation, Training]:
+    """Return the environment that `train` builds for a row, and what it builds it from."""
+    learn = method_named(row).learn
+    if not isinstance(learn, InSimulator):
+        raise BadInputError(
+            f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
+            "direct_transfer for the raw simulator"
+        )
+    if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
+        raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
+    settings, table = settings_of(run), "plus" if is_plus(row) else "train"
+    changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | options}
+    of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
+    _check_made(of_train, ("dataset", "grounding"))
+    episodes = PairedEpisodes.load(of_train["dataset"])
+    grounding: Grounding = NO_GROUNDING
+    if of_train["grounding"]:
+        grounding = load_grounding(of_train["grounding"] / "grounding.safetensors")
+    training = Training(
+        task=task_named(of_train["task"]),
+        config=of_train["config"],
+        settings=of_train["settings"],
+        episodes=episodes,
+        grounding=grounding,
+        initial=None,
+        seed=seed,
+        device="cpu",
+        folder=Path(run),
+        progress=silent,
+    )
+    return *learn.world(training), training
+
+
+def _planned(
+    run: str | Path, settings: dict[str, Any], stage: str, row: str, seed: int, percent: int | None
+) -> partial[object]:
+    """Return the call by which a run with these `settings` makes the artefact of a row."""
+    recipe = validated(settings, Recipe, f"{run}")
+    only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
+    items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
+    call = items.get(f"{stage}/{row}/{place(seed, percent)}")
+    if not isinstance(call, partial):
+        raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
+    return call
+
+
+def _check_made(given: dict[str, Any], artefacts: Iterable[str]) -> None:
+    """Refuse a call to which one of the `artefacts` is given that is not there."""
+    if missing := [str(given[name]) for name in artefacts if given[name] and not given[name].is_dir()]:
+        raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")
