@@ -188,9 +188,11 @@ def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: P
 
 
 def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> None:
+    make: Callable[..., Any] = gymnasium.make
+
     def refused(message: str, **options: Any) -> None:  # noqa: ANN401
         with pytest.raises(AstraDataError, match=message) as raised:
-            gymnasium.make(ID, **{"run": run, "row": "nas"} | options)
+            make(ID, **{"run": run, "row": "nas"} | options)
         assert "\n" not in str(raised.value)
 
     refused("expected the folder of a run", run=tmp_path)
