@@ -160,6 +160,9 @@ def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
                 return number
         raise AssertionError
 
+    env = gymnasium.make(ID, run=run, row="nas", episode_steps=2).unwrapped
+    ends = [env.reset() and [env.step(np.zeros(2, dtype=np.float32))[3] for _ in range(2)] for _ in range(2)]
+    assert ends == [[False, True], [False, True]]
     assert (steps(), steps(episode_steps=7), steps(max_episode_steps=5)) == (150, 7, 5)
     make: Callable[..., Any] = gymnasium.make_vec
     vectors = [make(ID, num_envs=3, run=run, row="nas", **more) for more in ({}, {"max_episode_steps": 6})]
@@ -169,7 +172,8 @@ def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
 
 def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: Path) -> None:
     options: dict[str, Any] = {"run": run, "row": "nas", "residual_noise": 1.0}
-    many, one = gymnasium.make_vec(ID, num_envs=1, **options), gymnasium.make(ID, **options)
+    make: Any = gymnasium.make
+    many, one = gymnasium.make_vec(ID, num_envs=1, **options), make(ID, **options)
     quiet = gymnasium.make(ID, run=run, row="nas", residual_noise=0.0)
     action = np.array([0.5, 0.2], dtype=np.float32)
 
@@ -184,10 +188,11 @@ def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: P
 
 
 def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> None:
+    make: Callable[..., Any] = gymnasium.make
+
     def refused(message: str, **options: Any) -> None:  # noqa: ANN401
-        arguments: dict[str, Any] = {"run": run, "row": "nas"} | options
         with pytest.raises(AstraDataError, match=message) as raised:
-            gymnasium.make(ID, **arguments)
+            make(ID, **{"run": run, "row": "nas"} | options)
         assert "\n" not in str(raised.value)
 
     refused("expected the folder of a run", run=tmp_path)
