@@ -23,6 +23,8 @@ BESIDE = {
     "steps": ("failed", "simulated_steps"),
 }
 """Headline → the other measures in the table of scores."""
+OF_PLANES = {"wall_contact", "distance"}
+"""Of these, what tasks without walls and places do not have."""
 
 COLUMNS = {
     "failed": ("failed", 2),
@@ -81,8 +83,10 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 def _scores(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return head and lines of the table of scores."""
     rows, scores, beside = results.methods, results.scores, BESIDE[results.headline.measure]
-    if results.tested_in != "target":
-        beside = tuple(measure for measure in beside if any(map(_some(measure), rows.values())))
+    bare = OF_PLANES if results.tested_in == "target" else beside
+    beside = tuple(
+        measure for measure in beside if measure not in bare or any(map(_some(measure), rows.values()))
+    )
     best = {
         score: max((row.summary[score.measure].mean for row in rows.values() if not row.role), default=None)
         for score in scores

@@ -62,6 +62,14 @@ def test_the_table_has_a_row_for_each_method_and_the_best_in_bold(page: str) -> 
     assert "on Fast, 8 cores, 16 GiB of memory, H200. Wall time of the stages, summed: 3 min.\n" in page
 
 
+def test_a_task_without_walls_and_places_has_no_columns_of_them(results: Results, page: str) -> None:
+    assert "wall contact | steps |" in page and "Wall contact: share of steps." in page
+    bare = rows_of(results, **{row: {"wall_contact": [0.0] * 3, "distance": [0.0] * 3} for row in ROWS})
+    changed = page_of(results, methods=bare)
+    assert "wall contact" not in changed.lower() and "way to success" not in changed
+    assert "| failed | steps | return |" in changed
+
+
 def test_the_papers_figures_stand_beside_ours(results: Results, page: str) -> None:
     assert "the paper's" not in page
     changed = page_of(results, paper_success={"astra": 0.4})
