@@ -2,4 +2,5 @@
 
 from astra_data.cli.app import main
 
-main()
+if __name__ == "__main__":
+    main()

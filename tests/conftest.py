@@ -35,7 +35,8 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     }
     model: type[Recipe] = recipe.with_tables(recipe.Recipe, stages.values(), ())
     monkeypatch.setattr(plan, "STAGES", stages)
-    for module in (plan, recipe, experiment):
+    methods = importlib.import_module("astra_data.methods")
+    for module in (plan, recipe, experiment, methods):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
     monkeypatch.setattr(experiment, "Recipe", model)

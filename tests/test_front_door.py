@@ -66,7 +66,7 @@ def test_every_name_is_what_it_says_and_has_an_example(name: str) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with what the examples begin with: walks, their pairs, and a small recipe."""
     made = tmp_path_factory.mktemp("examples")
-    config = CollectConfig(episodes=12, max_steps=60, start="task")
+    config = CollectConfig(episodes=12, max_steps=20, start="task")
     collect("antmaze-umaze", config, seed=0, name="walks", out=made / "walks", progress=silent)
     astra_data.pair("antmaze-umaze", dataset=made / "walks", out=made / "pairs")
     (made / "small.toml").write_text(RECIPE)

@@ -32,7 +32,7 @@ class Dataset(Contents):
         >>> data.reference, len(data)
         ('walks@data-1.0.0', 12)
         >>> data.columns(["action"])["action"].shape  # (N, A)
-        (720, 2)
+        (240, 2)
     """
 
     @classmethod

@@ -1,9 +1,7 @@
 """Run recipes: make every artefact that is not finished yet, for every row and seed."""
 
-from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -12,12 +10,12 @@ import torch
 from rich.console import Console
 
 from astra_data.core.config import did_you_mean
-from astra_data.core.cores import cores
 from astra_data.core.durable import clean, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
+from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
 from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
@@ -35,8 +33,6 @@ from astra_data.worlds.walk_through import check_task
 RUNS = Path("runs")
 SET_ASIDE = "set_aside"
 """The folder of a run for artefacts that are made again: what took hours to make is not deleted."""
-CUDA_JOBS = 2
-"""Items at a time on a CUDA device, where each process has its own context."""
 
 
 def run(
@@ -54,7 +50,7 @@ def run(
         recipe_path: the recipe.
         seeds: the recipe's seeds to make and to report; by default all.
         root: folder with the recipe's folder.
-        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
+        jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
         until: the last stage to run, by default all; after "ground" comes a page of held-out errors.
 
@@ -171,7 +167,7 @@ def make(
     Args:
         experiment: whose artefacts they are.
         items: each after those it reads.
-        jobs: number of items at a time; by default one per core, or `CUDA_JOBS` on a CUDA device.
+        jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
         cluster: address of the Ray cluster to run on, or "local" to start one; by default processes of
             this machine are used.
@@ -184,7 +180,7 @@ def make(
             a dataset is damaged that the recipe cannot make again.
         AstraDataError: an item failed.
     """
-    _check_device(device, cluster)
+    check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder) as ours:
@@ -210,10 +206,10 @@ def make(
         prepare, logs = partial(_prepare, dict(recipe.own_methods)), folder / "logs"
         with show(len(items), console) as watch:
             if cluster is None:
-                jobs = jobs or _default_jobs(device)
-                execute(_share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+                jobs = jobs or default_jobs(device)
+                execute(share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
             else:
-                items = [_with_threads(item, 1) for item in items]
+                items = [with_threads(item, 1) for item in items]
                 execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
 
 
@@ -256,22 +252,6 @@ def _set_aside(folder: Path, key: str) -> Path:
     return aside
 
 
-def _default_jobs(device: str) -> int:
-    return CUDA_JOBS if torch.device(device).type == "cuda" else cores()
-
-
-def _share_cores(items: Collection[Item], jobs: int) -> list[Item]:
-    """Give the items that step the target's physics their share of the cores."""
-    counts = Counter(map(stage_of, items))
-    return [_with_threads(item, max(1, cores() // min(jobs, counts[stage_of(item)]))) for item in items]
-
-
-def _with_threads(item: Item, num_threads: int) -> Item:
-    if not item.is_threaded:
-        return item
-    return replace(item, call=partial(item.call, num_threads=num_threads))
-
-
 def finished(item: Item, experiment: Experiment) -> bool:
     """Return whether the artefact of `item` is finished and need not be made again."""
     return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
@@ -291,18 +271,3 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
     if not selected:
         raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
     return selected
-
-
-def _check_device(device: str, cluster: str | None) -> None:
-    try:
-        wanted = torch.device(device)
-    except RuntimeError:
-        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'") from None
-    if cluster is not None:
-        # Ray gives each task its own GPU, which is the only one that it sees.
-        if wanted.index:
-            raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
-        return
-    count = torch.cuda.device_count()
-    if wanted.type == "cuda" and (wanted.index or 0) >= count:
-        raise BadInputError(f"device '{device}' is not available: torch finds {count} CUDA devices")

@@ -74,7 +74,7 @@ def pair(
         >>> pairs = pair("antmaze-umaze", dataset="walks", out=Path("pairs_again"))
         >>> landed = "abstract.simulated_next_state"
         >>> Dataset.open(pairs).columns([landed])[landed].shape  # (N, X)
-        (720, 4)
+        (240, 4)
     """
     pairing = pairing_named(simulator)
     source = open_dataset(dataset)

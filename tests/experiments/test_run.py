@@ -64,7 +64,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(recipe: Path, tmp_path: P
 def test_items_side_by_side_share_the_cores(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int | None, each_of_two: int
 ) -> None:
-    monkeypatch.setattr("astra_data.experiments.run.cores", lambda: 3)
+    monkeypatch.setattr("astra_data.experiments.devices.cores", lambda: 3)
     folder = run(recipe, root=tmp_path, jobs=jobs)
     assert asked(folder / "collect/seed_0")["num_threads"] == 3
     for row in ("astra", "astra_plus"):
@@ -74,7 +74,7 @@ def test_items_side_by_side_share_the_cores(
 def test_trainings_in_the_target_get_their_share_of_the_cores_and_one_table(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.experiments.run.cores", lambda: 8)
+    monkeypatch.setattr("astra_data.experiments.devices.cores", lambda: 8)
     methods = '["direct_transfer", "target", "full_obs"]'
     recipe.write_text(f'task = "maze"\nmethods = {methods}\nseeds = [0]\n[target]\nnum_envs = 7\n')
     folder = run(recipe, root=tmp_path, jobs=2, until="train")
@@ -96,7 +96,7 @@ def test_few_items_at_a_time_hold_a_context_of_a_gpu(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, jobs: int
 ) -> None:
     told: list[int] = []
-    monkeypatch.setattr("astra_data.experiments.run.cores", lambda: 5)
+    monkeypatch.setattr("astra_data.experiments.devices.cores", lambda: 5)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     monkeypatch.setattr("astra_data.experiments.run.execute", lambda *_, jobs, **__: told.append(jobs))
     run(recipe, root=tmp_path, device=device)
