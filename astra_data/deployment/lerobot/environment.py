@@ -12,6 +12,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
+from lerobot.utils.constants import OBS_STR
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
@@ -22,9 +24,6 @@ from astra_data.worlds.task import Task
 
 Array = NDArray[Any]
 
-_SHOWN_AS = {"agent_pos": STATE, "environment_state": GOAL, "action": ACTION}
-"""LeRobot's names of what environments show and take, and the columns that it makes of them."""
-
 _BLANK = (64, 64, 3)
 """The size of the pictures where a task has no `photograph`."""
 
@@ -32,7 +31,10 @@ _BLANK = (64, 64, 3)
 @EnvConfig.register_subclass(TYPE)
 @dataclass
 class AstraDataEnv(EnvConfig):  # type: ignore[misc]
-    """The target of `task`: a name, or a place such as cart.py:TASK, whose code is run."""
+    """The target of `task`: a name, or a place such as cart.py:TASK, whose code is run.
+
+    Its values have the names of datasets' columns, so that recordings are datasets of this package as well.
+    """
 
     def __post_init__(self) -> None:
         """Take rate and sizes from the task.
@@ -44,18 +46,24 @@ class AstraDataEnv(EnvConfig):  # type: ignore[misc]
             raise BadInputError("--env.task: expected a task, such as antmaze-umaze or cart.py:TASK")
         task = task_named(self.task)
         sizes = {
-            "agent_pos": (FeatureType.STATE, task.state.size),
-            "environment_state": (FeatureType.ENV, task.objective.goal_size),
-            "action": (FeatureType.ACTION, task.objective.action_size),
+            STATE: (FeatureType.STATE, task.state.size),
+            GOAL: (FeatureType.ENV, task.objective.goal_size),
+            ACTION: (FeatureType.ACTION, task.objective.action_size),
         }
         self.fps = task.fps
         self.features = {name: PolicyFeature(kind, (size,)) for name, (kind, size) in sizes.items() if size}
-        self.features_map = {name: _SHOWN_AS[name] for name in self.features}
+        self.features_map = {name: name for name in self.features}
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Nothing: the environment is made here, not by an id."""
         return {}
+
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Return what takes the prefix away again that LeRobot gives to names which are not its own."""
+        names = {f"{OBS_STR}.{name}": name for name in (STATE, GOAL)}
+        steps = [RenameObservationsProcessorStep(rename_map=names)]
+        return PolicyProcessorPipeline(steps=steps), PolicyProcessorPipeline(steps=[])
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
@@ -84,7 +92,7 @@ class TargetRobot(gymnasium.Env[dict[str, Array], Array]):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": task.fps}
         self.render_mode = "rgb_array"
         self._max_episode_steps = task.objective.horizon
-        sizes = {"agent_pos": task.state.size, "environment_state": task.objective.goal_size}
+        sizes = {STATE: task.state.size, GOAL: task.objective.goal_size}
         self.observation_space = Dict(
             {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items() if size}
         )
@@ -125,5 +133,5 @@ class TargetRobot(gymnasium.Env[dict[str, Array], Array]):
         return self._task.photograph(self._env.state.double().numpy())[0]
 
     def _observe(self) -> dict[str, Array]:
-        shown = {"agent_pos": self._env.state, "environment_state": self._env.goal}
+        shown = {STATE: self._env.state, GOAL: self._env.goal}
         return {name: shown[name][0].numpy().copy() for name in self.observation_space}

@@ -1,4 +1,4 @@
-"""What LeRobot reads in the folder of a policy: its settings, and what it does to observations and commands."""
+"""What LeRobot reads in the folder of a policy: its settings, and what it does with what it is shown."""
 
 import json
 from collections.abc import Mapping
