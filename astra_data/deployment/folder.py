@@ -14,6 +14,7 @@ from astra_data.core.provenance import origin
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, TORCHSCRIPT, write_graphs
+from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.deployment.page import page
 from astra_data.experiments.trained_policy import load_policy, policy_files, task_of
 from astra_data.training.deployment import DeployedPolicy
@@ -60,6 +61,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
         }
         (folder / DESCRIPTION).write_text(json.dumps(about, indent=1))
         (folder / PAGE).write_text(page(about))
+        write_lerobot_files(about, folder)
         with as_file(files("astra_data.deployment") / LOOP) as loop:
             shutil.copyfile(loop, folder / LOOP)
         write_manifest(folder, digests)

@@ -1,0 +1,137 @@
+"""The target of a task, as an environment of LeRobot."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
+from lerobot.utils.constants import OBS_STR
+from numpy.typing import NDArray
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, GOAL, STATE
+from astra_data.deployment.lerobot.files import TYPE
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.task import Task
+
+Array = NDArray[Any]
+
+_BLANK = (64, 64, 3)
+"""The size of the pictures where a task has no `photograph`."""
+
+
+@EnvConfig.register_subclass(TYPE)
+@dataclass
+class AstraDataEnv(EnvConfig):  # type: ignore[misc]
+    """The target of `task`: a name, or a place such as cart.py:TASK, whose code is run.
+
+    Its values have the names of datasets' columns, so that recordings are datasets of this package as well.
+    """
+
+    def __post_init__(self) -> None:
+        """Take rate and sizes from the task.
+
+        Raises:
+            BadInputError: none is named, or it is not known.
+        """
+        if self.task is None:
+            raise BadInputError("--env.task: expected a task, such as antmaze-umaze or cart.py:TASK")
+        task = task_named(self.task)
+        sizes = {
+            STATE: (FeatureType.STATE, task.state.size),
+            GOAL: (FeatureType.ENV, task.objective.goal_size),
+            ACTION: (FeatureType.ACTION, task.objective.action_size),
+        }
+        self.fps = task.fps
+        self.features = {name: PolicyFeature(kind, (size,)) for name, (kind, size) in sizes.items() if size}
+        self.features_map = {name: name for name in self.features}
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Nothing: the environment is made here, not by an id."""
+        return {}
+
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Return what takes the prefix away again that LeRobot gives to names which are not its own."""
+        names = {f"{OBS_STR}.{name}": name for name in (STATE, GOAL)}
+        steps = [RenameObservationsProcessorStep(rename_map=names)]
+        return PolicyProcessorPipeline(steps=steps), PolicyProcessorPipeline(steps=[])
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gymnasium.vector.VectorEnv[Any, Any, Any]]]:
+        """Build `n_envs` targets, which are stepped one after another in this process."""
+        make = freeze_after_episode_end(partial(TargetRobot, task_named(self.task)))
+        return {TYPE: {0: SyncVectorEnv([make] * n_envs, autoreset_mode=AutoresetMode.NEXT_STEP)}}
+
+
+class TargetRobot(gymnasium.Env[dict[str, Array], Array]):
+    """One robot of a task's target; commands (A,) are in their units, and clipped to their bounds.
+
+    Attributes:
+        task: the task's name. task_description: in words.
+    """
+
+    def __init__(self, task: Task) -> None:
+        """Build the target of `task`, with a seed of its own until `reset` gives one.
+
+        Raises:
+            BadInputError: it has none.
+        """
+        seed = int(np.random.default_rng().integers(2**62))
+        self._env, self._task = task.target(1, seed=seed, num_threads=1), task
+        self.task, self.task_description = task.name, task.instruction
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": task.fps}
+        self.render_mode = "rgb_array"
+        self._max_episode_steps = task.objective.horizon
+        sizes = {STATE: task.state.size, GOAL: task.objective.goal_size}
+        self.observation_space = Dict(
+            {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items() if size}
+        )
+        least, largest = np.array(list(task.limits.values()), np.float32).T
+        self.action_space = Box(least, largest)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Start an episode; `options` are not used."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._env.reseed(seed)
+        self._env.reset()
+        self._age = 0
+        return self._observe(), {"is_success": False}
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        """Give the robot a command (A,) for one control period."""
+        command = torch.tensor(action, dtype=torch.float32)[None]
+        step = self._env.step(self._task.limits.normal(command))
+        self._age += 1
+        objective = self._task.objective
+        success = objective.succeeded(step.success, self._env.failed, self._age)
+        truncated = self._age >= objective.horizon
+        return (
+            self._observe(),
+            float(step.reward[0]),
+            bool(step.terminated[0]),
+            truncated,
+            {"is_success": bool(success[0])},
+        )
+
+    def render(self) -> Array:  # type: ignore[override]
+        """Return a picture (height, width, 3) of the state; a blank one, if the task has no `photograph`."""
+        if self._task.photograph is None:
+            return np.full(_BLANK, 255, np.uint8)
+        return self._task.photograph(self._env.state.double().numpy())[0]
+
+    def _observe(self) -> dict[str, Array]:
+        shown = {STATE: self._env.state, GOAL: self._env.goal}
+        return {name: shown[name][0].numpy().copy() for name in self.observation_space}

@@ -1,0 +1,100 @@
+"""A policy that `astra-data deploy` wrote, as LeRobot's tools run one."""
+
+import json
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import GOAL, STATE
+from astra_data.deployment.folder import DESCRIPTION
+from astra_data.deployment.graph import TORCHSCRIPT, load_torchscript
+from astra_data.deployment.lerobot.configuration_astra_data import AstraDataConfig
+from astra_data.deployment.lerobot.files import TYPE
+
+
+class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
+    """The graph of the policy's folder, with a hidden state for each of B robots. It runs on the CPU."""
+
+    config_class = AstraDataConfig
+    name = TYPE
+
+    def __init__(self, config: AstraDataConfig, **_: object) -> None:
+        """Read the folder `config.pretrained_path`.
+
+        Raises:
+            BadInputError: there is none, or it is not the folder of a policy.
+        """
+        super().__init__(config)
+        folder = config.pretrained_path
+        if folder is None or not (Path(folder) / DESCRIPTION).is_file():
+            raise BadInputError(
+                f"--policy.path: expected a folder that astra-data deploy wrote, got {folder or 'none'}"
+            )
+        self._about: dict[str, Any] = json.loads((Path(folder) / DESCRIPTION).read_text())
+        self._graph = load_torchscript(Path(folder) / TORCHSCRIPT)
+        self.reset()
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path, *, config: AstraDataConfig | None = None, **_: object
+    ) -> "AstraDataPolicy":
+        """Return the policy in a folder, ready to act.
+
+        Raises:
+            BadInputError: it is not the folder of a policy.
+        """
+        config = config or AstraDataConfig.from_pretrained(pretrained_name_or_path)
+        config.pretrained_path = Path(pretrained_name_or_path)
+        policy: AstraDataPolicy = cls(config).eval()
+        return policy
+
+    def reset(self) -> None:
+        """Forget the last episodes."""
+        self._hidden: Tensor | None = None
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """Return commands (B, A), in their units, for the states (B, S) and goals (B, G) of `batch`.
+
+        Raises:
+            BadInputError: values are missing, too many or not finite.
+        """
+        state = self._checked(batch, STATE, "state")
+        goal = self._checked(batch, GOAL, "goal") if self._about["goal"]["names"] else state[:, :0]
+        if self._hidden is None:
+            self._hidden = torch.zeros(len(state), self._about["hidden"]["size"])
+        # The graph is of one robot.
+        rows = [part.split(1) for part in (state, goal, self._hidden)]
+        steps = [self._graph(*row) for row in zip(*rows, strict=True)]
+        commands, hidden = zip(*steps, strict=True)
+        self._hidden = torch.cat(hidden)
+        return torch.cat(commands).to(batch[STATE].device)
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """Return chunks (B, 1, A) of one command."""
+        return self.select_action(batch).unsqueeze(1)
+
+    def forward(self, batch: dict[str, Tensor]) -> NoReturn:
+        """Refuse.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError("LeRobot does not train this policy: astra-data train does")
+
+    def get_optim_params(self) -> NoReturn:
+        """Refuse, likewise."""
+        self.forward({})
+
+    def _checked(self, batch: dict[str, Tensor], column: str, called: str) -> Tensor:
+        names, given = self._about[called]["names"], batch.get(column)
+        if given is None or given.ndim != 2 or given.shape[1] != len(names) or not given.isfinite().all():
+            came = "none" if given is None else f"the shape {tuple(given.shape)}"
+            raise BadInputError(
+                f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}"
+            )
+        return given.float().cpu()
