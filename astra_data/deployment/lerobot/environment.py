@@ -73,7 +73,7 @@ class AstraDataEnv(EnvConfig):  # type: ignore[misc]
         return {TYPE: {0: SyncVectorEnv([make] * n_envs, autoreset_mode=AutoresetMode.NEXT_STEP)}}
 
 
-class TargetRobot(gymnasium.Env[dict[str, Array], Array]):
+class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
     """One robot of a task's target; commands (A,) are in their units, and clipped to their bounds.
 
     Attributes:
@@ -92,9 +92,9 @@ class TargetRobot(gymnasium.Env[dict[str, Array], Array]):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": task.fps}
         self.render_mode = "rgb_array"
         self._max_episode_steps = task.objective.horizon
-        sizes = {STATE: task.state.size, GOAL: task.objective.goal_size}
+        self._sizes = {STATE: task.state.size} | ({GOAL: goal} if (goal := task.objective.goal_size) else {})
         self.observation_space = Dict(
-            {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items() if size}
+            {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in self._sizes.items()}
         )
         least, largest = np.array(list(task.limits.values()), np.float32).T
         self.action_space = Box(least, largest)
@@ -126,12 +126,13 @@ class TargetRobot(gymnasium.Env[dict[str, Array], Array]):
             {"is_success": bool(success[0])},
         )
 
-    def render(self) -> Array:  # type: ignore[override]
+    def render(self) -> Array:
         """Return a picture (height, width, 3) of the state; a blank one, if the task has no `photograph`."""
         if self._task.photograph is None:
             return np.full(_BLANK, 255, np.uint8)
-        return self._task.photograph(self._env.state.double().numpy())[0]
+        picture: Array = self._task.photograph(self._env.state.double().numpy())[0]
+        return picture
 
     def _observe(self) -> dict[str, Array]:
         shown = {STATE: self._env.state, GOAL: self._env.goal}
-        return {name: shown[name][0].numpy().copy() for name in self.observation_space}
+        return {name: shown[name][0].numpy().copy() for name in self._sizes}
