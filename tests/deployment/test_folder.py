@@ -45,7 +45,8 @@ def folder(run: Path) -> Path:
 def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) -> None:
     names = {path.name for path in folder.iterdir()}
     graphs = {"policy.onnx", "policy.torchscript"}
-    assert names == graphs | {"policy.json", "README.md", "run_policy.py", "manifest.json"}
+    of_lerobot = {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
+    assert names == graphs | of_lerobot | {"policy.json", "README.md", "run_policy.py", "manifest.json"}
     about = json.loads((folder / "policy.json").read_text())
     task = TASKS["antmaze-umaze"]
     assert about["rate_hz"] == 20 and about["row"] == "nas" and about["encoder"] == "source"
