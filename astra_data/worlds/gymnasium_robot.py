@@ -29,6 +29,18 @@ def if_terminated(state: State, terminated: bool) -> bool:
     return terminated
 
 
+def made(env_id: str, **options: Any) -> Env:  # noqa: ANN401 - handed on
+    """Return the environment `env_id` with its `options`, without wrappers.
+
+    Raises:
+        BadInputError: it cannot be made.
+    """
+    with explained(f"gymnasium.make({env_id!r})"):
+        # The horizon is the task's, and what is wrong with states is told by the task.
+        env: Env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **options)
+    return env.unwrapped
+
+
 class GymnasiumRobot:
     """One environment of Gymnasium as a robot: its rewards, goals and time limit are left out.
 
@@ -67,11 +79,7 @@ class GymnasiumRobot:
         Raises:
             BadInputError: the environment cannot be made.
         """
-        with explained(f"gymnasium.make({env_id!r})"):
-            # The horizon is the task's, and what is wrong with states is told by the task.
-            self.env: Env = gymnasium.make(
-                env_id, max_episode_steps=-1, disable_env_checker=True, **options
-            ).unwrapped
+        self.env = made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
 
     def reset(self, seed: int | None = None) -> State:

@@ -18,8 +18,10 @@ from astra_data.worlds.walk_through import check_task
 
 FETCH = Path(__file__).parents[2] / "recipes/examples/fetch"
 SMALL = {
-    'methods = ["direct_transfer", "nas", "astra"]': 'methods = ["nas"]',
-    "episodes = 60": "episodes = 3",
+    'methods = ["direct_transfer", "nas", "astra", "astra_task_reward"]\nseeds = [1, 2, 3, 4, 5]': (
+        'methods = ["nas"]\nseeds = [0]'
+    ),
+    "episodes = 400": "episodes = 3",
     "episodes = 100": "episodes = 2",
     "max_steps = 50": "max_steps = 12",
     "updates = 1000": "updates = 2",
@@ -29,7 +31,7 @@ SMALL = {
     "held_out_share = 0.2": "held_out_share = 0.34",
     "num_envs = 64": "num_envs = 4\nhidden_sizes = [8]\nmemory_size = 4",
     "rollout_steps = 64": "rollout_steps = 8",
-    "total_steps = 1_000_000": "total_steps = 64",
+    "total_steps = 500_000": "total_steps = 64",
 }
 
 

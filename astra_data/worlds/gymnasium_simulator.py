@@ -1,0 +1,67 @@
+"""An abstract simulator that is an environment of Gymnasium whose state can be set."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from astra_data.worlds.gymnasium_robot import Env, made
+from astra_data.worlds.numpy_simulator import Floats, NumpySimulator
+from astra_data.worlds.robot import State
+
+
+class GymnasiumSimulator(NumpySimulator):
+    """B abstract states that one environment of Gymnasium steps, one after another.
+
+    A policy is trained in millions of steps, so it is meant for environments that step quickly, and for pairing.
+
+    Example:
+        >>> from functools import partial
+        >>> import torch
+        >>> from astra_data.worlds.gymnasium_simulator import GymnasiumSimulator
+        >>> def read(env):
+        ...     return env.state
+        >>> def write(env, state):
+        ...     env.state = state
+        >>> make_simulator = partial(GymnasiumSimulator, env_id="Pendulum-v1", size=2, read=read, write=write)
+        >>> make_simulator(3).step(torch.ones(3, 1)).shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        env_id: str,
+        size: int,
+        read: Callable[[Env], State],
+        write: Callable[[Env, State], object],
+        parameters: Mapping[str, float] | None = None,
+        **options: Any,  # noqa: ANN401 - handed on
+    ) -> None:
+        """Make the environment, and begin with B states of zeros.
+
+        Args:
+            num_envs: B.
+            env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0".
+            size: of a state, X.
+            read: returns the abstract state (X,) of the environment, without its wrappers.
+            write: sets it. All that a step depends on has to be in it.
+            parameters: numbers or texts about it, by default none.
+            options: of the environment.
+
+        Raises:
+            BadInputError: the environment cannot be made.
+        """
+        env = made(env_id, **options)
+        env.reset(seed=0)
+
+        def step_each(states: Floats, commands: Floats) -> Floats:
+            landed = np.empty_like(states)
+            for row, (state, command) in enumerate(zip(states, commands, strict=True)):
+                write(env, state)
+                env.step(command)
+                landed[row] = read(env)
+            return landed
+
+        super().__init__(num_envs, function=step_each, size=size, parameters=parameters)
