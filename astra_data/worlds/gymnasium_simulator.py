@@ -13,7 +13,7 @@ from astra_data.worlds.robot import State
 class GymnasiumSimulator(NumpySimulator):
     """B abstract states that one environment of Gymnasium steps, one after another.
 
-    A policy is trained in millions of steps, so it is meant for environments that step quickly, and for pairing.
+    A policy is trained in millions of steps, so it is for environments that step quickly, and for pairing.
 
     Example:
         >>> from functools import partial
