@@ -64,7 +64,7 @@ class Block:
     @property
     def commands(self) -> list[list[str]]:
         """The shell commands, without comments and set-up, as lists of words."""
-        lines = [part for line in self.text.splitlines() for part in line.split("&&")]
+        lines = [part for line in self.text.replace("\\\n", "").splitlines() for part in line.split("&&")]
         words = [shlex.split(line, comments=True) for line in lines]
         return [line[2:] if line[:2] == ["uv", "run"] else line for line in words if line]
 

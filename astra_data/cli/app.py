@@ -21,6 +21,7 @@ from astra_data.cli import (
     predicting,
     recipes,
     sharing,
+    starting,
     sweeping,
     tasks,
 )
@@ -63,6 +64,7 @@ def _options(
 
 PANELS: dict[str, dict[str, Callable[..., None]]] = {
     "Recipes": {
+        "new": starting.new,
         "run": recipes.run,
         "sweep": sweeping.sweep,
         "check": recipes.check,

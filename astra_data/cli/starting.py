@@ -1,0 +1,33 @@
+"""`astra-data new`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def new(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Of the robot: a-z, 0-9 and _.", show_default=False)
+    ],
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--from", help="Its logs: CSV files, or folders of them.", show_default="those of a made-up cart"
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
+) -> None:
+    """Begin with a robot of your own: a task, a recipe, a mapping of its logs, a test and a page."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from astra_data.experiments.new_robot import write_robot
+
+    folder = out or Path(name)
+    found = write_robot(name, folder, logs or ())
+    table = Table("field", "taken for", "unit", "factor", "why")
+    for field in found.fields:
+        table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
+    Console().print(table)
+    typer.echo(f"finished: {folder}; {folder}/README.md says how to go on, and CHECK marks what was guessed")

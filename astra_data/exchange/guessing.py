@@ -1,0 +1,225 @@
+"""What the fields of CSV logs are, guessed from their names and values; a person checks it."""
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.importers.csv import SUFFIXES
+
+Floats = NDArray[np.float64]
+Role = Literal["time", "episode", "state", "command", "failure", "success", "reward", "left out"]
+
+_COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref"
+_NAMES: tuple[tuple[Role, str], ...] = (
+    ("time", r"t|time|stamp|timestamp|secs?|seconds"),
+    ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
+    ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id"),
+    (
+        "failure",
+        r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|collision|collided|fault|terminated",
+    ),
+    ("success", r"success|succeeded|reached|delivered|solved"),
+    ("reward", r"reward"),
+    (
+        "command",
+        r"(.+_)?(cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref)(_.+|\d+)?|u(_.+|\d+)?",
+    ),
+)
+"""Roles by the whole of a field's name, without its unit; all other fields are states."""
+RATE_HZ = 10
+"""Of logs without a time."""
+_UNITS: tuple[tuple[str, str, float], ...] = (
+    ("mm_s", "m/s", 1e-3),
+    ("cm_s", "m/s", 1e-2),
+    ("m_s", "m/s", 1.0),
+    ("deg_s", "rad/s", math.pi / 180),
+    ("rad_s", "rad/s", 1.0),
+    ("rpm", "rad/s", math.pi / 30),
+    ("mm", "m", 1e-3),
+    ("cm", "m", 1e-2),
+    ("m", "m", 1.0),
+    ("deg", "rad", math.pi / 180),
+    ("rad", "rad", 1.0),
+    ("nm", "N m", 1.0),
+    ("n", "N", 1.0),
+    ("v", "V", 1.0),
+    ("a", "A", 1.0),
+)
+"""Endings of names, the unit that values are stored in, and the factor to it."""
+_TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
+_ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
+LENGTH = re.compile(r"(?!.*(heading|yaw|theta|psi|quat|vel|twist|speed|acc|rate|force|torque))(.+_)?[xyz]")
+_FULL_TURNS = 4 * math.pi
+"""An angle beyond it is taken for degrees."""
+_COMMAND = re.compile(rf"(^|_)({_COMMANDED}|u)(_|(?=\d)|$)")
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of the logs: `name` there and `short` here; `scale` takes its values to `unit`."""
+
+    name: str
+    role: Role
+    short: str
+    unit: str
+    scale: float
+    why: str
+
+    @property
+    def taken_for(self) -> str:
+        """Its role, with the name of a state or command."""
+        return f"{self.role} {self.short}" if self.role in ("state", "command") else self.role
+
+
+@dataclass(frozen=True)
+class Logs:
+    """Logs and what their fields are.
+
+    Attributes:
+        fields: in the order of the logs.
+        episodes: of each, the scaled values (T,) by a field's name.
+    """
+
+    fields: tuple[Field, ...]
+    episodes: tuple[dict[str, Floats], ...]
+
+    @property
+    def rate(self) -> int:
+        """Rows a second; `RATE_HZ` where the logs have no time."""
+        for field in self.of("time"):
+            steps = np.concatenate([np.diff(episode[field.name]) for episode in self.episodes])
+            return max(1, round(1 / float(np.median(steps))))
+        return RATE_HZ
+
+    def of(self, role: Role) -> tuple[Field, ...]:
+        """Return the fields with a role."""
+        return tuple(field for field in self.fields if field.role == role)
+
+    def values(self, fields: Sequence[Field]) -> list[Floats]:
+        """Return the values (T, len(fields)) of each episode."""
+        return [np.stack([episode[field.name] for field in fields], axis=-1) for episode in self.episodes]
+
+
+def guess(paths: Sequence[Path]) -> Logs:
+    """Read CSV logs, and guess what their fields are.
+
+    Args:
+        paths: files with the same header; a folder stands for the CSV files in it.
+
+    Raises:
+        BadInputError: there is no such file, it is no CSV, files differ, or there are no commands or states.
+    """
+    files = [file for path in paths for file in (_files(path) if path.is_dir() else [path])]
+    tables = {file: _numbers(file) for file in files}
+    header = list(next(iter(tables.values())))
+    for file, table in tables.items():
+        if list(table) != header:
+            raise BadInputError(f"{file}: expected the fields of {files[0]}, {header}: got {list(table)}")
+    joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
+    fields = tuple(_field(name, values) for name, values in joined.items())
+    found = Logs(fields, tuple(_episodes(fields, tables.values())))
+    for role, example in (("command", "cmd_v"), ("state", "x")):
+        if not found.of(role):  # type: ignore[arg-type]
+            listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
+            raise BadInputError(
+                f"{files[0]}: found no {role} among {listed}: name one in the header, such as {example}"
+            )
+    return found
+
+
+def _files(folder: Path) -> list[Path]:
+    found = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+    if not found:
+        raise BadInputError(f"{folder}: expected files that end in {' or '.join(SUFFIXES)}, found none")
+    return found
+
+
+def _numbers(path: Path) -> dict[str, Floats]:
+    """Return the fields of a file that are numbers, or true and false."""
+    try:
+        options = csv.ParseOptions(delimiter="\t" if path.suffix == ".tsv" else ",")
+        table = csv.read_csv(path, parse_options=options)
+    except FileNotFoundError:
+        raise BadInputError(f"{path}: there is no such file") from None
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
+        raise BadInputError(f"{path}: expected CSV with a header ({str(error).splitlines()[0]})") from None
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    names = [entry.name for entry in table.schema if any(kind(entry.type) for kind in kinds)]
+    if len(table) < 2 or not names or len(set(names)) < len(names):
+        raise BadInputError(f"{path}: expected a header of different names, and rows of numbers below it")
+    return {name: table[name].cast(pa.float64(), safe=False).to_numpy() for name in names}
+
+
+def _field(name: str, values: Floats) -> Field:
+    plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    body, ending = _without_unit(plain, _TIMES)
+    if re.fullmatch(_NAMES[0][1], body) and (np.diff(values) > 0).mean() > 0.9:
+        step = float(np.median(np.diff(values)))
+        unit = ending or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
+        return Field(
+            name, "time", "time", unit, _TIMES[unit], "its ending" if ending else f"steps of {step:g}"
+        )
+    body, ending = _without_unit(plain, [end for end, _, _ in _UNITS])
+    for role, pattern in _NAMES[1:]:
+        if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
+            if role in ("failure", "success") and not np.isin(values, (0, 1)).all():
+                continue
+            if role != "command":
+                return Field(name, role, role, "1", 1.0, "its name")
+            short = _COMMAND.sub("_", body).strip("_") or "command"
+            return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
+    if not np.isfinite(values).all() or np.ptp(values) == 0:
+        return Field(
+            name, "left out", plain, "1", 1.0, "has gaps" if np.isnan(values).any() else "never changes"
+        )
+    return _with_unit(name, "state", f"s{body}" if body[0].isdigit() else body, ending, values)
+
+
+def _without_unit(name: str, endings: Sequence[str] | dict[str, float]) -> tuple[str, str | None]:
+    for ending in endings:
+        if name.endswith(f"_{ending}") and len(name) > len(ending) + 1:
+            return name.removesuffix(f"_{ending}"), ending
+    return name, None
+
+
+def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Floats) -> Field:
+    for known, unit, scale in _UNITS:
+        if ending == known:
+            return Field(name, role, short, unit, scale, "its ending")
+    if role == "state" and _ANGLE.fullmatch(short):
+        if np.abs(values).max() > _FULL_TURNS:
+            return Field(
+                name, role, short, "rad", math.pi / 180, f"an angle up to {np.abs(values).max():.0f}: degrees"
+            )
+        return Field(name, role, short, "rad", 1.0, "its name")
+    if role == "state" and LENGTH.fullmatch(short):
+        return Field(name, role, short, "m", 1.0, "its name")
+    return Field(name, role, short, "1", 1.0, "no unit in its name")
+
+
+def _episodes(fields: Sequence[Field], tables: Iterable[dict[str, Floats]]) -> list[dict[str, Floats]]:
+    """Cut the files where the field of the episode changes, and scale their values."""
+    scaled = []
+    for table in tables:
+        values = {field.name: table[field.name] * field.scale for field in fields}
+        length = len(next(iter(values.values())))
+        cuts = {0, length}
+        for field in fields:
+            if field.role == "episode":
+                cuts |= set(1 + np.flatnonzero(np.diff(values[field.name])))
+        scaled += [
+            {name: column[first:last] for name, column in values.items()}
+            for first, last in pairwise(sorted(cuts))
+        ]
+    return scaled

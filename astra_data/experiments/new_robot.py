@@ -1,0 +1,128 @@
+"""A folder for a robot of one's own: a task, a recipe, a mapping of its logs, a test and a page."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, TERMINATED
+from astra_data.exchange.guessing import Logs, Role, guess
+from astra_data.experiments.robot_kinds import Direct, Planar, texts
+
+_COLUMNS: dict[Role, str] = {
+    "state": STATE,
+    "command": ACTION,
+    "failure": TERMINATED,
+    "success": SUCCESS,
+    "reward": REWARD,
+}
+
+
+def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Logs:
+    """Write the new folder `out` of the robot `name`; return what its logs hold.
+
+    Args:
+        name: of the task: letters, digits and _.
+        out: the folder to write.
+        logs: CSV files, or folders of them; by default those of a made-up cart, which are written too.
+
+    Raises:
+        BadInputError: `name` is no name, `out` exists, or the logs are of no use: see `guess`.
+    """
+    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
+    with atomic_folder(out) as folder:
+        places = [path.resolve() for path in logs]
+        if not places:
+            _drive(folder / "logs")
+        found = guess(places or [folder / "logs"])
+        kind = Planar.of(found) or Direct.of(found)
+        values = _common(name, found) | kind.values()
+        values["logs"] = " ".join(map(str, places)) or "logs"
+        for template, written in {
+            kind.template: f"{name}.py",
+            "recipe.toml": f"{name}.toml",
+            "logs.toml": "logs.toml",
+            "test.py": f"test_{name}.py",
+            "README.md": "README.md",
+        }.items():
+            text = (files("astra_data.experiments") / f"robot_files/{template}.template").read_text()
+            (folder / written).write_text(Template(text).substitute(values))
+    return found
+
+
+def _common(name: str, logs: Logs) -> dict[str, str]:
+    """Return what the templates of every kind name."""
+    states, commands = logs.of("state"), logs.of("command")
+    given = np.concatenate(logs.values(commands))
+    lows, highs = np.floor(given.min(axis=0) * 1e3) / 1e3, np.ceil(given.max(axis=0) * 1e3) / 1e3
+    bounds = {
+        field.short: (float(low), float(high)) for field, low, high in zip(commands, lows, highs, strict=True)
+    }
+    horizon = max(len(values) for values in logs.values(states))
+    time = [f'time = "{field.name}"\ntime_scale = {field.scale!r}\n' for field in logs.of("time")[:1]]
+    split = [f'field = "{field.name}"\n' for field in logs.of("episode")[:1]]
+    if time:
+        split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
+    lines = ["| field | taken for | unit | factor | why |", "|---|---|---|---|---|"]
+    for field in logs.fields:
+        taken = f"`{field.name}` | {field.taken_for} | {field.unit} | {field.scale:.4g}"
+        lines.append(f"| {taken} | {field.why} |")
+    return {
+        "name": name,
+        "timestep_s": repr(1 / logs.rate),
+        "rate_hz": f"{logs.rate}" + ("" if logs.of("time") else "  # CHECK: the logs have no time"),
+        "time": "".join(time),
+        "split": "".join(["\n[split]\n", *split]) if split else "",
+        "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)),
+        "window": str(max(2, min(20, horizon // 4))),
+        "size": str(len(states)),
+        "state": texts(field.short for field in states),
+        "row": json.dumps([round(float(value), 4) for value in logs.values(states)[0][0]]),
+        "bounds": repr(bounds).replace("'", '"'),
+        "horizon": str(horizon),
+        "guesses": "\n".join(lines),
+    }
+
+
+def _column(role: Role, logs: Logs) -> str:
+    """Return the table of a column in a mapping."""
+    fields, column = logs.of(role), _COLUMNS[role]
+    lines = [f'[columns."{column}"]']
+    if role in ("state", "command"):
+        lines += [
+            f"fields = {json.dumps([field.name for field in fields])}",
+            f"names = {json.dumps([field.short for field in fields])}",
+            f"unit = {json.dumps([field.unit for field in fields])}",
+            f"scale = {json.dumps([field.scale for field in fields])}",
+        ]
+    else:
+        lines.append(f"fields = {json.dumps([fields[0].name])}")
+    return "\n".join(lines) + "\n"
+
+
+def _drive(folder: Path, drives: int = 60, steps: int = 150) -> None:
+    """Record a made-up cart that lags behind its commands and tips over in fast curves."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    header = "t_s,x_m,y_m,heading_x,heading_y,v_m_s,w_rad_s,cmd_v_m_s,cmd_w_rad_s,tipped"
+    for drive in range(drives):
+        x, y, yaw, v, w, left, tilt, rows = 0.0, 0.0, rng.uniform(-math.pi, math.pi), 0.0, 0.0, 0, 0.0, []
+        for step in range(steps):
+            if left == 0:
+                command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]), int(rng.integers(1, 21))
+            left -= 1
+            tilt += 0.3 * (v * w - tilt)
+            rows.append([step / 10, x, y, math.cos(yaw), math.sin(yaw), v, w, *command, abs(tilt) > 0.7])
+            if rows[-1][-1]:
+                break
+            v, w = np.array([v, w]) + 0.4 * (command - [v, w])
+            x, y, yaw = x + 0.095 * v * math.cos(yaw), y + 0.095 * v * math.sin(yaw), yaw + 0.085 * w
+        np.savetxt(folder / f"drive_{drive:02d}.csv", rows, "%.4f", ",", header=header, comments="")

@@ -1,0 +1,191 @@
+"""The abstract simulators that a new robot may begin with, and how they fit its logs."""
+
+import json
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.guessing import HEADING, LENGTH, Field, Floats, Logs
+
+_TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|rot|steer).*")
+_SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
+
+
+@dataclass(frozen=True)
+class Planar:
+    """A position, a heading, and commands of speed and of turning: a unicycle.
+
+    Attributes:
+        logs: what was recorded.
+        position: x and y. heading: an angle, or its cosine and sine.
+    """
+
+    logs: Logs
+    position: tuple[Field, Field]
+    heading: tuple[Field, ...]
+
+    template = "unicycle.py"
+
+    @classmethod
+    def of(cls, logs: Logs) -> Self | None:
+        """Return how it fits; None if it does not."""
+        states = {field.short: field for field in logs.of("state")}
+        for short, x in states.items():
+            y = states.get(f"{short[:-1]}y")
+            if short[-1] != "x" or y is None or not LENGTH.fullmatch(short):
+                continue
+            angles = [name for name in states if HEADING.fullmatch(name)]
+            pairs = [name[:-2] for name in states if HEADING.fullmatch(name[:-2]) and name.endswith("_x")]
+            if len(logs.of("command")) != 2 or not (angles or pairs):
+                return None
+            names = (f"{pairs[0]}_x", f"{pairs[0]}_y") if pairs else (angles[0],)
+            return (
+                cls(logs, (x, y), tuple(states[name] for name in names))
+                if set(names) <= set(states)
+                else None
+            )
+        return None
+
+    def values(self) -> dict[str, str]:
+        """Return what its templates name."""
+        commands = self.logs.of("command")
+        turn = next((number for number, field in enumerate(commands) if _TURNS.fullmatch(field.short)), 1)
+        variables = ["speed", "speed"]
+        variables[turn] = "turn"
+        order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
+        indices = [order[field.name] for field in (*self.position, *self.heading)]
+        if len(self.heading) == 2:
+            abstraction = f"return state[..., {indices}]"
+        else:
+            x, y, yaw = (f"state[..., {index}]" for index in indices)
+            library = "np if isinstance(state, np.ndarray) else torch"
+            abstraction = (
+                f"of, yaw = {library}, {yaw}\n"
+                f"        return of.stack([{x}, {y}, of.cos(yaw), of.sin(yaw)], -1)"
+            )
+        poses = [self._pose(values) for values in self.logs.values((*self.position, *self.heading))]
+        starts = np.array([pose[0] for pose in poses])
+        goal, close = _typical([pose[:, :2] for pose in poses])
+        x, y, yaw = poses[0][0]
+        timestep_s = 1 / self.logs.rate
+        return {
+            "abstraction": abstraction,
+            "commands": ", ".join(variables),
+            "goal": _numbers(goal, "()"),
+            "close": f"{close:.2g}",
+            "lows": _numbers(starts.min(axis=0)),
+            "highs": _numbers(starts.max(axis=0)),
+            "phi": _numbers([x, y, math.cos(yaw), math.sin(yaw)]),
+            "before": "[0.0, 0.0, 0.0, 1.0]",
+            "command": _numbers(np.arange(2) != turn),
+            "after": _numbers([0.0, timestep_s, 0.0, 1.0]),
+        }
+
+    def _pose(self, values: Floats) -> Floats:
+        """Return x, y and the angle (T, 3) of positions and headings."""
+        yaw = np.arctan2(values[:, 3], values[:, 2]) if len(self.heading) == 2 else values[:, 2]
+        return np.column_stack([values[:, :2], yaw])
+
+
+@dataclass(frozen=True)
+class Direct:
+    """A state for each command, which does at once what it is told.
+
+    Attributes:
+        logs: what was recorded.
+        moved: the state that each command moves, those of the first commands.
+        is_rate: whether commands are rates of change; otherwise they are where to be.
+    """
+
+    logs: Logs
+    moved: tuple[Field, ...]
+    is_rate: bool
+
+    template = "direct.py"
+
+    @classmethod
+    def of(cls, logs: Logs) -> Self:
+        """Return how it fits: commands move the states of their names, or else the first ones."""
+        left = {field.short: field for field in logs.of("state")}
+        moved: list[Field | None] = []
+        for command in logs.of("command"):
+            names = (command.short, _SPEED.sub("", command.short), command.short.lstrip("u"))
+            moved.append(next((left.pop(name) for name in names if name in left), None))
+        rest = iter([field for short, field in left.items() if not _SPEED.match(short)])
+        filled = [field or next(rest, None) for field in moved]
+        found = tuple(field for field in filled[: _length(filled)] if field)
+        if not found:
+            raise BadInputError(
+                "found no state that a command could move: name it as its command, cmd_q1 and q1"
+            )
+        return cls(logs, found, cls._are_rates(logs, found))
+
+    @staticmethod
+    def _are_rates(logs: Logs, moved: tuple[Field, ...]) -> bool:
+        """Return whether states follow better where commands are rates than where they are positions."""
+        errors = np.zeros(2)
+        commands = logs.values(logs.of("command")[: len(moved)])
+        for state, command in zip(logs.values(moved), commands, strict=True):
+            landed = state[:-1] + command[:-1] / logs.rate, command[:-1]
+            errors += [float(np.abs(state[1:] - there).sum()) for there in landed]
+        return bool(errors[0] <= errors[1])
+
+    def values(self) -> dict[str, str]:
+        """Return what its templates name."""
+        order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
+        episodes = self.logs.values(self.moved)
+        starts = np.array([values[0] for values in episodes])
+        span = np.ptp(np.concatenate(episodes), axis=0)
+        goal, close = _typical([values / span for values in episodes])
+        actions, moved = len(self.logs.of("command")), len(self.moved)
+        command = "command" if actions == moved else f"command[:, :{moved}]"
+        step, before = 1 / self.logs.rate, np.arange(moved)
+        landed = before + step if self.is_rate else np.ones(moved)
+        return {
+            "names": texts(field.short for field in self.moved),
+            "units": texts(field.unit for field in self.moved),
+            "goal": _numbers(goal * span, "()"),
+            "close": f"{close:.2g}",
+            "range": _numbers(span, "()"),
+            "sentence": "Values that change as they are commanded to."
+            if self.is_rate
+            else "Values that are where they are commanded to be.",
+            "indices": str([order[field.name] for field in self.moved]),
+            "step": f"self.state + TIMESTEP_S * {command}" if self.is_rate else command,
+            "actions": str(actions),
+            "lows": _numbers(starts.min(axis=0)),
+            "highs": _numbers(starts.max(axis=0)),
+            "phi": _numbers(episodes[0][0]),
+            "before": _numbers(before),
+            "command": _numbers(np.ones(actions)),
+            "after": _numbers(landed),
+        }
+
+
+def _length(filled: list[Field | None]) -> int:
+    return filled.index(None) if None in filled else len(filled)
+
+
+def _typical(episodes: list[Floats]) -> tuple[Floats, float]:
+    """Return the end (D,) of the episode whose way from its start is the median, and a tenth of the way."""
+    ways = [float(np.linalg.norm(values[-1] - values[0])) for values in episodes]
+    typical = int(np.argsort(ways)[len(ways) // 2])
+    return episodes[typical][-1], ways[typical] / 10
+
+
+def _numbers(values: Iterable[float] | Floats, brackets: str = "[]") -> str:
+    """Return a list, or a tuple, as code."""
+    inside = [repr(round(float(value), 4) + 0.0) for value in values]
+    comma = "," if brackets == "()" and len(inside) == 1 else ""
+    return f"{brackets[0]}{', '.join(inside)}{comma}{brackets[1]}"
+
+
+def texts(values: Iterable[str]) -> str:
+    """Return a tuple as code."""
+    inside = [json.dumps(value) for value in values]
+    return f"({', '.join(inside)}{',' if len(inside) == 1 else ''})"

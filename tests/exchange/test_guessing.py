@@ -1,0 +1,114 @@
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.guessing import RATE_HZ, guess
+
+
+def write(path: Path, columns: dict[str, object], rows: int = 6) -> Path:
+    table = np.column_stack([np.broadcast_to(np.asarray(values, float), rows) for values in columns.values()])
+    np.savetxt(path, table, "%.9g", ",", header=",".join(columns), comments="")
+    return path
+
+
+RAMP = np.arange(6.0)
+
+
+def test_roles_and_units_are_told_by_names_and_values(tmp_path: Path) -> None:
+    columns = {
+        "t_ms": 50 * RAMP,
+        "x_mm": 1000 * RAMP,
+        "Pose.Y": RAMP,
+        "heading": 90 * RAMP,
+        "roll": RAMP / 10,
+        "heading_x": np.cos(RAMP),
+        "wheel rpm": 60 * RAMP,
+        "twist.linear.x": RAMP**2,
+        "cmd_v_mm_s": 100 * RAMP,
+        "u2": RAMP,
+        "tipped": RAMP > 4,
+        "success": RAMP / 2,
+        "frame_id": RAMP,
+        "battery": 12.0,
+    }
+    logs = guess([write(tmp_path / "log.csv", columns)])
+    found = {field.name: (field.taken_for, field.unit, field.scale) for field in logs.fields}
+    assert found == {
+        "t_ms": ("time", "ms", 1e-3),
+        "x_mm": ("state x", "m", 1e-3),
+        "Pose.Y": ("state pose_y", "m", 1.0),
+        "heading": ("state heading", "rad", math.pi / 180),
+        "roll": ("state roll", "rad", 1.0),
+        "heading_x": ("state heading_x", "1", 1.0),
+        "wheel rpm": ("state wheel", "rad/s", math.pi / 30),
+        "twist.linear.x": ("state twist_linear_x", "1", 1.0),
+        "cmd_v_mm_s": ("command v", "m/s", 1e-3),
+        "u2": ("command u2", "1", 1.0),
+        "tipped": ("failure", "1", 1.0),
+        "success": ("state success", "1", 1.0),  # is more than true and false
+        "frame_id": ("left out", "1", 1.0),
+        "battery": ("left out", "1", 1.0),
+    }
+    assert logs.rate == 20
+    np.testing.assert_allclose(logs.episodes[0]["heading"], math.pi / 2 * RAMP)
+
+
+@pytest.mark.parametrize(
+    ("step", "unit", "rate"), [(0.1, "s", 10), (20, "ms", 50), (5e4, "us", 20), (1e7, "ns", 100)]
+)
+def test_a_unit_of_time_is_told_by_its_steps(tmp_path: Path, step: float, unit: str, rate: int) -> None:
+    logs = guess([write(tmp_path / "log.csv", {"stamp": 7 + step * RAMP, "x": RAMP, "cmd": RAMP})])
+    (time,) = logs.of("time")
+    assert (time.unit, logs.rate) == (unit, rate)
+
+
+def test_stamps_of_nanoseconds_are_read(tmp_path: Path) -> None:
+    rows = "".join(f"{1_700_000_000_000_000_001 + 50_000_000 * row},{row},{row}\n" for row in range(9))
+    (tmp_path / "log.csv").write_text("stamp,x,cmd\n" + rows)
+    assert guess([tmp_path / "log.csv"]).rate == 20
+
+
+def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
+    for name in ("one.csv", "two.tsv"):
+        write(tmp_path / name, {"trial": RAMP // 4, "x": RAMP, "cmd": -RAMP})
+    (tmp_path / "two.tsv").write_text((tmp_path / "two.tsv").read_text().replace(",", "\t"))
+    (tmp_path / "notes.txt").write_text("none")
+    logs = guess([tmp_path])
+    assert [values[:, 0].tolist() for values in logs.values(logs.of("state"))] == [[0, 1, 2, 3], [4, 5]] * 2
+    assert logs.rate == RATE_HZ
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "expected CSV with a header"),
+        ("x,cmd\n", "expected a header of different names, and rows of numbers below it"),
+        ("x,x,cmd\n1,2,3\n2,3,4\n", "expected a header of different names"),
+        (
+            "t,x\n0,1\n1,2\n2,3\n",
+            "found no command among t (time), x (state): name one in the header, such as cmd_v",
+        ),
+        ("cmd,x\n0,1\n1,1\n2,1\n", "found no state among cmd (command), x (left out): name one"),
+    ],
+)
+def test_what_is_of_no_use_is_told(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(BadInputError, match=f"log.csv: {re.escape(expected)}"):
+        guess([tmp_path / "log.csv"])
+
+
+def test_files_have_to_be_there_and_alike(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected files that end in \.csv or \.tsv, found none"):
+        guess([tmp_path])
+    with pytest.raises(BadInputError, match="there is no such file"):
+        guess([tmp_path / "log.csv"])
+    one = write(tmp_path / "one.csv", {"x": RAMP, "cmd": RAMP})
+    two = write(tmp_path / "two.csv", {"y": RAMP, "cmd": RAMP})
+    with pytest.raises(
+        BadInputError, match=r"two\.csv: expected the fields of .*one\.csv, \['x', 'cmd'\]: got"
+    ):
+        guess([one, two])

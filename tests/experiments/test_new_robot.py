@@ -1,0 +1,106 @@
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli.app import app
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.reader import Dataset
+from astra_data.experiments.new_robot import write_robot
+from astra_data.experiments.run import check, run
+from astra_data.worlds.registry import task_named
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+
+
+def command(line: str) -> None:
+    app(shlex.split(line), standalone_mode=False)
+
+
+def arm(path: Path) -> Path:
+    """Write a log of three joints that follow commanded rates, in degrees and microseconds, in two trials."""
+    rng = np.random.default_rng(0)
+    rates = np.repeat(rng.uniform(-30, 30, (8, 3)), 10, axis=0)
+    joints = np.concatenate([np.zeros((1, 3)), np.cumsum(0.05 * rates, axis=0)[:-1]])
+    table = np.column_stack([np.arange(80) * 50_000, np.arange(80) // 40, joints, rates])
+    header = "time_us,episode,q1_deg,q2_deg,q3_deg,cmd_q1_deg_s,cmd_q2_deg_s,cmd_q3_deg_s"
+    np.savetxt(path, table, "%.3f", ",", header=header, comments="")
+    return path
+
+
+def test_a_new_robot_runs_by_the_words_of_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command("new my_cart")
+    monkeypatch.chdir("my_cart")
+    page = Path("README.md").read_text()
+    lines = [
+        line.partition("  #")[0] for line in page.partition("```sh\n")[2].partition("```")[0].splitlines()
+    ]
+    assert [line.split()[:2] for line in lines[:2]] == [["astra-data", "import"], ["astra-data", "inspect"]]
+    for line in lines[:2]:
+        command(line.removeprefix("astra-data "))
+    assert lines[2] == "python -m pytest"
+    tested = subprocess.run(
+        [sys.executable, *shlex.split(lines[2])[1:], "-q"], capture_output=True, text=True, check=False
+    )
+    assert "3 passed" in tested.stdout, tested.stdout
+    assert lines[3:6] == [
+        "astra-data check my_cart.toml",
+        "astra-data run my_cart.toml --until ground",
+        "astra-data run my_cart.toml",
+    ]
+    assert "train/astra/seed_0" in check(Path("my_cart.toml"))
+    run(Path("my_cart.toml"), until="pair", jobs=1)
+    assert len(Dataset.open("runs/my_cart/pair/seed_0")) == 60
+    command(lines[6].removeprefix("astra-data ") + " --help")
+    assert len(Path("my_cart.py").read_text().splitlines()) < 75
+
+
+def test_logs_of_an_arm_give_its_task(tmp_path: Path) -> None:
+    log = arm(tmp_path / "log.csv")
+    shown = CliRunner().invoke(app, ["new", "arm", "--from", str(log), "--out", "robots/arm"])
+    assert shown.exit_code == 0 and "command q2" in shown.output, shown.output
+    task = task_named("robots/arm/arm.py:TASK")
+    assert task.timestep_s == 0.05 and task.state.names == ("q1", "q2", "q3")
+    least, largest = task.limits["q1"]
+    assert -np.radians(30) - 1e-3 <= least < 0 < largest <= np.radians(30) + 1e-3
+    command(f"import {log} --mapping robots/arm/logs.toml --out imported")
+    data = Dataset.open("imported")
+    assert (len(data), len(data.columns(["action"])["action"])) == (2, 78)
+    command("pair imported --simulator robots/arm/arm.py:TASK --out pairs")
+    columns = Dataset.open("pairs").columns(["abstract.next_state", "abstract.simulated_next_state"])
+    recorded, simulated = columns.values()
+    np.testing.assert_allclose(simulated, recorded, atol=1e-4)
+
+
+def test_what_is_guessed_is_marked(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("x,cmd_x,won,reward\n" + "".join(f"{row},{row % 3},0,{row}\n" for row in range(9)))
+    write_robot("slide", Path("slide"), [log])
+    assert "fps = 10  # CHECK: the logs have no time" in Path("slide/logs.toml").read_text()
+    assert "[split]" not in Path("slide/logs.toml").read_text()
+    assert '[columns."next.reward"]\nfields = ["reward"]' in Path("slide/logs.toml").read_text()
+    assert Path("slide/slide.py").read_text().count("CHECK") == 7
+
+
+@pytest.mark.parametrize("name", ["", "My", "a-b", "1st", "a.py", "../a"])
+def test_a_name_is_one_of_a_file_and_a_task(name: str) -> None:
+    with pytest.raises(BadInputError, match="expected a name of a-z, 0-9 and _, such as my_cart"):
+        write_robot(name, Path("out"))
+    assert not Path("out").exists()
+
+
+def test_nothing_is_written_over_or_left_half_done(tmp_path: Path) -> None:
+    (tmp_path / "cart").mkdir()
+    with pytest.raises(BadInputError, match="cart exists already"):
+        write_robot("cart", Path("cart"))
+    with pytest.raises(BadInputError, match="there is no such file"):
+        write_robot("other", Path("other"), [Path("nothing.csv")])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cart"]

@@ -1,0 +1,80 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.guessing import Logs, guess
+from astra_data.experiments.robot_kinds import Direct, Planar
+
+T = np.arange(50.0)
+
+
+def logs(folder: Path, **columns: object) -> Logs:
+    table = np.column_stack([np.asarray(values, float) for values in columns.values()])
+    np.savetxt(folder / "log.csv", table, "%.6f", ",", header=",".join(columns), comments="")
+    return guess([folder / "log.csv"])
+
+
+def test_a_position_a_heading_and_two_commands_are_a_unicycle(tmp_path: Path) -> None:
+    found = logs(
+        tmp_path,
+        vel_x=np.cos(T),
+        vel_y=np.sin(T),
+        a=T % 7,
+        yaw=T % 3 / 2,
+        x=T,
+        y=2 * T,
+        cmd_w=T % 5,
+        cmd_v=T % 2,
+    )
+    kind = Planar.of(found)
+    assert kind is not None
+    values = kind.values()
+    assert [field.short for field in kind.position] == ["x", "y"]
+    assert "state[..., 4], state[..., 5], of.cos(yaw)" in values["abstraction"]
+    assert (values["commands"], values["command"]) == ("turn, speed", "[0.0, 1.0]")
+    assert values["goal"] == "(49.0, 98.0)" and values["lows"] == values["highs"] == "[0.0, 0.0, 0.0]"
+    assert float(values["close"]) == pytest.approx(np.hypot(49, 98) / 10, rel=0.05)
+
+
+def test_a_heading_may_be_a_unit_vector(tmp_path: Path) -> None:
+    found = logs(tmp_path, heading_x=-np.cos(T), heading_y=np.sin(T), x=T, y=T % 9, cmd_v=T % 5, cmd_w=T % 2)
+    kind = Planar.of(found)
+    assert kind is not None
+    assert kind.values()["abstraction"] == "return state[..., [2, 3, 0, 1]]"
+    assert kind.values()["lows"] == "[0.0, 0.0, 3.1416]"
+
+
+def test_others_are_no_unicycle(tmp_path: Path) -> None:
+    pose = {"x": T, "y": T % 9, "yaw": T % 3}
+    for columns in (
+        pose | {"cmd_a": T, "cmd_b": T, "cmd_c": T},
+        {"x": T, "y": T % 9, "cmd_a": T, "cmd_b": T},
+        {"x": T, "z": T, "yaw": T % 3, "cmd_a": T, "cmd_b": T},
+        {"x": T, "y": T % 9, "heading_x": T, "cmd_a": T, "cmd_b": T},
+    ):
+        assert Planar.of(logs(tmp_path, **columns)) is None
+
+
+def test_commands_move_the_states_of_their_names_or_the_first(tmp_path: Path) -> None:
+    slow, fast = np.cumsum(T % 5) / 10, np.cumsum(T % 3) / 10
+    named = Direct.of(logs(tmp_path, load=T % 4, q2=slow, q1=fast, cmd_q1=T % 3, cmd_q2=T % 5))
+    assert [field.short for field in named.moved] == ["q1", "q2"] and named.is_rate
+    assert named.values()["indices"] == "[2, 1]"
+    assert named.values()["step"] == "self.state + TIMESTEP_S * command"
+    assert (named.values()["before"], named.values()["after"]) == ("[0.0, 1.0]", "[0.1, 1.1]")
+    first = Direct.of(logs(tmp_path, vel_a=T % 4, a=slow, cmd_1=T % 5))
+    assert [field.short for field in first.moved] == ["a"]
+
+
+def test_commands_may_be_where_to_be(tmp_path: Path) -> None:
+    q = np.concatenate([[0.0], T[:-1] % 5])
+    kind = Direct.of(logs(tmp_path, q1=q, cmd_q1=T % 5, cmd_q2=T % 3))
+    assert not kind.is_rate
+    assert kind.values()["step"] == "command[:, :1]" and kind.values()["after"] == "[1.0]"
+
+
+def test_something_has_to_move(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="found no state that a command could move"):
+        Direct.of(logs(tmp_path, vel_a=T % 4, cmd_1=T % 5))
