@@ -19,6 +19,7 @@ from astra_data.core.config import did_you_mean, load_tables, validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import base_method, is_plus
 from astra_data.dataset.format import INFO_PATH
+from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
 from astra_data.experiments.renamed import with_current_keys
@@ -112,7 +113,7 @@ class Experiment:
         changed, folders = self._outdated
         if folders:
             raise RecipeError(
-                f"{' and '.join(sorted(changed))} changed in the recipe since {self.folder} was made: "
+                f"{changed} since {self.folder} was made: "
                 f"give the recipe another name, or remove {' '.join(map(str, folders))}"
             )
 
@@ -122,23 +123,28 @@ class Experiment:
         place = self.place(key)
         if not any(place.is_relative_to(folder) for folder in folders):
             return ""
-        return f"{' and '.join(sorted(changed))} changed in the recipe since: rename it, or remove this"
+        return f"{changed} since: give the recipe another name, or remove this"
 
     @cached_property
-    def _outdated(self) -> tuple[set[str], list[Path]]:
-        """The settings that changed since the artefacts were made, and the folders made with the old ones."""
+    def _outdated(self) -> tuple[str, list[Path]]:
+        """What changed since the artefacts were made, and the folders made with the old."""
         record = self.folder / "recipe.json"
         if not record.is_file():
-            return set(), []
+            return "", []
         changed = _differences(json.loads(record.read_text()), self.recipe)
-        whole = _stale_stages(changed - _ROWS_TABLES)
+        code = changed_code(self.recipe, self.folder)
+        whole = _stale_stages((changed - _ROWS_TABLES) | ({"task"} & code.keys()))
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
         own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
         folders = [self.folder / stage for stage in STAGES if stage in whole & own]
         for table in sorted(changed & _ROWS_TABLES):
             for stage in sorted((_stale_stages({table}) - whole) & own):
                 folders += self._rows_of(table, stage)
-        return changed, list(dict.fromkeys(folders))
+        rows = [place for stage in sorted(own - whole) for place in sorted((self.folder / stage).iterdir())]
+        folders += [row for row in rows if base_method(row.name) in code]
+        texts = [f"{' and '.join(sorted(changed))} changed in the recipe"] if changed else []
+        texts += [f"{file} changed" for file in dict.fromkeys(code.values())]
+        return " and ".join(texts), list(dict.fromkeys(folders))
 
     @property
     def results(self) -> Path:

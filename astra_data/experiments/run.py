@@ -21,6 +21,7 @@ from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.local_executor import execute
+from astra_data.experiments.own_files import record_code
 from astra_data.experiments.plan import check_stage, grounded_as, plan, stage_of, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
@@ -203,6 +204,7 @@ def make(
             line = f"{key} is made again: {reason}; the old one is in {_set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
+        record_code(recipe, folder)
         prepare, logs = partial(_prepare, dict(recipe.own_methods)), folder / "logs"
         with show(len(items), console) as watch:
             if cluster is None:

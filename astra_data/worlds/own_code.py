@@ -1,5 +1,6 @@
 """Objects from the user's code: "cart.py:TASK" in a file, "package.module:TASK" in an installed package."""
 
+import ast
 import hashlib
 import importlib
 import importlib.util
@@ -39,6 +40,36 @@ def file_of(name: str) -> dict[str, str]:
     """Return the sha256 of the file that `name` begins with, as "file_sha256"; empty where it is none."""
     place = Path(name.rpartition(":")[0])
     return {"file_sha256": file_digest(place)} if place.suffix == ".py" and place.is_file() else {}
+
+
+def code_digest(name: str) -> str | None:
+    """Return a digest of the code that `name` begins with; None where it is no file.
+
+    The files beside it that it imports count too; comments and layout do not.
+    """
+    place = Path(name.rpartition(":")[0])
+    if place.suffix != ".py" or not place.is_file():
+        return None
+    digest, todo, seen = hashlib.sha256(), [place], set()
+    while todo:
+        path = todo.pop()
+        seen.add(path)
+        tree = ast.parse(path.read_bytes())
+        digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
+        beside = {path.with_name(f"{module}.py") for module in sorted(_imported(tree))}
+        todo += sorted(file for file in beside - seen - set(todo) if file.is_file())
+    return digest.hexdigest()
+
+
+def _imported(tree: ast.Module) -> set[str]:
+    """Return the names of the top modules that a file imports."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
 
 
 def _of_file(path: Path) -> ModuleType:

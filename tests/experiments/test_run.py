@@ -168,7 +168,7 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     stale = {key: found.why for key, found in check(recipe, root=tmp_path).items() if found.state == "stale"}
     assert stale == dict.fromkeys(
         ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0"),
-        "plus changed in the recipe since: rename it, or remove this",
+        "plus changed in the recipe since: give the recipe another name, or remove this",
     )
     with pytest.raises(RecipeError) as caught:
         run(recipe, root=tmp_path)

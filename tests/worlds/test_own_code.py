@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.own_code import file_of, is_own_code, own_object
+from astra_data.worlds.own_code import code_digest, file_of, is_own_code, own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -85,3 +85,15 @@ def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
 def test_a_file_is_known_by_its_digest() -> None:
     assert file_of(f"{CART}:TASK") == {"file_sha256": hashlib.sha256(CART.read_bytes()).hexdigest()}
     assert file_of("antmaze-umaze") == file_of("package.module:TASK") == {}
+
+
+def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "cart.py").write_text("from wheel import R\nimport json\nTASK = R\n")
+    (tmp_path / "wheel.py").write_text("import cart\nR = 1\n")
+    (tmp_path / "json.py").write_text("")
+    first = code_digest(f"{tmp_path}/cart.py:TASK")
+    (tmp_path / "cart.py").write_text("# A cart.\nfrom wheel import R\nimport json\n\nTASK = (R)\n")
+    assert code_digest(f"{tmp_path}/cart.py:TASK") == first
+    (tmp_path / "wheel.py").write_text("import cart\nR = 2\n")
+    assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
+    assert code_digest("antmaze-umaze") is code_digest("some.module:TASK") is None

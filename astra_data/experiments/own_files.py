@@ -1,0 +1,35 @@
+"""The code of the user's that a recipe names: what was made with it is outdated once it changes."""
+
+import json
+from pathlib import Path
+
+from astra_data.core.durable import write_file
+from astra_data.experiments.recipe import Recipe
+from astra_data.worlds.own_code import code_digest
+
+CODE = "code.json"
+"""Beside recipe.json: the digests of "task", and of methods by their names."""
+
+
+def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
+    """Return what was recorded in `folder` and is another now: "task" or a method's name, to its file's."""
+    record = folder / CODE
+    before = json.loads(record.read_text()) if record.is_file() else {}
+    now = _digests(recipe)
+    changed = [name for name, digest in before.items() if now.get(name, digest) != digest]
+    return {name: Path(_places(recipe)[name].rpartition(":")[0]).name for name in changed}
+
+
+def record_code(recipe: Recipe, folder: Path) -> None:
+    """Write down in `folder` what the code is now, if there is any."""
+    if digests := _digests(recipe):
+        write_file(folder / CODE, json.dumps(digests, indent=1) + "\n")
+
+
+def _places(recipe: Recipe) -> dict[str, str]:
+    return {"task": recipe.task, **recipe.own_methods}
+
+
+def _digests(recipe: Recipe) -> dict[str, str]:
+    found = {name: code_digest(place) for name, place in _places(recipe).items()}
+    return {name: digest for name, digest in found.items() if digest}

@@ -1,0 +1,96 @@
+"""Artefacts that were made with other code of the user's."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import RecipeError
+from astra_data.experiments.experiment import Experiment, load_experiment
+from astra_data.experiments.own_files import CODE, record_code
+from astra_data.methods import _PLACES, METHODS
+
+ROOT = Path(__file__).parents[2]
+RECIPE = """
+task = "rail.py:TASK"
+methods = ["nas", "mine"]
+seeds = [0]
+
+[own_methods]
+mine = "mine.py:METHOD"
+
+[collect]
+start = "task"
+"""
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    """The recipe of a run with folders for each of its stages, as a run leaves them."""
+    shutil.copy(ROOT / "tests/small_cart.py", tmp_path / "rail.py")
+    shutil.copy(ROOT / "recipes/examples/methods/residual_ensemble.py", tmp_path / "mine.py")
+    (tmp_path / "rail.toml").write_text(RECIPE)
+    experiment = load(tmp_path)
+    for stage in ("collect", "pair", "ground/nas", "ground/mine", "train/nas", "train/mine"):
+        (experiment.folder / stage / "seed_0").mkdir(parents=True)
+    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    record_code(experiment.recipe, experiment.folder)
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> None:
+    for name in set(_PLACES):
+        del METHODS[name], _PLACES[name]
+
+
+def load(folder: Path) -> Experiment:
+    return load_experiment(folder / "rail.toml", folder / "runs")
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_code_as_it_was_and_comments_outdate_nothing(made: Path) -> None:
+    edit(made / "rail.py", "class Rail:", "# On a rail.\n\nclass Rail:")
+    experiment = load(made)
+    experiment.check_unchanged()
+    assert experiment.outdated("train/nas/seed_0") == ""
+
+
+def test_all_is_outdated_by_another_task(made: Path) -> None:
+    edit(made / "rail.py", "0.1 * command", "0.2 * command")
+    experiment = load(made)
+    for key in ("collect/seed_0", "train/mine/seed_0"):
+        assert (
+            experiment.outdated(key) == "rail.py changed since: give the recipe another name, or remove this"
+        )
+    folders = " ".join(str(experiment.folder / stage) for stage in ("collect", "pair", "ground", "train"))
+    with pytest.raises(RecipeError, match=f"^rail.py changed since .*, or remove {folders}$"):
+        experiment.check_unchanged()
+
+
+def test_rows_are_outdated_by_another_method(made: Path) -> None:
+    edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
+    edit(made / "rail.toml", "[0]", "[0]\n[evaluate]\nepisodes = 7")
+    experiment = load(made)
+    assert experiment.outdated("ground/mine/seed_0").startswith(
+        "evaluate changed in the recipe and mine.py changed"
+    )
+    assert experiment.outdated("ground/nas/seed_0") == experiment.outdated("collect/seed_0") == ""
+
+
+def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
+    edit(made / "rail.py", "0.1 * command", "0.2 * command")
+    (load(made).folder / CODE).unlink()
+    load(made).check_unchanged()
+
+
+def test_built_in_tasks_have_no_record(tmp_path: Path) -> None:
+    (tmp_path / "rail.toml").write_text('task = "antmaze-umaze"\nmethods = ["nas"]\nseeds = [0]\n')
+    experiment = load(tmp_path)
+    record_code(experiment.recipe, tmp_path)
+    assert not (tmp_path / CODE).exists()
