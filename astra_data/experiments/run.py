@@ -15,6 +15,7 @@ from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.core.naming import base_method
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
+from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
 from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
@@ -138,14 +139,16 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
 
     Raises:
         RecipeError: the recipe has faults.
-        BadInputError: its task has faults; lists them all.
+        BadInputError: its task has faults; lists them all. Or its data are not the task's.
     """
     experiment = load_experiment(recipe_path, root)
     name = experiment.recipe.task
     if faults := check_task(task_named(name)):
         raise BadInputError("\n".join(f"{recipe_path}: task {name}: {fault}" for fault in faults))
+    data = data_condition(experiment.recipe)
     planned = plan(experiment.recipe, recipe_path, experiment.folder)
-    return {item.key: condition(item, experiment, verify=verify) for item in planned}
+    conditions = {item.key: condition(item, experiment, verify=verify) for item in planned}
+    return conditions if data is None else {"data": data, **conditions}
 
 
 Show = Callable[[int, Console], AbstractContextManager[Watcher]]

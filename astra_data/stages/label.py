@@ -60,7 +60,7 @@ def label(
         SharingError: it cannot be pulled.
     """
     world, source = task_named(task), _opened(data)
-    _check(source, world)
+    check_fits(source, world)
     more = [
         column
         for column in ((world.goal,) if world.goal else ()) + OUTCOME_COLUMNS
@@ -140,8 +140,14 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
 
 def _opened(data: str | Path) -> Dataset:
     """Open a dataset here, or pull it."""
-    is_address = "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))
-    return pull(str(data)) if is_address and not Path(data).is_dir() else open_dataset(data)
+    return pull(str(data)) if is_address(data) else open_dataset(data)
+
+
+def is_address(data: str | Path) -> bool:
+    """Return whether `data` is an address to pull from, such as user/name or s3://…, and no folder here."""
+    if Path(data).is_dir():
+        return False
+    return "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))
 
 
 def _goals(task: Task, episode: Episode, seed: int) -> torch.Tensor:
@@ -151,7 +157,12 @@ def _goals(task: Task, episode: Episode, seed: int) -> torch.Tensor:
     return torch.from_numpy(drawn).float().expand(len(episode), -1).contiguous()
 
 
-def _check(source: Dataset, task: Task) -> None:
+def check_fits(source: Dataset, task: Task) -> None:
+    """Check that a dataset has the states and actions of a task.
+
+    Raises:
+        BadInputError: it lacks some, or theirs are of another size.
+    """
     faults = []
     for expected in (task.state, task.action):
         if expected.name not in source.features:

@@ -1,0 +1,71 @@
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import writer
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.run import check
+
+ROOT = Path(__file__).parents[2]
+
+
+def write_logs(folder: Path, least: float, largest: float, *, state_size: int = 2) -> None:
+    """Write pushes of the small cart, whose bounds are -1 and 4."""
+    columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
+    states = np.zeros((9, state_size), np.float32)
+    actions = np.linspace(least, largest, 9, dtype=np.float32)
+    with writer(folder, columns=columns) as logs:
+        logs.add(Episode(0, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    shutil.copy(ROOT / "tests/small_cart.py", tmp_path / "rail.py")
+    path = tmp_path / "rail.toml"
+    path.write_text('task = "rail.py:TASK"\ndata = "logs"\nmethods = ["nas"]\nseeds = [0]\n')
+    return path
+
+
+@pytest.mark.parametrize(
+    ("least", "largest", "expected"),
+    [
+        (-1.0, 4.0, ""),
+        (-0.9, 3.9, ""),  # within 5 % of what was recorded
+        (-1.5, 4.5, ""),
+        (-0.5, 4.0, "v may be -1 to 4, recorded is -0.5 to 4: narrow the bounds of the commands, or rec"),
+        (-1.0, 3.0, "v may be -1 to 4, recorded is -1 to 3"),
+    ],
+)
+def test_bounds_beyond_what_was_recorded_are_told(
+    recipe: Path, least: float, largest: float, expected: str
+) -> None:
+    write_logs(recipe.parent / "logs", least, largest)
+    found = check(recipe, root=recipe.parent / "runs")["data"]
+    assert found.is_finished
+    assert found.why.startswith(expected) and bool(found.why) == bool(expected)
+
+
+def test_data_that_are_not_there_are_to_do(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(recipe.parent / "home"))
+    found = check(recipe, root=recipe.parent / "runs")["data"]
+    assert found.state == "missing"
+    assert found.why.startswith("no dataset 'logs' in ") and found.why.endswith(": import or pull it first")
+
+
+def test_data_of_another_robot_are_refused(recipe: Path) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0, state_size=3)
+    with pytest.raises(BadInputError, match=r"state has 3 values, expected those of rail-cart: 2"):
+        check(recipe, root=recipe.parent / "runs")
+
+
+def test_recipes_that_collect_or_pull_have_no_such_line(recipe: Path) -> None:
+    text = recipe.read_text()
+    recipe.write_text(text.replace('"logs"', '"somebody/logs"'))
+    assert "data" not in check(recipe, root=recipe.parent / "runs")
+    recipe.write_text(text.replace('data = "logs"\n', "") + '[collect]\nstart = "task"\n')
+    assert load_experiment(recipe, recipe.parent / "runs").recipe.data is None
+    assert "data" not in check(recipe, root=recipe.parent / "runs")
