@@ -23,6 +23,7 @@ from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.methods import METHODS
+from astra_data.methods.method import Method
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.stages.report import Reported
 
@@ -167,6 +168,7 @@ class _Plan:
             "percent": percent,
             "of": recipe.collect and recipe.collect.episodes,
             "data": recipe.data,
+            "recorded": self._recorded(method, seed, percent, name),
             "out": self.folder / key,
             "device": self.device,
             **{parameter: made and self.folder / made for parameter, made in keys.items()},
@@ -182,6 +184,13 @@ class _Plan:
             and (method is None or stage.each != "policy" or method.steps_target),
             device=self.device if "device" in parameters else "cpu",
         )
+
+    def _recorded(self, method: Method | None, seed: int, percent: int | None, name: str) -> Path | None:
+        """Return the dataset that the policy of a row was trained on; None if it is none."""
+        if method is None or not method.trains or method.steps_target:
+            return None
+        made = self._artefacts(STAGES["train"], seed, percent, name)["dataset"]
+        return self.folder / made if made else None
 
     def _artefacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
         """Return the keys of the artefacts that a stage may read, by its parameters."""

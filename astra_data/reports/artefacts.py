@@ -74,6 +74,8 @@ class Evaluation(Artefact):
     """In the raw simulator; None for a policy that cannot act on abstract states."""
     grounded: Outcomes | None = None
     """In the reference grounded simulator; None if there is none, or likewise."""
+    beyond_recorded: float | None = None
+    """Share of the steps, where the row was tested, whose command is beyond the range of its dataset."""
     encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
     """Mean of each measure by encoder, if there is more than one."""
 

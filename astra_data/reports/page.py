@@ -19,12 +19,17 @@ from astra_data.reports.tested import warning, where
 from astra_data.worlds.score import SUCCESS
 
 BESIDE = {
-    "success": ("failed", "wall_contact", "steps", "distance", "return", "simulated_success"),
-    "steps": ("failed", "simulated_steps"),
+    "success": (
+        *("failed", "wall_contact", "steps", "distance", "return"),
+        *("simulated_success", "beyond_recorded"),
+    ),
+    "steps": ("failed", "simulated_steps", "beyond_recorded"),
 }
 """Headline → the other measures in the table of scores."""
 OF_PLANES = {"wall_contact", "distance"}
 """Of these, what tasks without walls and places do not have."""
+NEGLIGIBLE = {"beyond_recorded": 0.01}
+"""Up to which value a measure is left out if no row has more; by default 0."""
 
 COLUMNS = {
     "failed": ("failed", 2),
@@ -34,6 +39,7 @@ COLUMNS = {
     "return": ("return", 1),
     "simulated_success": ("success in its simulator", 2),
     "simulated_steps": ("survived steps in its simulator", 0),
+    "beyond_recorded": ("beyond recorded commands", 2),
 }
 """Column title and digits of such a measure."""
 
@@ -83,7 +89,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 def _scores(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return head and lines of the table of scores."""
     rows, scores, beside = results.methods, results.scores, BESIDE[results.headline.measure]
-    bare = OF_PLANES if results.tested_in == "target" else beside
+    bare = OF_PLANES | NEGLIGIBLE.keys() if results.tested_in == "target" else set(beside)
     beside = tuple(
         measure for measure in beside if measure not in bare or any(map(_some(measure), rows.values()))
     )
@@ -118,8 +124,9 @@ def _scores(results: Results) -> tuple[list[str], list[list[str]]]:
 
 
 def _some(measure: str) -> Callable[[MethodResults], bool]:
-    """Return whether a row has values of a measure other than 0: a robot without walls touches none."""
-    return lambda row: measure in row.summary and row.summary[measure].mean != 0.0
+    """Return whether a row has values of a measure to speak of: a robot without walls touches none."""
+    least = NEGLIGIBLE.get(measure, 0.0)
+    return lambda row: measure in row.summary and abs(row.summary[measure].mean) > least
 
 
 def _encoders(results: Results) -> list[list[str]]:

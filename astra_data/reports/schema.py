@@ -127,6 +127,8 @@ class MethodResults(Section):
     """Success in the simulator that the policy was trained in; None if it was trained in none."""
     simulated_steps: list[float] | None = None
     """Length of an episode in that simulator, in control steps."""
+    beyond_recorded: list[float] | None = Field(default=None, exclude_if=lambda shares: shares is None)
+    """Share of steps whose command is beyond the range of the row's dataset; None if that is not known."""
     simulator_returns: dict[str, list[float]]
     """Return in the shared test simulators, "raw" and "grounded", in which the row was tested."""
     encoders: dict[str, dict[str, list[float]]]
@@ -152,6 +154,7 @@ class MethodResults(Section):
             "simulated_success": self.simulated_success,
             "simulated_steps": self.simulated_steps,
             "distance": self.distance,
+            "beyond_recorded": self.beyond_recorded,
         }
 
 

@@ -36,6 +36,7 @@ from astra_data.training.deployment import DeployedPolicy, EncoderKind
 from astra_data.training.episode_record import EpisodeRecord, Outcome
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.policy_file import PolicyFile, Simulation, deploy
+from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
@@ -65,6 +66,7 @@ def evaluate(
     grounding: Path | None = None,
     target_encoder: Path | None = None,
     reference: Path | None = None,
+    recorded: Path | None = None,
     seed: int = 0,
     out: Path,
     progress: Progress = silent,
@@ -82,6 +84,7 @@ def evaluate(
         grounding: what `ground` made for it, for a row that grounds.
         target_encoder: what `align` made for it, for a row that aligns.
         reference: the grounding of the reference simulator, if there is one.
+        recorded: the dataset whose range of commands those of the policy are compared with.
         seed: of all randomness.
         out: the folder to write.
         progress: called with the fraction done.
@@ -155,11 +158,15 @@ def evaluate(
     }
     read = {name: file_digest(file) for name, file in files.items() if file}
     tensors: dict[str, Tensor] = {}
+    asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
     tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
     if world.has_target:
         outcomes, filmed = {}, {}
         for kind, robot in robots.items():
-            outcomes[kind], filmed[kind], rate = _in_target(world, robot, config, seed, num_threads, progress)
+            counted = asked if kind == headline else None
+            outcomes[kind], filmed[kind], rate = _in_target(
+                world, robot, config, seed, num_threads, progress, counted
+            )
         if policy is not None:
             results["encoders"] = {
                 kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
@@ -172,12 +179,15 @@ def evaluate(
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
     for name, simulated in simulators.items():
-        outcome, start_goal = _in_simulator(simulated, begin, world.objective.horizon, seed)
+        counted = asked if name == tested_in else None
+        outcome, start_goal = _in_simulator(simulated, begin, world.objective.horizon, seed, counted)
         results[name] = outcome.to_json()
         if name in ("simulated", tested_in):
             tensors[f"{name}.position"] = outcome.position
     if world.has_target:
         start_goal = _starts_and_goals(world, config, seed)
+    if asked is not None:
+        results["beyond_recorded"] = asked.share
     with finished_folder(out) as folder:
         save_tensors(folder / "trajectories.safetensors", tensors | start_goal, {})
         results |= stopwatch.spent()
@@ -200,7 +210,13 @@ def _start(deployed: DeployedPolicy, act: Act, goal: Tensor) -> Act:
 
 
 def _in_target(
-    task: Task, begin: Begin, config: EvaluateConfig, seed: int, num_threads: int | None, progress: Progress
+    task: Task,
+    begin: Begin,
+    config: EvaluateConfig,
+    seed: int,
+    num_threads: int | None,
+    progress: Progress,
+    asked: RecordedRange | None,
 ) -> tuple[Outcome, Tensor, float]:
     """Return the outcome in the target, the states (T + 1, S) of the first episode, and target steps/s."""
     legs = {} if config.leg_scale == 1.0 else {"leg_scale": config.leg_scale}
@@ -212,7 +228,10 @@ def _in_target(
     began = time.perf_counter()
     for step in range(task.objective.horizon):
         is_filmed = bool(record.active[0])
-        outcome = env.step(act(env.state, env.goal), record.active)
+        action = act(env.state, env.goal)
+        if asked is not None:
+            asked.count(action, record.active)
+        outcome = env.step(action, record.active)
         success = task.objective.succeeded(outcome.success, env.failed, step + 1)
         record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
         if is_filmed:
@@ -249,7 +268,7 @@ def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfi
 
 @torch.no_grad()
 def _in_simulator(
-    world: SimulatorEnv, begin: Begin, horizon: int, seed: int
+    world: SimulatorEnv, begin: Begin, horizon: int, seed: int, asked: RecordedRange | None
 ) -> tuple[Outcome, dict[str, Tensor]]:
     """Return the outcome in `world`, and its starts and goals, which are the same in every simulator."""
     torch.manual_seed(derive(seed, "simulated evaluation"))
@@ -258,7 +277,10 @@ def _in_simulator(
     record = EpisodeRecord(world.objective.places(world.simulator.state))
     start_goal = {"start": world.objective.places(world.simulator.state).clone(), "goal": world.goal.clone()}
     for number in range(horizon):
-        step = world.step(act(world.simulator.state, world.goal))
+        action = act(world.simulator.state, world.goal)
+        if asked is not None:
+            asked.count(action, record.active)
+        step = world.step(action)
         success = world.objective.succeeded(step.success, world.failed, number + 1)
         blocked = world.simulator.blocked
         places = world.objective.places(world.simulator.state)

@@ -70,6 +70,17 @@ def test_a_task_without_walls_and_places_has_no_columns_of_them(results: Results
     assert "| failed | steps | return |" in changed
 
 
+def test_commands_beyond_what_was_recorded_are_told_where_there_are_some(results: Results, page: str) -> None:
+    assert "beyond recorded" not in page.lower()
+    few = rows_of(results, astra={"beyond_recorded": [0.01, 0.01, 0.0]})
+    assert "beyond recorded" not in page_of(results, methods=few).lower()
+    many = page_of(results, methods=rows_of(results, astra={"beyond_recorded": [0.9, 1.0, 0.95]}))
+    assert "| success in its simulator | beyond recorded commands |" in many
+    assert "narrow the bounds of the task's commands" in many
+    lines = [line for line in many.splitlines() if line.startswith(("| ASTRA |", "| ASTRA+ |"))][:2]
+    assert lines[0].endswith(" | 0.95 ± 0.05 |") and lines[1].endswith(" | - |")
+
+
 def test_the_papers_figures_stand_beside_ours(results: Results, page: str) -> None:
     assert "the paper's" not in page
     changed = page_of(results, paper_success={"astra": 0.4})

@@ -4,8 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from fake_dataset import writer
 from small_run import TRAIN
 from torch import Tensor
 
@@ -14,6 +16,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.rma import RmaConfig
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
@@ -143,6 +146,22 @@ def test_a_policy_that_was_in_no_simulator_is_tested_in_the_target_alone(
     assert "simulated" not in told and "simulated.position" not in paths
     assert told["encoders"].keys() == {"source"}
     check_outcome(told["target"], paths["target.position"])
+
+
+@pytest.mark.parametrize(("narrower", "expected"), [(1.0, 0.0), (0.0, 1.0)])
+def test_commands_beyond_those_of_the_dataset_are_counted(
+    task: str, trained: Path, grounded: Path, tmp_path: Path, narrower: float, expected: float
+) -> None:
+    columns = [Column(name, size=2) for name in (STATE, NEXT_STATE, ACTION)]
+    actions = narrower * np.array([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]], np.float32)
+    values = dict.fromkeys((STATE, NEXT_STATE, ACTION), actions)
+    with writer(tmp_path / "set", columns=columns) as made:
+        made.add(Episode(0, values, {}))
+    policy = {"policy": trained, "grounding": grounded}
+    told, _ = make(task, "astra", tmp_path / "out", policy | {"recorded": tmp_path / "set"})
+    assert told["beyond_recorded"] == expected
+    without, _ = make(task, "astra", tmp_path / "without", policy)
+    assert "beyond_recorded" not in without and without["target"] == told["target"]
 
 
 def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
