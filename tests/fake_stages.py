@@ -255,6 +255,7 @@ def evaluate(
     grounding: Path | None,
     target_encoder: Path | None,
     reference: Path | None,
+    recorded: Path | None,
     seed: int,
     out: Path,
     progress: Progress,

@@ -37,6 +37,12 @@ def test_rows_read_what_their_method_needs(tmp_path: Path, fake_recipe: type[Rec
         "align/astra/seed_0",
     )
     assert len(items["report"].inputs) == 8
+    calls = {
+        row: items[f"evaluate/{row}/seed_7"].call for row in ("astra_plus", "direct_transfer", "follower")
+    }
+    recorded = {row: call.keywords["recorded"] for row, call in calls.items() if isinstance(call, partial)}
+    pairs = tmp_path / "pair/seed_7"
+    assert recorded == {"astra_plus": pairs, "direct_transfer": pairs, "follower": None}
 
 
 def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(
