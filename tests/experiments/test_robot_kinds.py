@@ -66,6 +66,9 @@ def test_commands_move_the_states_of_their_names_or_the_first(tmp_path: Path) ->
     assert (named.values()["before"], named.values()["after"]) == ("[0.0, 1.0]", "[0.1, 1.1]")
     first = Direct.of(logs(tmp_path, vel_a=T % 4, a=slow, cmd_1=T % 5))
     assert [field.short for field in first.moved] == ["a"]
+    assert (
+        first.values()["names"] == '("a",)' and first.values()["lows"] == first.values()["highs"] == "[0.0]"
+    )
 
 
 def test_commands_may_be_where_to_be(tmp_path: Path) -> None:
