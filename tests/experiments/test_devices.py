@@ -47,6 +47,12 @@ def test_a_device_that_is_not_there_is_told(
         check_device(device, cluster)
 
 
+def test_without_a_gpu_there_is_no_first_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(BadInputError, match="device 'cuda' is not available: torch finds 0 CUDA devices"):
+        check_device("cuda", None)
+
+
 def test_devices_that_are_there_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     for device, cluster in (("cpu", None), ("cuda", None), ("cuda:0", None), ("cuda", "local")):
