@@ -34,4 +34,7 @@ held_out_share = 0.25
 
 [evaluate]
 episodes = 3
+
+[report]
+bootstrap_replicates = 100
 """

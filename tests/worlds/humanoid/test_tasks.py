@@ -82,6 +82,9 @@ held_out_share = 0.25
 
 [evaluate]
 episodes = 2
+
+[report]
+bootstrap_replicates = 100
 """
 LASTING = "humanoid-short"
 HORIZON = 12
