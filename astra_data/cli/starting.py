@@ -30,4 +30,6 @@ def new(
     for field in found.fields:
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
     Console().print(table)
+    if not found.of("time"):
+        typer.echo(f"none of them is a time: {found.rate} rows a second were taken; set fps and TIMESTEP_S")
     typer.echo(f"finished: {folder}; {folder}/README.md says how to go on, and CHECK marks what was guessed")

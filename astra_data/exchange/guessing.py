@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -21,9 +21,9 @@ Role = Literal["time", "episode", "state", "command", "failure", "success", "rew
 
 _COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref"
 _NAMES: tuple[tuple[Role, str], ...] = (
-    ("time", r"t|time|stamp|timestamp|secs?|seconds"),
+    ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
     ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
-    ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id"),
+    ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
     (
         "failure",
         r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|collision|collided|fault|terminated",
@@ -36,6 +36,10 @@ _NAMES: tuple[tuple[Role, str], ...] = (
     ),
 )
 """Roles by the whole of a field's name, without its unit; all other fields are states."""
+_UNCLEAR = "done|truncated|timeout"
+"""Ends of which the name does not say whether they are successes, failures or neither."""
+_FORCE = re.compile(r"(.+_)?(tau|torque|effort)(_.+|\d+)?")
+"""A command where there is no other."""
 RATE_HZ = 10
 """Of logs without a time."""
 _UNITS: tuple[tuple[str, str, float], ...] = (
@@ -59,7 +63,9 @@ _UNITS: tuple[tuple[str, str, float], ...] = (
 _TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
 _ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
-LENGTH = re.compile(r"(?!.*(heading|yaw|theta|psi|quat|vel|twist|speed|acc|rate|force|torque))(.+_)?[xyz]")
+LENGTH = re.compile(
+    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?[xyz]"
+)
 _FULL_TURNS = 4 * math.pi
 """An angle beyond it is taken for degrees."""
 _COMMAND = re.compile(rf"(^|_)({_COMMANDED}|u)(_|(?=\d)|$)")
@@ -118,7 +124,8 @@ def guess(paths: Sequence[Path]) -> Logs:
         paths: files with the same header; a folder stands for the CSV files in it.
 
     Raises:
-        BadInputError: there is no such file, it is no CSV, files differ, or there are no commands or states.
+        BadInputError: there is no such file, it is no CSV, files differ, a time or command is not finite, two
+            fields come to the same name, or there are no commands or states.
     """
     files = [file for path in paths for file in (_files(path) if path.is_dir() else [path])]
     tables = {file: _numbers(file) for file in files}
@@ -127,7 +134,10 @@ def guess(paths: Sequence[Path]) -> Logs:
         if list(table) != header:
             raise BadInputError(f"{file}: expected the fields of {files[0]}, {header}: got {list(table)}")
     joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
-    fields = tuple(_field(name, values) for name, values in joined.items())
+    try:
+        fields = _distinct([_field(name, values) for name, values in joined.items()])
+    except BadInputError as error:
+        raise BadInputError(f"{files[0]}: {error}") from None
     found = Logs(fields, tuple(_episodes(fields, tables.values())))
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if not found.of(role):  # type: ignore[arg-type]
@@ -136,6 +146,30 @@ def guess(paths: Sequence[Path]) -> Logs:
                 f"{files[0]}: found no {role} among {listed}: name one in the header, such as {example}"
             )
     return found
+
+
+def _distinct(fields: list[Field]) -> tuple[Field, ...]:
+    """Return the fields, with forces as commands where there are no others.
+
+    Raises:
+        BadInputError: two states, or two commands, come to the same name.
+    """
+    if not any(field.role == "command" for field in fields):
+        fields = [
+            replace(field, role="command", why="a force, and no other command")
+            if field.role == "state" and _FORCE.fullmatch(field.short)
+            else field
+            for field in fields
+        ]
+    seen: dict[str, str] = {}
+    for field in fields:
+        if field.role not in ("state", "command"):
+            continue
+        if (other := seen.setdefault(field.taken_for, field.name)) != field.name:
+            raise BadInputError(
+                f"{other} and {field.name} are both taken for {field.taken_for}: rename one, or leave it out"
+            )
+    return tuple(fields)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -147,9 +181,9 @@ def _files(folder: Path) -> list[Path]:
 
 def _numbers(path: Path) -> dict[str, Floats]:
     """Return the fields of a file that are numbers, or true and false."""
+    delimiter, mark = ("\t", "tabs") if path.suffix == ".tsv" else (",", "commas")
     try:
-        options = csv.ParseOptions(delimiter="\t" if path.suffix == ".tsv" else ",")
-        table = csv.read_csv(path, parse_options=options)
+        table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
     except FileNotFoundError:
         raise BadInputError(f"{path}: there is no such file") from None
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
@@ -157,33 +191,53 @@ def _numbers(path: Path) -> dict[str, Floats]:
     kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
     names = [entry.name for entry in table.schema if any(kind(entry.type) for kind in kinds)]
     if len(table) < 2 or not names or len(set(names)) < len(names):
-        raise BadInputError(f"{path}: expected a header of different names, and rows of numbers below it")
+        raise BadInputError(
+            f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
+        )
     return {name: table[name].cast(pa.float64(), safe=False).to_numpy() for name in names}
 
 
 def _field(name: str, values: Floats) -> Field:
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     body, ending = _without_unit(plain, _TIMES)
-    if re.fullmatch(_NAMES[0][1], body) and (np.diff(values) > 0).mean() > 0.9:
+    if re.fullmatch(_NAMES[0][1], body):
+        _check_finite(name, "time", values)
+        if (np.diff(values) > 0).mean() <= 0.9:
+            return Field(name, "left out", plain, "1", 1.0, "a time that does not rise")
         step = float(np.median(np.diff(values)))
         unit = ending or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
         return Field(
             name, "time", "time", unit, _TIMES[unit], "its ending" if ending else f"steps of {step:g}"
         )
+    if re.fullmatch(_UNCLEAR, plain):
+        return Field(name, "left out", plain, "1", 1.0, "an end, but which? name it success or failed")
     body, ending = _without_unit(plain, [end for end, _, _ in _UNITS])
+    if ending in ("n", "v", "a") and re.fullmatch(f"{_COMMANDED}|u", body):
+        body, ending = plain, None  # an axis, as in cmd_v
     for role, pattern in _NAMES[1:]:
         if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
             if role in ("failure", "success") and not np.isin(values, (0, 1)).all():
                 continue
             if role != "command":
                 return Field(name, role, role, "1", 1.0, "its name")
+            _check_finite(name, "command", values)
+            if np.ptp(values) == 0:
+                return Field(name, "left out", plain, "1", 1.0, "never changes")
             short = _COMMAND.sub("_", body).strip("_") or "command"
             return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
     if not np.isfinite(values).all() or np.ptp(values) == 0:
         return Field(
-            name, "left out", plain, "1", 1.0, "has gaps" if np.isnan(values).any() else "never changes"
+            name, "left out", plain, "1", 1.0, "never changes" if np.isfinite(values).all() else "has gaps"
         )
     return _with_unit(name, "state", f"s{body}" if body[0].isdigit() else body, ending, values)
+
+
+def _check_finite(name: str, role: Role, values: Floats) -> None:
+    if wrong := int((~np.isfinite(values)).sum()):
+        raise BadInputError(
+            f"{name}: expected a number in each row of a {role}, got none in {wrong} of {len(values)}: "
+            "leave these rows out"
+        )
 
 
 def _without_unit(name: str, endings: Sequence[str] | dict[str, float]) -> tuple[str, str | None]:

@@ -1,8 +1,10 @@
 """A folder for a robot of one's own: a task, a recipe, a mapping of its logs, a test and a page."""
 
 import json
+import keyword
 import math
 import re
+import sys
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -23,13 +25,15 @@ _COLUMNS: dict[Role, str] = {
     "success": SUCCESS,
     "reward": REWARD,
 }
+_TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "pytest", "torch"}
+"""Names whose file would be found in place of a module, or is that of the mapping."""
 
 
 def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Logs:
     """Write the new folder `out` of the robot `name`; return what its logs hold.
 
     Args:
-        name: of the task: letters, digits and _.
+        name: of the task: a-z, digits and _, and no module's.
         out: the folder to write.
         logs: CSV files, or folders of them; by default those of a made-up cart, which are written too.
 
@@ -38,6 +42,8 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Logs:
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
+    if name in _TAKEN or keyword.iskeyword(name):
+        raise BadInputError(f"'{name}': expected a name that nothing else in Python has, such as my_{name}")
     with atomic_folder(out) as folder:
         places = [path.resolve() for path in logs]
         if not places:

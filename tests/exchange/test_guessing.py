@@ -1,5 +1,6 @@
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.exchange.guessing import RATE_HZ, guess
 
 
-def write(path: Path, columns: dict[str, object], rows: int = 6) -> Path:
+def write(path: Path, columns: Mapping[str, object], rows: int = 6) -> Path:
     table = np.column_stack([np.broadcast_to(np.asarray(values, float), rows) for values in columns.values()])
     np.savetxt(path, table, "%.9g", ",", header=",".join(columns), comments="")
     return path
@@ -72,6 +73,58 @@ def test_stamps_of_nanoseconds_are_read(tmp_path: Path) -> None:
     assert guess([tmp_path / "log.csv"]).rate == 20
 
 
+def test_names_of_ros_are_read(tmp_path: Path) -> None:
+    columns = {
+        "header.stamp": 5e7 * RAMP,
+        "header.stamp.nsecs": 5e7 * RAMP,
+        "pose.position.x": RAMP,
+        "pose.orientation.x": RAMP,
+        "cmd_vel.linear.x": RAMP,
+        "cmd_vel.linear.y": 0.0,
+        "cmd_vel.angular.z": -RAMP,
+        "done": RAMP > 4,
+    }
+    logs = guess([write(tmp_path / "log.csv", columns)])
+    assert [(field.taken_for, field.unit) for field in logs.fields] == [
+        ("time", "ns"),
+        ("left out", "1"),
+        ("state pose_position_x", "m"),
+        ("state pose_orientation_x", "1"),
+        ("command vel_linear_x", "1"),
+        ("left out", "1"),
+        ("command vel_angular_z", "1"),
+        ("left out", "1"),
+    ]
+    assert logs.rate == 20
+    assert logs.fields[-1].why == "an end, but which? name it success or failed"
+
+
+def test_a_time_that_does_not_rise_is_left_out(tmp_path: Path) -> None:
+    logs = guess([write(tmp_path / "log.csv", {"stamp": RAMP // 4, "x": RAMP, "cmd": RAMP})])
+    assert (logs.fields[0].role, logs.fields[0].why) == ("left out", "a time that does not rise")
+
+
+def test_forces_are_commands_where_there_are_no_others(tmp_path: Path) -> None:
+    columns = {"q1": RAMP, "q2": -RAMP, "tau1_nm": RAMP, "tau2_nm": -RAMP}
+    taken = [field.taken_for for field in guess([write(tmp_path / "a.csv", columns)]).fields]
+    assert taken == ["state q1", "state q2", "command tau1", "command tau2"]
+    commanded = columns | {"cmd1": RAMP, "cmd2": -RAMP}
+    taken = [field.taken_for for field in guess([write(tmp_path / "b.csv", commanded)]).fields]
+    assert taken[2:] == ["state tau1", "state tau2", "command u1", "command u2"]
+
+
+def test_an_axis_is_no_unit(tmp_path: Path) -> None:
+    columns = {"x": RAMP, "cmd_v": RAMP, "u_a": RAMP, "motor_v": RAMP, "cmd_deg": RAMP}
+    logs = guess([write(tmp_path / "log.csv", columns)])
+    assert [(field.short, field.unit) for field in logs.fields] == [
+        ("x", "m"),
+        ("v", "1"),
+        ("a", "1"),
+        ("motor", "V"),
+        ("command", "rad"),
+    ]
+
+
 def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
     for name in ("one.csv", "two.tsv"):
         write(tmp_path / name, {"trial": RAMP // 4, "x": RAMP, "cmd": -RAMP})
@@ -93,6 +146,18 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
             "found no command among t (time), x (state): name one in the header, such as cmd_v",
         ),
         ("cmd,x\n0,1\n1,1\n2,1\n", "found no state among cmd (command), x (left out): name one"),
+        ("cmd,x\n1,0\n1,1\n1,2\n", "found no command among cmd (left out), x (state): name one"),
+        (
+            "t,x,cmd\n0,0,0\n,1,1\n2,2,2\n",
+            "t: expected a number in each row of a time, got none in 1 of 3: leave",
+        ),
+        ("x,cmd\n0,0\n1,nan\n2,inf\n", "cmd: expected a number in each row of a command, got none in 2 of 3"),
+        ("x_mm,x_cm,cmd\n0,0,0\n1,1,1\n", "x_mm and x_cm are both taken for state x: rename one"),
+        ("x,cmd_v,u_v\n0,0,0\n1,1,1\n", "cmd_v and u_v are both taken for command v: rename one"),
+        (
+            "x;cmd\n0;1\n1;2\n",
+            "expected a header of different names, and rows of numbers below it, parted by commas",
+        ),
     ],
 )
 def test_what_is_of_no_use_is_told(tmp_path: Path, text: str, expected: str) -> None:

@@ -13,6 +13,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.experiments.new_robot import write_robot
 from astra_data.experiments.run import check, run
 from astra_data.worlds.registry import task_named
+from astra_data.worlds.walk_through import check_task
 
 
 @pytest.fixture(autouse=True)
@@ -80,6 +81,45 @@ def test_logs_of_an_arm_give_its_task(tmp_path: Path) -> None:
     np.testing.assert_allclose(simulated, recorded, atol=1e-4)
 
 
+def test_torques_of_an_arm_give_a_task(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    columns = {f"q{joint}": rng.normal(size=60) for joint in range(1, 7)}
+    columns |= {f"tau{joint}": rng.uniform(-2, 2, 60) for joint in range(1, 7)}
+    header = ",".join(["time", *columns])
+    np.savetxt(
+        "log.csv",
+        np.column_stack([np.arange(60) / 50, *columns.values()]),
+        "%.4f",
+        ",",
+        header=header,
+        comments="",
+    )
+    command("new arm6 --from log.csv")
+    command("import log.csv --mapping arm6/logs.toml")
+    assert check_task(task_named("arm6/arm6.py:TASK")) == []
+    assert "data" in check(Path("arm6/arm6.toml"))
+
+
+def test_a_twist_of_six_fields_is_a_unicycle(tmp_path: Path) -> None:
+    rows = np.arange(60)
+    turns = np.where(rows % 20 < 10, 0.5, -0.5)
+    yaw = np.cumsum(0.05 * turns)
+    pose = [0.05 * np.cumsum(np.cos(yaw)), 0.05 * np.cumsum(np.sin(yaw)), yaw]
+    twist = [0.9 + 0.1 * (rows % 2), *np.zeros((4, 60)), turns]
+    header = "header.stamp,pose.x,pose.y,pose.yaw," + ",".join(
+        f"cmd_vel.{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"
+    )
+    table = np.column_stack([rows / 20, *pose, *twist])
+    np.savetxt("log.csv", table, "%.4f", ",", header=header, comments="")
+    command("new rover --from log.csv")
+    command("import log.csv --mapping rover/logs.toml")
+    assert "class Unicycle" in Path("rover/rover.py").read_text()
+    task = task_named("rover/rover.py:TASK")
+    assert check_task(task) == [] and task.timestep_s == 0.05
+    assert list(task.limits) == ["vel_linear_x", "vel_angular_z"]
+    assert "data" in check(Path("rover/rover.toml"))
+
+
 def test_what_is_guessed_is_marked(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("x,cmd_x,won,reward\n" + "".join(f"{row},{row % 3},0,{row}\n" for row in range(9)))
@@ -88,11 +128,20 @@ def test_what_is_guessed_is_marked(tmp_path: Path) -> None:
     assert "[split]" not in Path("slide/logs.toml").read_text()
     assert '[columns."next.reward"]\nfields = ["reward"]' in Path("slide/logs.toml").read_text()
     assert Path("slide/slide.py").read_text().count("CHECK") == 7
+    shown = CliRunner().invoke(app, ["new", "other", "--from", str(log)])
+    assert "none of them is a time: 10 rows a second were taken" in shown.output
 
 
 @pytest.mark.parametrize("name", ["", "My", "a-b", "1st", "a.py", "../a"])
 def test_a_name_is_one_of_a_file_and_a_task(name: str) -> None:
     with pytest.raises(BadInputError, match="expected a name of a-z, 0-9 and _, such as my_cart"):
+        write_robot(name, Path("out"))
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("name", ["class", "random", "torch", "logs"])
+def test_a_name_is_taken_from_nothing_else(name: str) -> None:
+    with pytest.raises(BadInputError, match=f"that nothing else in Python has, such as my_{name}"):
         write_robot(name, Path("out"))
     assert not Path("out").exists()
 
