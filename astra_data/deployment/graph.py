@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.training.deployment import DeployedPolicy, Memory
+from astra_data.training.own_policy import OwnPolicy
 
 ONNX, TORCHSCRIPT = "policy.onnx", "policy.torchscript"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
@@ -79,6 +80,11 @@ def write_graphs(deployed: DeployedPolicy, folder: Path) -> Written:
         BadInputError: code of the task cannot be traced, or a graph gives other commands than the policy.
     """
     optional("onnxscript", "deploy")
+    if isinstance(deployed.policy, OwnPolicy):
+        raise BadInputError(
+            f"{deployed.policy.name} is a policy of another learner, which cannot be traced: export it with its "
+            "own library, or act with astra_data.load_policy"
+        )
     graph = PolicyGraph(deployed).eval()
     example = graph.example
     with _quiet():

@@ -20,6 +20,7 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import base_method, is_plus
 from astra_data.dataset.format import INFO_PATH
 from astra_data.experiments.own_files import changed_code
+from astra_data.experiments.own_methods import looked_up
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
 from astra_data.experiments.renamed import with_current_keys
@@ -27,6 +28,7 @@ from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
 from astra_data.stages.registry import STAGES
+from astra_data.worlds.own_code import place_beside
 from astra_data.worlds.registry import task_named
 
 ALWAYS_NEW = {"report"}
@@ -143,7 +145,7 @@ class Experiment:
         rows = [place for stage in sorted(own - whole) for place in sorted((self.folder / stage).iterdir())]
         folders += [row for row in rows if base_method(row.name) in code]
         texts = [f"{' and '.join(sorted(changed))} changed in the recipe"] if changed else []
-        texts += [f"{file} changed" for file in dict.fromkeys(code.values())]
+        texts += [f"{what} changed" for what in dict.fromkeys(code.values())]
         return " and ".join(texts), list(dict.fromkeys(folders))
 
     @property
@@ -211,12 +213,10 @@ def _tables(path: Path) -> dict[str, Any]:
     """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
     tables = with_current_keys(load_tables(path), path)
     task, data = tables.get("task"), tables.get("data")
-    if isinstance(task, str) and ".py:" in task:
-        tables["task"] = str(path.parent / task)
+    if isinstance(task, str):
+        tables["task"] = place_beside(task, path.parent)
     if isinstance(own := tables.get("own_methods"), dict):
-        tables["own_methods"] = {
-            name: str(path.parent / place) if ".py:" in str(place) else place for name, place in own.items()
-        }
+        tables["own_methods"] = looked_up(own, path.parent)
     if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
         tables["data"] = str(path.parent / data)
     return tables
@@ -257,7 +257,8 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     with suppress(RecipeError):
         before = validated(before, type(recipe), "recipe.json").settings
     before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
-    changed = {key for key in now.keys() - {"methods", "seeds", "based_on"} if before.get(key) != now[key]}
+    elsewhere = {"methods", "own_methods", "seeds", "based_on"}
+    changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}
     if "task" in changed and _share_target(str(before.get("task")), recipe.task):
         return changed - {"task"} | {_SIMULATOR}
     return changed

@@ -8,16 +8,26 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.worlds.own_code import code_digest
 
 CODE = "code.json"
-"""Beside recipe.json: the digests of "task", and of methods by their names."""
+"""Beside recipe.json: the digests of "task", and of methods by their names, with their settings."""
+_SETTINGS = ".settings"
 
 
 def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
-    """Return what was recorded in `folder` and is another now: "task" or a method's name, to its file's."""
+    """Return what was recorded in `folder` and is another now.
+
+    Returns:
+        "task" and names of methods, each to what of it changed: its file, or its settings.
+    """
     record = folder / CODE
     before = json.loads(record.read_text()) if record.is_file() else {}
     now = _digests(recipe)
     changed = [name for name, digest in before.items() if now.get(name, digest) != digest]
-    return {name: Path(_places(recipe)[name].rpartition(":")[0]).name for name in changed}
+    return {
+        name.removesuffix(_SETTINGS): f"the settings of {name.removesuffix(_SETTINGS)}"
+        if name.endswith(_SETTINGS)
+        else Path(_places(recipe)[name].rpartition(":")[0]).name
+        for name in changed
+    }
 
 
 def record_code(recipe: Recipe, folder: Path) -> None:
@@ -27,9 +37,12 @@ def record_code(recipe: Recipe, folder: Path) -> None:
 
 
 def _places(recipe: Recipe) -> dict[str, str]:
-    return {"task": recipe.task, **recipe.own_methods}
+    return {"task": recipe.task} | {name: own.method for name, own in recipe.own_methods.items()}
 
 
 def _digests(recipe: Recipe) -> dict[str, str]:
     found = {name: code_digest(place) for name, place in _places(recipe).items()}
+    for name, own in recipe.own_methods.items():
+        if settings := own.settings(name):
+            found[f"{name}{_SETTINGS}"] = settings.model_dump_json()
     return {name: digest for name, digest in found.items() if digest}

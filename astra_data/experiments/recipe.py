@@ -18,7 +18,8 @@ from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
-from astra_data.methods import METHODS, add_method, method_named, tables
+from astra_data.experiments.own_methods import OwnMethod, add_all
+from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.worlds.registry import task_named
@@ -48,9 +49,8 @@ class Recipe(Config):
     data: str | None = Field(default=None, exclude_if=lambda data: data is None)
     """A dataset in place of `[collect]`: a folder beside the recipe, what the commands on datasets take (a
     folder, a name at home, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
-    own_methods: dict[str, str] = Field(default_factory=dict, exclude_if=lambda places: not places)
-    """Methods of one's own by the names of their rows: "delta.py:METHOD", a file beside the recipe, or
-    "package.module:METHOD"; their code is run."""
+    own_methods: dict[str, OwnMethod] = Field(default_factory=dict, exclude_if=lambda methods: not methods)
+    """Methods of one's own by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
     seeds: tuple[int, ...] = Field(min_length=1)
@@ -75,9 +75,12 @@ class Recipe(Config):
 
         Ranges to train in are reduced to the parameters that the task's simulator has.
         """
-        method = METHODS[base_method(row)]
+        name = base_method(row)
+        method = METHODS[name]
         if method.table is None or method.configures != stage:
             return None
+        if name in self.own_methods:
+            return self.own_methods[name].settings(name)
         table: Any = getattr(self, method.table.name)
         if method.table.ranges and stage == "train":
             table = table.of_kind(type(getattr(task_named(self.task).varied, method.table.ranges)))
@@ -123,13 +126,12 @@ class Recipe(Config):
 
     @field_validator("own_methods")
     @classmethod
-    def _add_own_methods(cls, places: dict[str, str]) -> dict[str, str]:
-        for name, place in places.items():
-            try:
-                add_method(name, place)
-            except BadInputError as error:
-                raise ValueError(str(error)) from None
-        return places
+    def _add_own_methods(cls, methods: dict[str, OwnMethod]) -> dict[str, OwnMethod]:
+        try:
+            add_all(methods)
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return methods
 
     @field_validator("methods")
     @classmethod
@@ -270,7 +272,7 @@ def _stage_field(stage: Stage) -> tuple[Any, Any]:
 
 def _method_field(table: Table) -> tuple[Any, Any]:
     if table.ranges is None:
-        return table.model, table.default or table.model()
+        return table.model, table.usual
     return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
 
 

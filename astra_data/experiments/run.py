@@ -23,11 +23,11 @@ from astra_data.experiments.experiment import ALWAYS_NEW, Experiment, load_exper
 from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.local_executor import execute
 from astra_data.experiments.own_files import record_code
+from astra_data.experiments.own_methods import OwnMethod, add_all
 from astra_data.experiments.plan import check_stage, grounded_as, plan, stage_of, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
-from astra_data.methods import add_method
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
@@ -218,12 +218,11 @@ def make(
                 execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
 
 
-def _prepare(own_methods: dict[str, str]) -> None:
+def _prepare(own_methods: dict[str, OwnMethod]) -> None:
     """Make a process ready for an item of a recipe with these methods of its own."""
     # One thread for the networks: they are small, and idle threads would slow down other items.
     torch.set_num_threads(1)
-    for name, place in own_methods.items():
-        add_method(name, place)
+    add_all(own_methods)
 
 
 def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:

@@ -6,10 +6,11 @@ from typing import Any
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method, place
+from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.plan import grounded_as
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.methods import add_method, method_named
+from astra_data.methods import method_named
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.worlds.registry import task_named
@@ -74,8 +75,7 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     """
     task_of(run)
     settings = json.loads((Path(run) / "recipe.json").read_text())
-    for name, place_of in settings.get("own_methods", {}).items():
-        add_method(name, place_of)
+    add_all(settings.get("own_methods", {}))
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")

@@ -18,6 +18,8 @@ from astra_data.methods.nas import NAS
 from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
+from astra_data.training.own_learner import OwnLearner
+from astra_data.training.policy_file import add_policy_kind
 from astra_data.worlds.own_code import own_object
 
 METHODS: dict[str, Method] = {
@@ -49,7 +51,7 @@ ENTRY_POINTS = "astra_data.methods"
 """The group of entry points under which installed packages offer methods."""
 _NAME = re.compile("[a-z][a-z0-9_]*")
 _PLACES: dict[str, str] = {}
-"""Where the methods come from that are none of the package's."""
+"""Where the methods come from that are none of the package's, in this process: two of one name are refused."""
 _OWN_KINDS: set[str] = set()
 """The kinds of their groundings."""
 
@@ -64,8 +66,10 @@ def add_method(name: str, place: str) -> None:
     Raises:
         BadInputError: the name is taken or cannot be that of a folder; or what is there is no method.
     """
-    if _PLACES.get(name) == place:
+    if (known := _PLACES.get(name)) == place:
         return
+    if known is not None:
+        raise BadInputError(f"method '{name}' is {known} already: give {place} another name")
     if not _NAME.fullmatch(name) or is_plus(name):
         raise BadInputError(f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS}")
     if name in METHODS and name not in _PLACES:
@@ -73,8 +77,8 @@ def add_method(name: str, place: str) -> None:
     method = own_object(place)
     if not isinstance(method, Method):
         raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
-    if method.table is not None:
-        raise BadInputError(f"{place} has a table of settings, which only methods of the package have")
+    if method.table is not None and method.table.ranges:
+        raise BadInputError(f"{place} has a table of ranges, which only methods of the package have")
     if kind := method.grounding:
         if kind.kind in KINDS and kind.kind not in _OWN_KINDS:
             raise BadInputError(
@@ -82,6 +86,8 @@ def add_method(name: str, place: str) -> None:
             )
         _OWN_KINDS.add(kind.kind)
         KINDS[kind.kind] = kind
+    if isinstance(method.learn, OwnLearner):
+        add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)
     _PLACES[name] = place
 

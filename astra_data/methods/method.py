@@ -34,6 +34,11 @@ class Table:
     default: Config | None = None
     ranges: Literal["randomized", "wide"] | None = None
 
+    @property
+    def usual(self) -> Config:
+        """The settings where a recipe has no such table."""
+        return self.default or self.model()
+
 
 @dataclass(frozen=True)
 class Method:

@@ -1,6 +1,7 @@
 """Policies of other learners, which act on the observations of a row's environment."""
 
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -20,6 +21,29 @@ class ActingPolicy(Protocol):
     def act(self, observation: Array) -> Array:
         """Return actions (B, A) within ±1 for observations (B, O) float32."""
         ...
+
+
+class SavedPolicy(ActingPolicy, Protocol):
+    """What a policy has to have that a learner of the user's makes for a row.
+
+    Attributes:
+        kind: names the class in files; see `KINDS`.
+    """
+
+    kind: ClassVar[str]
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
+        ...
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
+        """Rebuild it."""
+        ...
+
+
+KINDS: dict[str, type[SavedPolicy]] = {}
+"""The classes of such policies by their kinds, as methods of the user's add them."""
 
 
 class OwnPolicy(Policy):

@@ -1,5 +1,6 @@
 """Policies on disk: one safetensors file with the networks and all that is needed to run them."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from astra_data.core.checkpoint import save_tensors, understood
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
@@ -16,6 +18,7 @@ from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.training.build_env import EnvConfig
 from astra_data.training.deployment import DeployedPolicy, Observed
+from astra_data.training.own_policy import KINDS, OwnPolicy, SavedPolicy
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
@@ -24,6 +27,19 @@ _KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
     "adaptive": (Student, AdaptiveShape),
     "soft_actor": (SoftActor, PolicyShape),
 }
+_PREFIX = "policy."
+"""Of the names of a policy's tensors."""
+
+
+def add_policy_kind(made: type[SavedPolicy]) -> None:
+    """Let files hold policies of another learner.
+
+    Raises:
+        BadInputError: the package has policies of this kind itself.
+    """
+    if made.kind in _KINDS:
+        raise BadInputError(f"policies of kind '{made.kind}' are the package's: rename that of {made.__name__}")
+    KINDS[made.kind] = made
 
 
 @dataclass(frozen=True)
@@ -63,9 +79,10 @@ class PolicyFile:
 
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
-        tensors = {f"policy.{name}": tensor for name, tensor in self.policy.state_dict().items()}
-        metadata: dict[str, Any] = {
-            "kind": next(kind for kind, (made, _) in _KINDS.items() if type(self.policy) is made),
+        kind, networks, own = _taken_apart(self.policy)
+        tensors = {f"{_PREFIX}{name}": tensor for name, tensor in networks.items()}
+        metadata: dict[str, Any] = own | {
+            "kind": kind,
             "shape": asdict(self.policy.shape),
             "dataset": self.dataset,
             "hash": self.content_hash,
@@ -89,18 +106,13 @@ class PolicyFile:
         Raises:
             BadInputError: the file is missing, holds something else, or is from an older version.
         """
-        with understood(Path(path), "a policy", _KINDS, device) as (tensors, metadata):
-            shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
-            made, shaped = _KINDS[metadata["kind"]]
-            policy = made(shaped(**shape))
-            prefix = "policy."
-            policy.load_state_dict(
-                {
-                    name.removeprefix(prefix): value
-                    for name, value in tensors.items()
-                    if name.startswith(prefix)
-                }
-            )
+        with understood(Path(path), "a policy", {**_KINDS, **KINDS}, device) as (tensors, metadata):
+            networks = {
+                name.removeprefix(_PREFIX): value
+                for name, value in tensors.items()
+                if name.startswith(_PREFIX)
+            }
+            policy = _put_together(networks, metadata)
             simulation = None
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
@@ -113,6 +125,26 @@ class PolicyFile:
             read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
         policy.to(device).requires_grad_(False)
         return read
+
+
+def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, Any]]:
+    """Return the kind of a policy, its tensors, and metadata if it is of another learner."""
+    if not isinstance(policy, OwnPolicy):
+        return next(kind for kind, (made, _) in _KINDS.items() if type(policy) is made), policy.state_dict(), {}
+    saved: Any = policy.acting
+    tensors, metadata = saved.to_file()
+    return saved.kind, tensors, {"own": metadata}
+
+
+def _put_together(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Policy:
+    shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
+    if "own" in metadata:
+        acting = KINDS[metadata["kind"]].from_file(tensors, metadata["own"])
+        return OwnPolicy(acting, shape["observation_size"], shape["action_size"])
+    made, shaped = _KINDS[metadata["kind"]]
+    policy = made(shaped(**shape))
+    policy.load_state_dict(tensors)
+    return policy
 
 
 def deploy(

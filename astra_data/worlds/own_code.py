@@ -21,6 +21,11 @@ def is_own_code(name: str) -> bool:
     return bool(colon and module and attribute.isidentifier())
 
 
+def place_beside(name: str, folder: Path) -> str:
+    """Return `name` with its file, if it is one, looked up in `folder`."""
+    return str(folder / name) if ".py:" in name else name
+
+
 def own_object(name: str) -> Any:  # noqa: ANN401 - any object
     """Run the file or module that `name` begins with, and return the object that it ends with.
 

@@ -83,6 +83,19 @@ def test_rows_are_outdated_by_another_method(made: Path) -> None:
     assert experiment.outdated("ground/nas/seed_0") == experiment.outdated("collect/seed_0") == ""
 
 
+def test_rows_are_outdated_by_other_settings(made: Path) -> None:
+    shutil.copy(ROOT / "recipes/examples/methods/delta_action.py", made / "other.py")
+    edit(made / "rail.toml", 'mine = "mine.py:METHOD"', 'other = {method = "other.py:METHOD", memory = 8}')
+    edit(made / "rail.toml", '"mine"', '"other"')
+    experiment = load(made)
+    (experiment.folder / "ground/other/seed_0").mkdir(parents=True)
+    record_code(experiment.recipe, experiment.folder)
+    edit(made / "rail.toml", "memory = 8", "memory = 9")
+    experiment = load(made)
+    assert experiment.outdated("ground/other/seed_0").startswith("the settings of other changed since")
+    assert experiment.outdated("ground/nas/seed_0") == ""
+
+
 def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
     (load(made).folder / CODE).unlink()

@@ -1,15 +1,17 @@
 """Methods of the user's: rows beside those of the package."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from small_cart import TASK
+from small_cart import GIVEN, TASK, Rail
 
 import astra_data.methods as registry
+from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.progress import silent
 from astra_data.experiments.experiment import load_experiment
@@ -19,6 +21,7 @@ from astra_data.grounding.files import KINDS, load_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.methods import METHODS, add_method, method_named
 from astra_data.worlds.own_code import own_object
+from astra_data.worlds.task import Task
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "recipes/examples/methods"
@@ -66,31 +69,71 @@ def recipe(folder: Path, methods: str, own: str) -> Path:
     return path
 
 
-def fitting(folder: Path, moved_by: float) -> Fitting:
+def fitting(folder: Path, moved_by: float = 0.0, task: Task = TASK) -> Fitting:
     """Return steps of a cart that moves by `moved_by` more than its simulator."""
     generator = torch.Generator().manual_seed(0)
     state = torch.rand(8, 20, 1, generator=generator)
     action = 1.2 * torch.rand(8, 20, 1, generator=generator) - 0.6
     simulated = state + 0.1 * TASK.limits.in_units(action)
     windows = SimpleNamespace(
-        state=state, action=action, next_state=simulated + moved_by, simulated_next=simulated
+        state=state,
+        action=action,
+        next_state=simulated + moved_by,
+        simulated_next=simulated,
+        mask=torch.ones(8, 20),
     )
-    episodes: Any = SimpleNamespace(windows=windows, steps=lambda values: values.flatten(0, 1))
+    episodes: Any = SimpleNamespace(
+        windows=windows,
+        steps=lambda values: values.flatten(0, 1),
+        draw_windows=lambda count, length: (windows, None),
+    )
     config = GroundConfig(updates=300)
-    return Fitting(TASK, config, None, episodes, episodes, 0, "cpu", folder, silent)
+    return Fitting(task, config, None, episodes, episodes, 0, "cpu", folder, silent)
 
 
-def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path) -> None:
-    method = own_object(f"{EXAMPLES / 'delta_action.py'}:METHOD")
-    grounding, _ = method.fit(fitting(tmp_path, moved_by=0.1 * 0.5))
-    state, action = torch.linspace(0.1, 0.9, 9)[:, None], torch.linspace(-0.5, 0.5, 9)[:, None]
-    added = grounding.delta(torch.cat([state, action], dim=-1))
+class NumpyRail(Rail):
+    """The same, of arrays, which have no gradients."""
+
+    def step(self, command: torch.Tensor) -> torch.Tensor:
+        return super().step(command.detach())
+
+
+DELTA = f"{EXAMPLES / 'delta_action.py'}:METHOD"
+
+
+@pytest.mark.parametrize("simulator", [Rail, NumpyRail])
+def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, simulator: type[Rail]) -> None:
+    method, task = own_object(DELTA), Task(**GIVEN | {"make_simulator": simulator})
+    given = replace(fitting(tmp_path, 0.1 * 0.5, task), settings=method.table.usual)
+    grounding, _ = method.fit(given)
+    windows = given.training.windows
+    added, _ = grounding.delta(windows.state, windows.action)
     # 0.5 m/s of a range of 5 m/s, which is 2 of the action's units.
-    torch.testing.assert_close(added, torch.full((9, 1), 0.2), atol=0.02, rtol=0)
-    simulator = grounding.simulator(TASK, 9)
-    simulator.start(state, torch.arange(9), torch.zeros(9, 1))
-    expected = state + 0.1 * (TASK.limits.in_units(action) + 0.5)
-    torch.testing.assert_close(simulator.step(action), expected, atol=0.005, rtol=0)
+    torch.testing.assert_close(added, torch.full((8, 20, 1), 0.2), atol=0.07, rtol=0)
+
+
+def test_a_delta_action_tells_a_lag_from_the_history(tmp_path: Path) -> None:
+    """The cart does what it was told a step before, so the step before is what is to be added."""
+    method, given = own_object(DELTA), fitting(tmp_path)
+    windows = given.training.windows
+    before = torch.cat([torch.zeros(8, 1, 1), windows.action[:, :-1]], dim=1)
+    windows.next_state = windows.state + 0.1 * TASK.limits.in_units(before)  # type: ignore[misc]
+    given = replace(
+        given,
+        config=GroundConfig(updates=600),
+        settings=method.table.model(memory=16, learning_rate=0.01),
+    )
+    grounding, figures = method.fit(given)
+    assert grounding.delta.sizes == [1, 1, 16] and figures["loss"] < 0.01
+    simulator = grounding.simulator(TASK, 8)
+    simulator.start(windows.state[:, 0], torch.arange(8), torch.zeros(8, 1))
+    simulator.step(windows.action[:, 0])
+    saved = {name: values.clone() for name, values in simulator.state_dict().items()}
+    for _ in range(2):
+        moved = simulator.step(windows.action[:, 1]) - saved["state"]
+        told = 0.1 * TASK.limits.in_units(windows.action[:, 0])
+        torch.testing.assert_close(moved, told, atol=0.06, rtol=0)
+        simulator.load_state_dict(saved)
 
 
 def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: Path) -> None:
@@ -124,11 +167,44 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     assert policy.act(torch.zeros(2, 2), torch.ones(2, 1)).shape == (2, 1)
 
 
+def test_its_settings_stand_in_the_recipe(tmp_path: Path) -> None:
+    own = f'delta_action = {{method = "{DELTA}", memory = 4}}\n'
+    recipe_of = load_experiment(recipe(tmp_path, '["delta_action_plus"]', own), tmp_path / "runs").recipe
+    settings = recipe_of.settings_of("delta_action_plus", "ground")
+    assert settings is not None and settings.model_dump() == {"memory": 4, "learning_rate": 0.003}
+    assert recipe_of.settings_of("delta_action_plus", "train") is None
+    again = validated(recipe_of.settings, type(recipe_of), "recipe.json")
+    assert again.settings_of("delta_action", "ground") == settings
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "told"),
+    [
+        ("delta_action", "memroy = 4", "own_methods.delta_action: memroy: unknown key: did you mean 'memory'"),
+        ("delta_action", "memory = 0", "memory: expected greater than or equal to 1, got 0"),
+        ("residual_ensemble", "members = 3", "residual_ensemble.py:METHOD has no settings, got members"),
+    ],
+)
+def test_settings_that_it_has_not_are_refused(tmp_path: Path, method: str, given: str, told: str) -> None:
+    own = f'{method} = {{method = "{EXAMPLES}/{method}.py:METHOD", {given}}}\n'
+    with pytest.raises(RecipeError, match=told):
+        load_experiment(recipe(tmp_path, f'["{method}"]', own), tmp_path / "runs")
+
+
+def test_one_name_is_not_two_methods(tmp_path: Path) -> None:
+    add_method("mine", DELTA)
+    add_method("mine", DELTA)
+    other = f"{EXAMPLES}/residual_ensemble.py:METHOD"
+    with pytest.raises(BadInputError, match=f"method 'mine' is {DELTA} already: give {other} another name"):
+        add_method("mine", other)
+    assert METHODS["mine"].title == "Delta action"
+
+
 def test_a_file_is_looked_up_beside_the_recipe(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text((EXAMPLES / "delta_action.py").read_text())
     path = recipe(tmp_path, '["mine", "mine_plus"]', 'mine = "mine.py:METHOD"\n')
     loaded = load_experiment(path, tmp_path / "runs").recipe
-    assert loaded.own_methods == {"mine": str(tmp_path / "mine.py:METHOD")}
+    assert loaded.own_methods["mine"].method == str(tmp_path / "mine.py:METHOD")
     assert METHODS["mine"].name == "mine" and METHODS["mine"].title == "Delta action"
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium
 import torch
 import typer
-from rows import Rows
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -26,6 +25,7 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.stable_baselines import Rows
 from astra_data.training.train import PpoTrainConfig
 from astra_data.worlds.registry import TASKS
 

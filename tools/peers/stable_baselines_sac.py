@@ -10,12 +10,12 @@ import sys
 
 import torch
 import typer
-from rows import Rows
 from stable_baselines3 import SAC
 
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.stable_baselines import Rows
 from astra_data.worlds.registry import TASKS
 
 

@@ -1,40 +1,70 @@
 """Delta actions, as in ASAP: the simulator is given other actions than the robot, so that it moves alike.
 
-The difference is fitted through the simulator's own step, which has to be differentiable.
+By how much they differ is told from the history, by a GRU that is fitted through the simulator's own step. A
+step without a gradient is replaced by its slope, which is measured by trying actions a little to either side.
 """
 
 from dataclasses import dataclass
 
 import torch
+from torch.nn import GRU, Linear
 
+from astra_data.core.config import AtOnce, Config
 from astra_data.grounding.protocols import FittedGrounding
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.methods.method import Method
+from astra_data.methods.method import Method, Table
+
+NUDGE = 0.05
 
 
-def network(states, actions):
-    return torch.nn.Sequential(
-        torch.nn.Linear(states + actions, 64), torch.nn.Tanh(), torch.nn.Linear(64, actions)
-    )
+class DeltaConfig(Config):
+    memory: AtOnce = 32
+    learning_rate: float = 3e-3
+
+
+class Delta(torch.nn.Module):
+    """f of the states and actions so far."""
+
+    def __init__(self, states, actions, memory):
+        super().__init__()
+        self.sizes = [states, actions, memory]
+        self.gru, self.head = GRU(states + actions, memory, batch_first=True), Linear(memory, actions)
+
+    def forward(self, state, action, hidden=None):  # (E, T, X), (E, T, A) -> (E, T, A)
+        after, hidden = self.gru(torch.cat([state, action], dim=-1), hidden)
+        return self.head(after), hidden
 
 
 class DeltaSimulator(EpisodeSimulator):
-    """Step the simulator by action + f(state, action)."""
+    """Step the simulator by action + f(history)."""
 
     def __init__(self, simulator, delta, *, scatter):
         super().__init__(simulator, scatter=scatter)
-        self.delta = delta
+        self.delta, count = delta, len(simulator.state)
+        self.hidden = torch.zeros(1, count, delta.sizes[2], device=simulator.state.device)
 
+    def start(self, state, rows, goal, **history):
+        super().start(state, rows, goal)
+        self.hidden[:, rows] = 0.0
+
+    @torch.no_grad()
     def step(self, action):
-        with torch.no_grad():
-            return super().step(action + self.delta(torch.cat([self.state, action], dim=-1)))
+        added, self.hidden = self.delta(self.state[:, None], action[:, None], self.hidden)
+        return super().step(action + added[:, 0])
+
+    def state_dict(self):
+        return super().state_dict() | {"hidden": self.hidden}
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self.hidden = state["hidden"].clone()
 
 
 @dataclass(frozen=True)
 class DeltaAction(FittedGrounding):
     kind = "delta action"
 
-    delta: torch.nn.Module
+    delta: Delta
 
     def corrected(self, simulator, scatter):
         return DeltaSimulator(simulator, self.delta, scatter=scatter)
@@ -44,35 +74,60 @@ class DeltaAction(FittedGrounding):
         return torch.zeros(size, size, device=episodes.windows.state.device)
 
     def to_file(self):
-        actions = self.delta[-1].out_features
-        return self.delta.state_dict(), {"sizes": [self.delta[0].in_features - actions, actions]}
+        return self.delta.state_dict(), {"sizes": self.delta.sizes}
 
     @classmethod
     def from_file(cls, tensors, metadata, device):
-        delta = network(*metadata["sizes"])
+        delta = Delta(*metadata["sizes"])
         delta.load_state_dict(tensors)
         return cls(delta.to(device).requires_grad_(False))
 
 
+def stepped(task, state, action):
+    """Step simulators from states (N, X) by actions (N, A); the gradient is the simulator's, or its slope."""
+
+    def landed(given):
+        simulator = task.simulator(len(state), str(state.device))
+        simulator.reset_to(state)
+        return simulator.step(given)
+
+    after = landed(action)
+    if after.requires_grad:
+        return after
+    with torch.no_grad():
+        nudges = NUDGE * torch.eye(action.shape[-1], device=action.device)
+        slopes = [(landed(action + nudge) - landed(action - nudge)) / (2 * NUDGE) for nudge in nudges]
+        slope = torch.stack(slopes, dim=-1)
+    return after + (slope @ (action - action.detach())[..., None])[..., 0]
+
+
 def fit(fitting):
     torch.manual_seed(fitting.seed)
-    episodes, windows = fitting.training, fitting.training.windows
-    state, action, after = map(episodes.steps, (windows.state, windows.action, windows.next_state))
-    delta, count = network(state.shape[-1], action.shape[-1]).to(fitting.device), min(256, len(state))
-    spread, simulator = (after - state).std(0) + 1e-6, fitting.task.simulator(count, fitting.device)
-    optimizer = torch.optim.Adam(delta.parameters(), lr=3e-3)
-    for update in range(fitting.config.updates):
-        rows = torch.randint(len(state), (count,), device=fitting.device)
-        simulator.reset_to(state[rows])
-        landed = simulator.step(action[rows] + delta(torch.cat([state[rows], action[rows]], dim=-1)))
-        loss = ((landed - after[rows]) / spread).square().mean()
+    windows, steps, config = fitting.training.windows, fitting.training.steps, fitting.config
+    delta = Delta(windows.state.shape[-1], windows.action.shape[-1], fitting.settings.memory)
+    delta.to(fitting.device)
+    spread = steps(windows.next_state - windows.state).std(0) + 1e-6
+    optimizer = torch.optim.Adam(delta.parameters(), lr=fitting.settings.learning_rate)
+    for update in range(config.updates):
+        drawn, _ = fitting.training.draw_windows(config.batch_windows, config.window)
+        is_real = drawn.mask.bool()
+        action = drawn.action + delta(drawn.state, drawn.action)[0]
+        after = stepped(fitting.task, drawn.state[is_real], action[is_real])
+        loss = ((after - drawn.next_state[is_real]) / spread).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        fitting.progress(update / fitting.config.updates, f"loss {loss.item():.3f}")
+        fitting.progress(update / config.updates, f"loss {loss.item():.3f}")
     return DeltaAction(delta.requires_grad_(False)), {"loss": loss.item()}
 
 
 METHOD = Method(
-    name="delta_action", title="Delta action", colour="#8C564B", fit=fit, grounding=DeltaAction, fit_rates=()
+    name="delta_action",
+    title="Delta action",
+    colour="#8C564B",
+    fit=fit,
+    grounding=DeltaAction,
+    table=Table("delta_action", DeltaConfig),
+    configures="ground",
+    fit_rates=(),
 )

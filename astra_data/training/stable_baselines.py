@@ -1,4 +1,4 @@
-"""Batched worlds of ours, as Stable-Baselines3 wants them."""
+"""Vector environments as Stable-Baselines3 wants them, which has an interface of its own."""
 
 from typing import Any
 
@@ -9,7 +9,16 @@ from astra_data.training.gymnasium import Array, BatchedVectorEnv
 
 
 class Rows(VecEnv):  # type: ignore[misc]
-    """Gymnasium's vector environment as Stable-Baselines3 wants it."""
+    """A vector environment of Gymnasium as one of Stable-Baselines3.
+
+    Example:
+        >>> import gymnasium
+        >>> from stable_baselines3 import PPO
+        >>> import astra_data.envs
+        >>> from astra_data.training.stable_baselines import Rows
+        >>> robots = gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=8)
+        >>> model = PPO("MlpPolicy", Rows(robots), n_steps=16, batch_size=128)
+    """
 
     def __init__(self, env: BatchedVectorEnv) -> None:
         """Show `env`."""
@@ -17,15 +26,15 @@ class Rows(VecEnv):  # type: ignore[misc]
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Array:
-        """Start all rows."""
+        """Start all rows; return observations (B, O)."""
         return self.env.reset()[0]
 
     def step_async(self, actions: Array) -> None:
-        """Keep `actions` for `step_wait`."""
+        """Keep `actions` (B, A) for `step_wait`."""
         self.actions = actions
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
-        """Step all rows."""
+        """Step all rows; a finished one starts anew."""
         observation, reward, terminated, truncated, infos = self.env.step(self.actions)
         done = terminated | truncated
         told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]

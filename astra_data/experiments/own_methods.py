@@ -1,0 +1,69 @@
+"""Methods of one's own as recipes name them: by a place, or by a table of the place and settings."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, model_validator
+
+from astra_data.core.config import Config, validated
+from astra_data.core.errors import BadInputError
+from astra_data.methods import METHODS, add_method
+from astra_data.worlds.own_code import place_beside
+
+
+class OwnMethod(Config):
+    """A method of one's own; further keys are its settings, which the model of its `table` reads."""
+
+    model_config = ConfigDict(extra="allow")
+
+    method: str
+    """A file beside the recipe, "delta.py:METHOD", or "package.module:METHOD"; its code is run."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _may_be_a_place_alone(cls, given: Any) -> Any:  # noqa: ANN401 - checked next
+        return {"method": given} if isinstance(given, str) else given
+
+    def add(self, name: str) -> None:
+        """Add the method by the `name` of its rows, and check its settings.
+
+        Raises:
+            BadInputError: as `add_method`, or it has no such settings.
+        """
+        add_method(name, self.method)
+        self.settings(name)
+
+    def settings(self, name: str) -> Config | None:
+        """Return the settings of the method, which was added by `name`; None if it has none.
+
+        Raises:
+            BadInputError: it has no such settings.
+        """
+        given = self.model_extra or {}
+        if (table := METHODS[name].table) is not None:
+            return validated(given, table.model, f"own_methods.{name}") if given else table.usual
+        if given:
+            raise BadInputError(f"own_methods.{name}: {self.method} has no settings, got {', '.join(given)}")
+        return None
+
+
+def add_all(own_methods: Mapping[str, Any]) -> None:
+    """Add the methods of a recipe, each as the recipe names it.
+
+    Raises:
+        BadInputError: as `add_method`, or one has not the settings that it is given.
+    """
+    for name, given in own_methods.items():
+        OwnMethod.model_validate(given).add(name)
+
+
+def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the methods of a recipe in `folder`, their files looked up there; what is no table is left."""
+    found = {}
+    for name, given in own_methods.items():
+        table = {"method": given} if isinstance(given, str) else given
+        if isinstance(table, dict) and isinstance(table.get("method"), str):
+            table = table | {"method": place_beside(table["method"], folder)}
+        found[name] = table
+    return found
