@@ -36,7 +36,7 @@ def tasks(
         table.add_row(
             name,
             "astra-data" if name in TASKS else "an installed package",
-            ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in known.commands.items()),
+            ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in known.limits.items()),
             ", ".join(known.abstract_state.names or (f"{known.abstract_state.size} values",)),
             "yes" if known.has_target else "no",
             str(known.fps),

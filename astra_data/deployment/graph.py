@@ -57,7 +57,7 @@ class PolicyGraph(nn.Module):
         """
         robot = replace(self._deployed)
         robot.resume(Memory(*hidden.split(list(self.parts.values()), dim=-1)))
-        command = robot.task.limits.in_units(robot.act(state, goal))
+        command = robot.command(state, goal)
         return command, torch.cat(robot.memory, dim=-1)
 
 
@@ -82,8 +82,8 @@ def write_graphs(deployed: DeployedPolicy, folder: Path) -> Written:
     optional("onnxscript", "deploy")
     if isinstance(deployed.policy, OwnPolicy):
         raise BadInputError(
-            f"{deployed.policy.name} is a policy of another learner, which cannot be traced: export it with its "
-            "own library, or act with astra_data.load_policy"
+            f"{deployed.policy.name} is a policy of another learner, which cannot be traced: export it with "
+            "its own library, or act with astra_data.load_policy"
         )
     graph = PolicyGraph(deployed).eval()
     example = graph.example
@@ -220,7 +220,7 @@ def _apart(graph: PolicyGraph, written: Graph, name: str) -> float:
     for step in range(_COMPARED_STEPS):
         state, goal = (torch.from_numpy(rng.standard_normal(x.shape, np.float32)) for x in (state, goal))
         command, hidden = written(state, goal, hidden)
-        expected = deployed.task.limits.in_units(deployed.act(state, goal))
+        expected = deployed.command(state, goal)
         apart = float(((command - expected).abs() * 2 / (high - low)).max())
         if not apart <= TOLERANCE:
             raise BadInputError(

@@ -17,7 +17,7 @@ from astra_data.worlds.registry import task_named
 
 
 def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> DeployedPolicy:
-    """Load the policy of a row, with its encoder if it has one; call `start` before the first `act`.
+    """Load the policy of a row, with its encoder if it has one; call `start` before the first `command`.
 
     Args:
         run: the folder of a run, such as "runs/quickstart".
@@ -32,7 +32,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         >>> from astra_data import load_policy
         >>> policy = load_policy("runs/antmaze_quick", "astra")
         >>> policy.start(1)
-        >>> velocity = policy.act(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
+        >>> velocity = policy.command(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
     """
     files = policy_files(run, row, seed=seed, percent=percent)
     return deploy(

@@ -51,7 +51,7 @@ ENTRY_POINTS = "astra_data.methods"
 """The group of entry points under which installed packages offer methods."""
 _NAME = re.compile("[a-z][a-z0-9_]*")
 _PLACES: dict[str, str] = {}
-"""Where the methods come from that are none of the package's, in this process: two of one name are refused."""
+"""Where the methods come from that are none of the package's, by name; in this process each name is one."""
 _OWN_KINDS: set[str] = set()
 """The kinds of their groundings."""
 

@@ -80,8 +80,12 @@ class DeployedPolicy:
         self.memory = memory
         self._generator = None
 
+    def command(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G)."""
+        return self.task.limits.in_units(self.act(state, goal))
+
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        """Return actions (B, A), of ±1 along each axis, for target states (B, S) and goals (B, G)."""
         seen = self.task.abstraction(state) if self.target_encoder is None else state
         latent = self._latent(self.target_encoder or self.source_encoder, seen, goal)
         return self._act(target_observation(self.task, state, goal, latent, self.observed))

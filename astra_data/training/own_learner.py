@@ -52,8 +52,8 @@ class WatchedEnv(BatchedVectorEnv):
         success = None if lasts or not self._ended else self._succeeded / self._ended
         self.points.append({"steps": self._steps, "success": success})
         self._ended = self._succeeded = 0
-        told = "unknown yet" if success is None else f"{success:.2f}"
-        self._training.progress(min(1.0, self._steps / self._total), f"success of training episodes {told}")
+        note = "unknown yet" if success is None else f"{success:.2f}"
+        self._training.progress(min(1.0, self._steps / self._total), f"success of training episodes {note}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,9 @@ def add_policy_kind(made: type[SavedPolicy]) -> None:
         BadInputError: the package has policies of this kind itself.
     """
     if made.kind in _KINDS:
-        raise BadInputError(f"policies of kind '{made.kind}' are the package's: rename that of {made.__name__}")
+        raise BadInputError(
+            f"policies of kind '{made.kind}' are the package's: rename that of {made.__name__}"
+        )
     KINDS[made.kind] = made
 
 
@@ -130,7 +132,11 @@ class PolicyFile:
 def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, Any]]:
     """Return the kind of a policy, its tensors, and metadata if it is of another learner."""
     if not isinstance(policy, OwnPolicy):
-        return next(kind for kind, (made, _) in _KINDS.items() if type(policy) is made), policy.state_dict(), {}
+        return (
+            next(kind for kind, (made, _) in _KINDS.items() if type(policy) is made),
+            policy.state_dict(),
+            {},
+        )
     saved: Any = policy.acting
     tensors, metadata = saved.to_file()
     return saved.kind, tensors, {"own": metadata}

@@ -3,25 +3,26 @@
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from astra_data.training.gymnasium import Array, BatchedVectorEnv
+from astra_data.training.gymnasium import Array
 
 
-class Rows(VecEnv):  # type: ignore[misc]
+class StableBaselinesEnv(VecEnv):
     """A vector environment of Gymnasium as one of Stable-Baselines3.
 
     Example:
         >>> import gymnasium
         >>> from stable_baselines3 import PPO
         >>> import astra_data.envs
-        >>> from astra_data.training.stable_baselines import Rows
+        >>> from astra_data.training.stable_baselines import StableBaselinesEnv
         >>> robots = gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=8)
-        >>> model = PPO("MlpPolicy", Rows(robots), n_steps=16, batch_size=128)
+        >>> model = PPO("MlpPolicy", StableBaselinesEnv(robots), n_steps=16, batch_size=128)
     """
 
-    def __init__(self, env: BatchedVectorEnv) -> None:
-        """Show `env`."""
+    def __init__(self, env: VectorEnv[Array, Array, Array]) -> None:
+        """Show `env`, which starts finished rows anew in the same step."""
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -37,13 +38,13 @@ class Rows(VecEnv):  # type: ignore[misc]
         """Step all rows; a finished one starts anew."""
         observation, reward, terminated, truncated, infos = self.env.step(self.actions)
         done = terminated | truncated
-        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        facts: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(done):
-            told[row] = {
+            facts[row] = {
                 "terminal_observation": infos["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
             }
-        return observation, reward, done, told
+        return observation, reward, done, facts
 
     def close(self) -> None:
         """Do nothing."""

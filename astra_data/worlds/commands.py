@@ -1,12 +1,16 @@
 """Commands in their own units, and as policies give them: ±1 along each axis."""
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION
+from astra_data.dataset.versions import open_dataset
 
 
 class Commands(Mapping[str, tuple[float, float]]):
@@ -39,6 +43,29 @@ class Commands(Mapping[str, tuple[float, float]]):
         self._middle, self._half = (low + high) / 2, (high - low) / 2
         self.are_normal = all(ends == (-1.0, 1.0) for ends in self._bounds.values())
         """Whether they are ±1 in their own units already."""
+
+    @classmethod
+    def recorded(cls, dataset: str | Path) -> Self:
+        """Return the range of the commands in a dataset, named as every command takes it, as the bounds.
+
+        Raises:
+            BadInputError: there is no such dataset, it has no commands, or one of them never changes.
+            CorruptDatasetError: it is incomplete or was altered.
+        """
+        source = open_dataset(dataset)
+        statistics = source.statistics()
+        if isinstance(statistics, str):
+            raise BadInputError(f"commands: the range of {source.reference} is not known: {statistics}")
+        if ACTION not in statistics:
+            raise BadInputError(f"commands: {source.reference} has no column {ACTION}: give their bounds")
+        least, largest = (np.asarray(statistics[ACTION][end], float).tolist() for end in ("min", "max"))
+        column = next(column for column in source.schema if column.name == ACTION)
+        names = column.names or tuple(map(str, range(column.size)))
+        if still := [name for name, low, high in zip(names, least, largest, strict=True) if low == high]:
+            raise BadInputError(
+                f"commands: {', '.join(still)} never changes in {source.reference}: give the bounds"
+            )
+        return cls(dict(zip(names, zip(least, largest, strict=True), strict=True)))
 
     def __getitem__(self, name: str) -> tuple[float, float]:
         """Return the bounds of an axis."""

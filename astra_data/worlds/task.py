@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -66,7 +67,8 @@ class Task:
         name: in datasets, results and, of tasks of the package, in recipes.
         timestep_s: the control period.
         state: the column of target states, with names, units, frames and roles.
-        commands: the least and the largest command along each axis of the action, by the axes' names.
+        commands: the least and the largest command along each axis of the action, by the axes' names; or a
+            dataset, whose range they are then.
         make_simulator: the class of the abstract simulator, a `Simulator`, or what builds B of them.
         objective: horizon, starts, goals, reward and success; the maze, if there is one.
         robot: builds one robot, which makes a target to collect in and to test in; or
@@ -99,7 +101,7 @@ class Task:
     name: str
     timestep_s: float
     state: Column
-    commands: Mapping[str, tuple[float, float]]
+    commands: Mapping[str, tuple[float, float]] | str | Path
     make_simulator: Callable[..., AbstractSimulator]
     objective: Objective
     robot: Callable[[], Robot] | None = None
@@ -129,7 +131,8 @@ class Task:
             for name in ("abstraction", "abstract_state")
             if getattr(self, name) is None and not hasattr(self.make_simulator, name)
         ]
-        commands = Commands(self.commands)
+        bounds = self.commands
+        commands = Commands.recorded(bounds) if isinstance(bounds, str | Path) else Commands(bounds)
         if self.objective.action_size != len(commands):
             faults.append(
                 f"objective: action_size {self.objective.action_size}, expected that of commands, "

@@ -150,9 +150,10 @@ def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: 
 
 def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     own = "".join(
-        f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in ("delta_action", "residual_ensemble")
+        f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n'
+        for name in ("delta_action", "residual_ensemble", "sb3_ppo")
     )
-    path = recipe(tmp_path, '["direct_transfer", "delta_action", "residual_ensemble"]', own)
+    path = recipe(tmp_path, '["direct_transfer", "delta_action", "residual_ensemble", "sb3_ppo"]', own)
     experiment = load_experiment(path, tmp_path / "runs")
     for item in plan(experiment.recipe, path, experiment.folder):
         item.call(progress=silent)
@@ -160,7 +161,9 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     fitted = load_grounding(experiment.folder / "ground/delta_action/seed_0/grounding.safetensors")
     assert fitted.kind == "delta action"
     page = (experiment.folder / "report/results.md").read_text()
-    assert "| Delta action |" in page and "| Residual ensemble |" in page
+    for row in ("Delta action", "Residual ensemble", "NAS, PPO of SB3"):
+        assert f"| {row} |" in page
+    assert not (experiment.folder / "ground/sb3_ppo").exists()  # it is trained in NAS's simulator
     METHODS.pop("delta_action"), registry._PLACES.pop("delta_action")
     policy = load_policy(experiment.folder, "delta_action")  # by what the run recorded
     policy.start(2)
@@ -180,7 +183,11 @@ def test_its_settings_stand_in_the_recipe(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("method", "given", "told"),
     [
-        ("delta_action", "memroy = 4", "own_methods.delta_action: memroy: unknown key: did you mean 'memory'"),
+        (
+            "delta_action",
+            "memroy = 4",
+            "own_methods.delta_action: memroy: unknown key: did you mean 'memory'",
+        ),
         ("delta_action", "memory = 0", "memory: expected greater than or equal to 1, got 0"),
         ("residual_ensemble", "members = 3", "residual_ensemble.py:METHOD has no settings, got members"),
     ],

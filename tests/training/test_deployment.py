@@ -1,5 +1,6 @@
 import pytest
 import torch
+from small_cart import TASK as RAIL_CART
 from torch import Tensor
 
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
@@ -86,3 +87,13 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
         actions, TASK.objective.limit_command(torch.stack(outputs, dim=1), 0.2), atol=1e-4, rtol=0
     )
     assert torch.stack(outputs).norm(dim=-1).max() > 0.3
+
+
+def test_commands_are_actions_in_their_units() -> None:
+    policy = ActorCritic(ActorCriticShape(observation_size=2, action_size=1))
+    deployed = DeployedPolicy(RAIL_CART, policy)
+    state, goal = torch.rand(4, 2), torch.rand(4, 1)
+    deployed.start(4)
+    action = deployed.act(state, goal)
+    deployed.start(4)
+    torch.testing.assert_close(deployed.command(state, goal), 1.5 + 2.5 * action)

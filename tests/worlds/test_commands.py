@@ -1,8 +1,13 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from fake_dataset import COLUMNS, concatenated, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION
 from astra_data.worlds.commands import Commands
 
 DRIVE = Commands({"v": (-0.2, 1.0), "w": (-1.5, 1.5)})
@@ -44,3 +49,29 @@ def test_they_are_a_mapping_of_names_to_bounds() -> None:
 def test_bounds_that_are_none_are_refused(bounds: dict[str, tuple[float, float]], told: str) -> None:
     with pytest.raises(BadInputError, match=told):
         Commands(bounds)
+
+
+def test_the_bounds_may_be_the_range_of_a_dataset(tmp_path: Path) -> None:
+    write_fake(tmp_path / "fake")
+    least, largest = concatenated(ACTION).min(0), concatenated(ACTION).max(0)
+    found = Commands.recorded(tmp_path / "fake")
+    assert dict(found) == {
+        name: (float(low), float(high)) for name, low, high in zip("xy", least, largest, strict=True)
+    }
+
+
+def test_a_range_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="nowhere"):
+        Commands.recorded(tmp_path / "nowhere")
+    with writer(tmp_path / "still") as still:
+        episode = fake_episode(1, 5)
+        episode.columns[ACTION][:, 1] = 0.5
+        still.add(episode)
+    with pytest.raises(BadInputError, match=r"commands: y never changes in .*: give the bounds"):
+        Commands.recorded(tmp_path / "still")
+    without = [column for column in COLUMNS if column.name != ACTION]
+    with writer(tmp_path / "none", columns=without) as none:
+        columns = {name: values for name, values in fake_episode(1, 5).columns.items() if name != ACTION}
+        none.add(replace(fake_episode(1, 5), columns=columns))
+    with pytest.raises(BadInputError, match="has no column action: give their bounds"):
+        Commands.recorded(tmp_path / "none")

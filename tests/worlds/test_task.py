@@ -1,9 +1,11 @@
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from fake_dataset import COLUMNS, write_fake
 from small_cart import GIVEN, LOGS_ALONE, TASK
 
 from astra_data.core.errors import BadInputError
@@ -31,6 +33,12 @@ def test_what_needs_a_maze_is_refused_where_there_is_none() -> None:
     for ask in asked:
         with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):
             ask()
+
+
+def test_its_bounds_may_be_a_dataset_s(tmp_path: Path) -> None:
+    write_fake(tmp_path / "fake", columns=COLUMNS)
+    task = Task(**GIVEN | {"commands": f"{tmp_path / 'fake'}", "objective": ANT.objective})
+    assert list(task.limits) == ["x", "y"] and max(low for low, _ in task.limits.values()) < -0.9
 
 
 def test_targets_are_shared_by_the_tasks_that_say_so() -> None:

@@ -25,7 +25,7 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.training.stable_baselines import Rows
+from astra_data.training.stable_baselines import StableBaselinesEnv
 from astra_data.training.train import PpoTrainConfig
 from astra_data.worlds.registry import TASKS
 
@@ -67,7 +67,7 @@ def main(algorithm: Algorithm, face: Face) -> None:
 
     count = config.num_envs if face is Face.vector else SINGLE_WORLDS
     env = (
-        Rows(BatchedVectorEnv(world(count), horizon))
+        StableBaselinesEnv(BatchedVectorEnv(world(count), horizon))
         if face is Face.vector
         else DummyVecEnv([single] * count)
     )

@@ -15,7 +15,7 @@ from stable_baselines3 import SAC
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
 from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.training.stable_baselines import Rows
+from astra_data.training.stable_baselines import StableBaselinesEnv
 from astra_data.worlds.registry import TASKS
 
 
@@ -26,7 +26,7 @@ def main(count: int, updates: int, steps: int) -> None:
     world = SeededSimulatorEnv(SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, count)))
     learner = SAC(
         "MlpPolicy",
-        Rows(BatchedVectorEnv(world, task.objective.horizon)),
+        StableBaselinesEnv(BatchedVectorEnv(world, task.objective.horizon)),
         learning_starts=0,
         batch_size=256,
         gradient_steps=updates,

@@ -90,7 +90,7 @@ class Relocation:
 
     def _is_commanded(self, turn: PlanarMap, action: Array) -> bool:
         turned = turn.of_column(self.task.action, action)
-        least, largest = np.array(list(self.task.commands.values())).T
+        least, largest = np.array(list(self.task.limits.values())).T
         return bool(((turned >= least - _ROUNDING) & (turned <= largest + _ROUNDING)).all())
 
     def _draw_turn(self, rng: np.random.Generator) -> PlanarMap:

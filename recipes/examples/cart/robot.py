@@ -83,8 +83,8 @@ def play(run, trials=100, seed=0):
         delivered, tipped = np.zeros(trials, bool), np.zeros(trials, bool)
         policy.start(trials)
         for _ in range(policy.task.objective.horizon):
-            action = policy.act(torch.tensor(states, dtype=torch.float32), torch.empty(trials, 0))
-            commands = policy.task.limits.in_units(action).numpy()
+            seen = torch.tensor(states, dtype=torch.float32)
+            commands = policy.command(seen, torch.empty(trials, 0)).numpy()
             for number in np.flatnonzero(~delivered & ~tipped):
                 states[number], tipped[number] = carts[number].step(commands[number])
             delivered |= (np.linalg.norm(states[:, :2] - DOCK_M, axis=1) < 0.3) & ~tipped

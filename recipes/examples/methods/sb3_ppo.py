@@ -8,7 +8,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from astra_data.methods.method import Method
 from astra_data.methods.nas import NAS
 from astra_data.training.own_learner import OwnLearner
-from astra_data.training.stable_baselines import Rows
+from astra_data.training.stable_baselines import StableBaselinesEnv
 
 
 class Sb3Policy:
@@ -35,7 +35,7 @@ def learn(env, training):
     config = training.config
     model = PPO(
         "MlpPolicy",
-        Rows(env),
+        StableBaselinesEnv(env),
         n_steps=config.rollout_steps,
         batch_size=config.rollout_steps * config.num_envs // 4,
         learning_rate=config.learning_rate,

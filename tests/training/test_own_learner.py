@@ -1,0 +1,125 @@
+"""A learner of the user's in the simulator of a row."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import pytest
+import torch
+from small_cart import TASK
+from torch import Tensor
+from toy_episodes import toy_episodes
+
+from astra_data.core.errors import BadInputError
+from astra_data.deployment.graph import write_graphs
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.training.own_learner import OwnLearner, WatchedEnv
+from astra_data.training.own_policy import KINDS, Array
+from astra_data.training.policy_file import PolicyFile, add_policy_kind, deploy
+from astra_data.training.train import PpoTrainConfig, Training
+
+
+class Constant:
+    """Always the same command."""
+
+    kind: ClassVar[str] = "constant"
+
+    def __init__(self, command: float) -> None:
+        self.command = command
+
+    def act(self, observation: Array) -> Array:
+        return np.full((len(observation), 1), self.command)
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        return {"command": torch.tensor([self.command])}, {"unit": "none"}
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
+        assert metadata == {"unit": "none"}
+        return cls(float(tensors["command"]))
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "constant", Constant)
+
+
+def training(folder: Path, progress: Callable[[float, str], None] = lambda share, note: None) -> Training:
+    one = torch.zeros(1, 3, 1)
+    return Training(
+        task=TASK,
+        config=PpoTrainConfig(num_envs=4, total_steps=400),
+        settings=None,
+        episodes=toy_episodes(one, one, next_state=one),
+        grounding=NO_GROUNDING,
+        initial=None,
+        seed=7,
+        device="cpu",
+        folder=folder,
+        progress=progress,
+    )
+
+
+def driving(command: float, steps: int, seen: list[Array] | None = None) -> OwnLearner:
+    def learn(env: WatchedEnv, training: Training) -> Constant:
+        env.reset()
+        for _ in range(steps // env.num_envs):
+            observation, *_ = env.step(np.full((env.num_envs, 1), command))
+            if seen is not None:
+                seen.append(observation)
+        return Constant(command)
+
+    return OwnLearner(learn=learn, policy=Constant)
+
+
+@pytest.mark.parametrize(("command", "success"), [(1.0, 1.0), (-1.0, 0.0)])
+def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float) -> None:
+    """Forward at 4 m/s every goal, at most 2 m away, is reached in 5 steps; backward none is in 40."""
+    told: list[tuple[float, str]] = []
+    given = training(tmp_path, lambda share, note: told.append((share, note)))
+    _, curve = driving(command, steps=400)(given)
+    points = curve["points"]
+    assert [point["steps"] for point in points[:3]] == [8, 16, 24]
+    assert points[-1]["steps"] == 400 and len(points) == 51
+    ended = [point["success"] for point in points if point["success"] is not None]
+    assert set(ended) == {success} and told[-1][0] == 1.0
+    # Backward all four end at steps 160 and 320, by the horizon of 40.
+    assert success or [point["steps"] for point in points if point["success"] == 0.0] == [160, 320]
+
+
+def test_the_same_seed_shows_it_the_same(tmp_path: Path) -> None:
+    seen: list[list[Array]] = [[], [], []]
+    for index, seed in enumerate((7, 7, 8)):
+        given = training(tmp_path)
+        object.__setattr__(given, "seed", seed)
+        driving(1.0, 80, seen[index])(given)
+    assert np.array_equal(seen[0], seen[1]) and not np.array_equal(seen[0], seen[2])
+
+
+def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
+    policy, _ = driving(0.25, 8)(training(tmp_path))
+    policy.save(tmp_path / "policy.safetensors")
+    deployed = deploy(TASK, PolicyFile.load(tmp_path / "policy.safetensors"))
+    deployed.start(2)
+    assert deployed.act(torch.zeros(2, 2), torch.ones(2, 1)).tolist() == [[0.25], [0.25]]
+    with pytest.raises(
+        BadInputError, match="Constant is a policy of another learner, which cannot be traced"
+    ):
+        write_graphs(deployed, tmp_path)
+    del KINDS["constant"]
+    with pytest.raises(BadInputError, match="found kind constant"):
+        PolicyFile.load(tmp_path / "policy.safetensors")
+
+
+def test_what_is_not_learned_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="learn took no step in the environment that it was given"):
+        driving(1.0, 0)(training(tmp_path))
+    with pytest.raises(BadInputError, match="learn returned a float, expected a Constant"):
+        OwnLearner(learn=lambda env, training: 1.0, policy=Constant)(training(tmp_path))  # type: ignore[arg-type, return-value]
+
+
+def test_a_kind_of_the_package_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Constant, "kind", "actor_critic")
+    with pytest.raises(BadInputError, match="policies of kind 'actor_critic' are the package's"):
+        add_policy_kind(Constant)
