@@ -6,6 +6,7 @@ Collects 400 drives with the settings of recipes/cart_study.toml, draws 60 of th
 fall, and runs NAS and ASTRA on each such set. Goes on where it was interrupted.
 """
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -24,21 +25,22 @@ from astra_data.reports.schema import Results
 STUDY = Path(__file__).parents[1] / "recipes" / "cart_study.toml"
 POOL, DRIVES, POOL_SEED = 400, 60, 100
 ROWS = ("nas", "astra")
+FALLS, SEEDS = [3, 6, 12, 25, 50], [1, 2, 3]
 
 
 def main(
     folder: Path,
-    falls: Annotated[list[int], typer.Option(help="How many of the drives end in a fall.")] = [3, 6, 12, 25, 50],  # noqa: B006
-    seed: Annotated[list[int], typer.Option(help="Of groundings and trainings.")] = [1, 2, 3],  # noqa: B006
+    falls: Annotated[list[int] | None, typer.Option(help="How many of the drives end in a fall.")] = None,
+    seed: Annotated[list[int] | None, typer.Option(help="Of groundings and trainings.")] = None,
 ) -> None:
-    """Run the study in `folder`."""
+    """Run the study in `folder`; by default 3, 6, 12, 25 and 50 falls, seeds 1 to 3."""
     folder.mkdir(parents=True, exist_ok=True)
     pool = collected(folder)
     print("| falls of 60 drives | steps | " + " | ".join(ROWS) + " |\n|---|---|" + "---|" * len(ROWS))
-    for count in falls:
+    for count in falls or FALLS:
         data = with_falls(pool, count, folder / f"drives_{count}")
         recipe = folder / f"falls_{count}.toml"
-        recipe.write_text(text_of(f'data = "{data.resolve()}"', seed))
+        recipe.write_text(text_of(f'data = "{data.resolve()}"', seed or SEEDS))
         found = read_published(run(recipe, root=folder, jobs=1) / "report" / "results.json")
         assert isinstance(found, Results)
         cells = [", ".join(f"{success:.2f}" for success in found.methods[row].success) for row in ROWS]
@@ -51,14 +53,14 @@ def text_of(data: str, seeds: list[int], rows: tuple[str, ...] = ROWS) -> str:
     before, _, after = text.partition("\n[collect]")
     tables = after.partition("\n\n")[2]
     assert before
-    head = f'task = "{STUDY.parent / task}"\nmethods = {list(rows)}\nseeds = {seeds}\n'.replace("'", '"')
+    head = f'task = "{STUDY.parent / task}"\nmethods = {json.dumps(rows)}\nseeds = {seeds}\n'
     return f"{head}{data}\n\n{tables}"
 
 
 def collected(folder: Path) -> Dataset:
     """Return the drives to draw from."""
     settings = load_tables(STUDY)["collect"] | {"episodes": POOL}
-    table = "\n".join(f"{name} = {str(value).replace(chr(39), chr(34))}" for name, value in settings.items())
+    table = "\n".join(f"{name} = {json.dumps(value)}" for name, value in settings.items())
     recipe = folder / "pool.toml"
     recipe.write_text(text_of("", [POOL_SEED]) + f"\n[collect]\n{table}\n")
     run(recipe, root=folder, jobs=1, until="collect")

@@ -34,6 +34,12 @@ MaxSteps = Annotated[int | None, typer.Option(help="Longest episode, in steps.",
 Start = Annotated[
     str | None, typer.Option(help="Where episodes start: anywhere or task.", show_default="anywhere")
 ]
+Hold = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        metavar="LEAST LARGEST", help="How long random commands are held, in s.", show_default="0.5 3"
+    ),
+]
 PpoSteps = Annotated[
     int | None, typer.Option(help="Steps after which suboptimal_ppo stops learning.", show_default="300000")
 ]
@@ -68,6 +74,7 @@ def collect(
     episodes: Episodes = None,
     max_steps: MaxSteps = None,
     start: Start = None,
+    hold_s: Hold = None,
     ppo_steps: PpoSteps = None,
     sac_episode_steps: SacEpisodeSteps = None,
     policy: Policy = None,
@@ -83,6 +90,7 @@ def collect(
         "episodes": episodes,
         "max_steps": max_steps,
         "start": start,
+        "hold_s": hold_s,
         "ppo_steps": ppo_steps,
         "sac_episode_steps": sac_episode_steps,
         "policy": policy,

@@ -24,5 +24,7 @@ def test_the_defaults_that_help_shows_are_those_of_the_settings(command: str, mo
             assert shown[name] == ("" if default else "no-") + name.replace("_", "-")
         elif isinstance(default, float | int):
             assert float(shown[name]) == default
+        elif isinstance(default, tuple):
+            assert [*map(float, shown[name].split())] == [*default]
         elif default is not None:
             assert shown[name] == default

@@ -37,6 +37,16 @@ def test_an_option_of_0_is_given(home: Path) -> None:
     assert open_dataset("walks").description["config"]["reset_tolerance"] == 0.0
 
 
+def test_commands_may_be_held_for_no_time(home: Path) -> None:
+    call("collect", "antmaze-umaze", *SMALL, "--hold-s", "0", "0", "--name", "restless")
+    call("collect", "antmaze-umaze", *SMALL, "--hold-s", "9", "9", "--name", "patient")
+    counts = [
+        len({tuple(row) for row in open_dataset(name).columns(["action"], [0])["action"].tolist()})
+        for name in ("restless", "patient")
+    ]
+    assert counts == [3, 1]
+
+
 def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
     assert (
         call("collect", "antmaze-long", *SMALL, "--out", str(tmp_path / "a"), "--name", "walks").exit_code
