@@ -4,6 +4,7 @@ One iteration collects a rollout from every environment and makes a few passes o
 rollouts of some environments, so the same code trains policies with and without memory.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,9 +12,10 @@ from torch import Tensor, nn
 
 from astra_data.core.config import Config, Count, NotNegative, Positive, Share
 from astra_data.core.seeding import derive
-from astra_data.learning.acting import Acting
-from astra_data.learning.learner import Learner
+from astra_data.learning.acting import Acting, Taken
+from astra_data.learning.learner import Learner, Resumable
 from astra_data.learning.networks.actor_critic import ActorCritic
+from astra_data.learning.return_scale import ReturnScale
 from astra_data.worlds.batched import BatchedEnv
 
 if TYPE_CHECKING:
@@ -47,6 +49,14 @@ class PpoConfig(Config):
     """Gradients are clipped to this norm."""
     reward_scale: Positive = 0.1
     """Factor on the reward that the critic learns from."""
+    normalize_returns: bool = False
+    """Divide rewards by the running deviation of the discounted return; `reward_scale` has no effect then."""
+    critic_gain: Positive = 1.0
+    """Of the critic's last layer at the start. With 1, its values are larger than returns that are small, and
+    the first advantages tell of the untrained critic rather than of the rewards."""
+    final_std: Positive | None = None
+    """Largest deviation of the actions at the end, to which it falls linearly, so that the policy is trained
+    as it is tested; by default the policy keeps what it has learned."""
 
 
 class Ppo(Learner):
@@ -69,12 +79,20 @@ class Ppo(Learner):
             seed: of all randomness.
         """
         self.policy, self.config = policy, config
+        with torch.no_grad():
+            policy.value_layer.weight.mul_(config.critic_gain)
+        self._first_std = float(policy.log_std.detach().exp().max())
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
         self._loss = _ppo_loss(policy, config)
+        parts: dict[str, Resumable] = {"policy": policy, "optimizer": self._optimizer}
+        self._returns = None
+        if config.normalize_returns:
+            device = policy.log_std.device
+            self._returns = parts["returns"] = ReturnScale(env.num_envs, config.discount, device)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
             Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=True),
-            {"policy": policy, "optimizer": self._optimizer},
+            parts,
             total_steps=config.total_steps,
             rollout_steps=config.rollout_steps,
             seed=seed,
@@ -85,6 +103,10 @@ class Ppo(Learner):
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * self.share_left
         self._learn(self._collect())
+        if (least := self.config.final_std) is not None:
+            largest = least + max(self._first_std - least, 0.0) * self.share_left
+            with torch.no_grad():
+                self.policy.log_std.clamp_(max=math.log(largest))
         return {"std": float(self.policy.log_std.detach().exp().mean())}
 
     @torch.no_grad()
@@ -110,7 +132,7 @@ class Ppo(Learner):
                 "action": action,
                 "action_log_prob": torch.distributions.Normal(mean, std).log_prob(action).sum(-1),
                 "value": value,
-                "reward": step.reward * self.config.reward_scale,
+                "reward": self._scaled(taken),
                 "terminated": step.terminated,
                 "done": taken.done,
                 "beyond": torch.zeros_like(value),
@@ -129,6 +151,12 @@ class Ppo(Learner):
             self.config.discount, self.config.gae_lambda, *(part.unsqueeze(-1) for part in parts)
         )
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
+
+    def _scaled(self, taken: Taken) -> Tensor:
+        """Return the rewards (B,) of a step as the critic learns from them."""
+        if self._returns is None:
+            return taken.step.reward * self.config.reward_scale
+        return self._returns.scaled(taken.step.reward, taken.done)
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
         from tensordict import TensorDict

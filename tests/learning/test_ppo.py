@@ -1,5 +1,6 @@
 import copy
 import math
+from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -31,6 +32,9 @@ def ppo(
     return Ppo(env, ActorCritic(shape), config, horizon=horizon, seed=1)
 
 
+unscaled_ppo = ppo
+
+
 def train(learner: Ppo) -> list[dict[str, float]]:
     metrics = []
     while not learner.done:
@@ -54,8 +58,9 @@ def test_learns_to_go_to_a_target() -> None:
     assert distance_after(learner.policy, 10) < 0.15
 
 
-@pytest.mark.parametrize("memory", [0, 8])
-def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
+@pytest.mark.parametrize(("memory", "normalize"), [(0, False), (8, False), (0, True)])
+def test_resuming_gives_the_same_parameters_to_the_bit(memory: int, normalize: bool) -> None:
+    ppo = partial(unscaled_ppo, normalize_returns=normalize)
     whole = ppo(GoToZero(8), 6, horizon=7, memory=memory)
     train(whole)
     world, other_world = GoToZero(8), GoToZero(8)
@@ -226,3 +231,27 @@ def test_without_finished_episodes_success_is_unknown() -> None:
 
 def test_fewer_environments_than_minibatches_are_enough() -> None:
     train(ppo(GoToZero(2), 2, horizon=5, minibatches=4))
+
+
+def test_an_untrained_critic_may_begin_near_zero() -> None:
+    plain, small = (ppo(GoToZero(8), 1, horizon=7, critic_gain=gain).policy for gain in (1.0, 0.01))
+    seen = torch.linspace(-1, 1, 9)[:, None]
+    torch.testing.assert_close(small.value(seen), 0.01 * plain.value(seen))
+    assert torch.equal(small.policy(seen)[0], plain.policy(seen)[0])
+
+
+def test_returns_may_be_normalized() -> None:
+    """A unit each step for 8 steps: discounted sums by the age of the row, of a deviation below 2.3."""
+    learner = ppo(ConstantReward(64, 8.0), 20, horizon=10**6, normalize_returns=True, discount=0.9)
+    train(learner)
+    sums = [(1 - 0.9**age) / 0.1 for age in range(1, 9)]
+    deviation = math.sqrt(fmean(value**2 for value in sums) - fmean(sums) ** 2)
+    reward = learner._collect()["reward"]
+    torch.testing.assert_close(reward, torch.full_like(reward, 1 / deviation), rtol=0.02, atol=0)
+
+
+def test_the_actions_scatter_may_fall_to_what_is_tested() -> None:
+    learner = ppo(GoToZero(8), 4, horizon=7, final_std=0.1, entropy_weight=1.0)
+    first = math.exp(-0.5)
+    expected = [0.1 + (first - 0.1) * left for left in (1.0, 0.75, 0.5, 0.25)]
+    assert [point["std"] for point in train(learner)] == pytest.approx(expected, rel=1e-4)
