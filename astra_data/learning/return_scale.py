@@ -25,7 +25,8 @@ class ReturnScale:
         self.var = (spread + apart.square() * self.count * count / total) / total
         self.mean, self.count = self.mean + apart * count / total, total
         self.sums = torch.where(done, 0.0, self.sums)
-        return (reward / (self.var + 1e-8).sqrt().float()).clamp(-_LARGEST, _LARGEST)
+        deviation = (self.var + 1e-8).sqrt().float()
+        return torch.clamp(reward / deviation, -_LARGEST, _LARGEST)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs."""

@@ -7,7 +7,6 @@ own reward. Of a task without a target, there are the simulators alone.
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,19 +30,15 @@ from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.training.build_env import EnvParts, training_env
-from astra_data.training.deployment import DeployedPolicy, EncoderKind
+from astra_data.training.deployment import EncoderKind
 from astra_data.training.episode_record import EpisodeRecord, Outcome
 from astra_data.training.own_policy import OwnPolicy
-from astra_data.training.policy_file import PolicyFile, Simulation, deploy
+from astra_data.training.own_world import Act, Begin, in_simulator, own_world, started
+from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
-
-Act = Callable[[Tensor, Tensor], Tensor]
-Begin = Callable[[Tensor], Act]
-"""Given the goals (N, G) of new episodes, returns the function that acts in them."""
 
 
 class EvaluateConfig(Config):
@@ -133,12 +128,12 @@ def evaluate(
         if grounding:
             model = load_grounding(grounding / "grounding.safetensors")
         source = deploy(world, trained, model)
-        begin = partial(_start, source, source.act_in_simulator)
-        robots = {"source": partial(_start, source, source.act)}
+        begin = partial(started, source, source.act_in_simulator)
+        robots = {"source": partial(started, source, source.act)}
         if target_encoder is not None:
             encoder = load_target_encoder(target_encoder / "target_encoder.safetensors")
             aligned = replace(source, target_encoder=encoder)
-            robots["target"] = partial(_start, aligned, aligned.act)
+            robots["target"] = partial(started, aligned, aligned.act)
         headline = config.encoder if config.encoder in robots else "source"
         results |= {
             "encoder": headline,
@@ -147,7 +142,7 @@ def evaluate(
         }
         shown_abstract = trained.observed == "abstract"
         if trained.simulation is not None:
-            simulators["simulated"] = _training_simulator(world, trained.simulation, model, config)
+            simulators["simulated"] = own_world(world, trained.simulation, model, config.episodes)
     if shown_abstract:
         simulators |= _shared_simulators(world, reference, config)
     files = {
@@ -180,7 +175,9 @@ def evaluate(
         results |= {"tested_in": tested_in, "encoder": "source"}
     for name, simulated in simulators.items():
         counted = asked if name == tested_in else None
-        outcome, start_goal = _in_simulator(simulated, begin, world.objective.horizon, seed, counted)
+        outcome, start_goal = in_simulator(
+            simulated, begin, world.objective.horizon, derive(seed, "simulated evaluation"), counted
+        )
         results[name] = outcome.to_json()
         if name in ("simulated", tested_in):
             tensors[f"{name}.position"] = outcome.position
@@ -202,11 +199,6 @@ def evaluate(
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
     act = careful(task, goal)
     return lambda state, goal: act(task.abstraction(state), goal)
-
-
-def _start(deployed: DeployedPolicy, act: Act, goal: Tensor) -> Act:
-    deployed.start(len(goal))
-    return act
 
 
 def _in_target(
@@ -249,13 +241,6 @@ def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str
     return {"start": env.position, "goal": env.goal}
 
 
-def _training_simulator(
-    task: Task, simulation: Simulation, grounding: Grounding, config: EvaluateConfig
-) -> SimulatorEnv:
-    parts = EnvParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
-    return training_env(task, simulation.world, parts, grounding, num_envs=config.episodes, device="cpu")
-
-
 def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
@@ -264,27 +249,3 @@ def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfi
         name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()
     }
-
-
-@torch.no_grad()
-def _in_simulator(
-    world: SimulatorEnv, begin: Begin, horizon: int, seed: int, asked: RecordedRange | None
-) -> tuple[Outcome, dict[str, Tensor]]:
-    """Return the outcome in `world`, and its starts and goals, which are the same in every simulator."""
-    torch.manual_seed(derive(seed, "simulated evaluation"))
-    world.reset()
-    act = begin(world.goal)
-    record = EpisodeRecord(world.objective.places(world.simulator.state))
-    start_goal = {"start": world.objective.places(world.simulator.state).clone(), "goal": world.goal.clone()}
-    for number in range(horizon):
-        action = act(world.simulator.state, world.goal)
-        if asked is not None:
-            asked.count(action, record.active)
-        step = world.step(action)
-        success = world.objective.succeeded(step.success, world.failed, number + 1)
-        blocked = world.simulator.blocked
-        places = world.objective.places(world.simulator.state)
-        record.add(places, step.reward, success, world.failed, blocked)
-        if not record.active.any():
-            break
-    return record.outcome(), start_goal

@@ -16,6 +16,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.training.policy_file import PolicyFile
+from astra_data.training.restarts import POLICY, with_restarts
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
 from astra_data.worlds.registry import task_named
 
@@ -104,8 +105,12 @@ def train(
             progress=progress,
             num_threads=num_threads,
         )
-        policy, curve = base.learn(training)
-        policy.save(folder / "policy.safetensors")
+        if base.in_simulator:
+            tested = load_grounding(grounding_file) if grounding_file else NO_GROUNDING
+            policy, curve = with_restarts(base.learn, training, tested)
+        else:
+            policy, curve = base.learn(training)
+        policy.save(folder / POLICY)
         (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
         for checkpoint in folder.glob("*checkpoint.safetensors"):
             checkpoint.unlink()

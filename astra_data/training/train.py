@@ -15,7 +15,7 @@ import torch
 from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
-from astra_data.core.config import AtOnce, Config, Number, choice
+from astra_data.core.config import AtOnce, Config, Number, Share, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
@@ -45,6 +45,13 @@ class TrainConfig(EnvConfig):
     """Hidden layers of actor and critic."""
     memory_size: Number = 64
     """Size of the policy's own GRU, where no grounding provides a latent."""
+    tries: AtOnce = 1
+    """Trainings at most: where the policy did not master its own simulator, in 100 episodes from the task's
+    starts and without the noise of training, it is trained again from another seed."""
+    least_success: Share = 0.9
+    """Success in these with which a simulator is mastered; the best try is kept where none has it."""
+    most_of_horizon: Share = 0.85
+    """Share of the horizon that those which succeed may take; later they hardly arrive in time."""
 
     @property
     def imitates(self) -> bool:

@@ -1,14 +1,13 @@
 """A learner of the user's in the simulator of a row."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
 import torch
+from constant_policy import Constant
 from small_cart import TASK
-from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
@@ -18,26 +17,6 @@ from astra_data.training.own_learner import OwnLearner, WatchedEnv
 from astra_data.training.own_policy import KINDS, Array
 from astra_data.training.policy_file import PolicyFile, add_policy_kind, deploy
 from astra_data.training.train import PpoTrainConfig, Training
-
-
-class Constant:
-    """Always the same command."""
-
-    kind: ClassVar[str] = "constant"
-
-    def __init__(self, command: float) -> None:
-        self.command = command
-
-    def act(self, observation: Array) -> Array:
-        return np.full((len(observation), 1), self.command)
-
-    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-        return {"command": torch.tensor([self.command])}, {"unit": "none"}
-
-    @classmethod
-    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
-        assert metadata == {"unit": "none"}
-        return cls(float(tensors["command"]))
 
 
 @pytest.fixture(autouse=True)

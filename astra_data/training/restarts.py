@@ -1,0 +1,67 @@
+"""Train again where a policy did not master the simulator that it was trained in; the target has no say."""
+
+import shutil
+from dataclasses import replace
+from typing import Any
+
+from astra_data.core.progress import part
+from astra_data.core.seeding import derive
+from astra_data.grounding.protocols import Grounding
+from astra_data.training.own_world import Trial, trial
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.train import Learn, Training
+
+POLICY = "policy.safetensors"
+
+
+def with_restarts(
+    learn: Learn, training: Training, grounding: Grounding
+) -> tuple[PolicyFile, dict[str, Any]]:
+    """Train until a policy masters its own simulator, `tries` times at most, each from another seed.
+
+    Args:
+        learn: trains once.
+        training: what it is given.
+        grounding: that of the training, on the CPU, where policies are tested.
+
+    Returns:
+        the policy that does, or else the one with the most success there; and its learning curve, with all
+        tries as "tries": their seeds, what they reached, and their points.
+    """
+    config = training.config
+    if config.tries == 1:
+        return learn(training)
+    made: list[tuple[Trial, PolicyFile, dict[str, Any]]] = []
+    seeds = [training.seed, *(derive(training.seed, f"try {number}") for number in range(1, config.tries))]
+    for number, seed in enumerate(seeds):
+        attempt = _attempt(training, seed, number)
+        policy, curve = learn(attempt)
+        policy.save(attempt.folder / POLICY)
+        reached = trial(training.task, PolicyFile.load(attempt.folder / POLICY), grounding, training.seed)
+        made.append((reached, policy, curve))
+        if _masters(reached, training):
+            break
+    _, policy, curve = max(made, key=lambda one: one[0].success)
+    tries = [
+        {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": told["points"]}
+        for seed, (one, _, told) in zip(seeds, made, strict=False)
+    ]
+    for number in range(1, len(made)):
+        shutil.rmtree(_attempt(training, 0, number).folder)
+    return policy, curve | {"tries": tries}
+
+
+def _attempt(training: Training, seed: int, number: int) -> Training:
+    """Return the training of a try; the first is the one that there would be without tries."""
+    tries = training.config.tries
+    folder = training.folder / f"try_{number}" if number else training.folder
+    folder.mkdir(exist_ok=True)
+    progress = part(training.progress, number / tries, (number + 1) / tries)
+    return replace(training, seed=seed, folder=folder, progress=progress)
+
+
+def _masters(reached: Trial, training: Training) -> bool:
+    """Return whether a policy succeeds often enough, and with time to spare where success ends an episode."""
+    config, objective = training.config, training.task.objective
+    in_time = objective.is_lasting or reached.steps <= config.most_of_horizon * objective.horizon
+    return reached.success >= config.least_success and in_time

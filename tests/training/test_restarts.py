@@ -1,0 +1,101 @@
+"""Trainings that are done again where a policy did not master its own simulator."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from constant_policy import Constant
+from small_cart import TASK
+from toy_episodes import toy_episodes
+
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import derive
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.training.own_learner import OwnLearner
+from astra_data.training.own_policy import KINDS, OwnPolicy
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.restarts import with_restarts
+from astra_data.training.train import PpoTrainConfig, Training
+
+SEEDS = [7, derive(7, "try 1"), derive(7, "try 2")]
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "constant", Constant)
+
+
+def restarted(
+    folder: Path,
+    commands: Iterable[float],
+    progress: Progress = silent,
+    **settings: Any,  # noqa: ANN401
+) -> tuple[float, dict[str, Any], list[int]]:
+    """Train policies that give these commands, one a try; return what is kept, the curve and the seeds."""
+    rest, seeds, one = iter(commands), [], torch.zeros(1, 3, 1)
+
+    def learn(env: Any, given: Training) -> Constant:  # noqa: ANN401
+        seeds.append(given.seed)
+        given.progress(1.0, "")
+        assert given.folder.is_dir()
+        policy = Constant(next(rest))
+        observation, _ = env.reset()
+        env.step(policy.act(observation))
+        return policy
+
+    training = Training(
+        task=TASK,
+        config=PpoTrainConfig(num_envs=4, total_steps=4, **settings),
+        settings=None,
+        episodes=toy_episodes(one, one, next_state=one),
+        grounding=NO_GROUNDING,
+        initial=None,
+        seed=7,
+        device="cpu",
+        folder=folder,
+        progress=progress,
+    )
+    kept, curve = with_restarts(OwnLearner(learn=learn, policy=Constant), training, NO_GROUNDING)
+    assert isinstance(kept, PolicyFile) and isinstance(kept.policy, OwnPolicy)
+    return kept.policy.acting.command, curve, seeds  # type: ignore[attr-defined]
+
+
+def test_a_policy_that_masters_its_simulator_is_kept(tmp_path: Path) -> None:
+    command, curve, seeds = restarted(tmp_path, [1.0], tries=3)
+    assert (command, seeds) == (1.0, SEEDS[:1])
+    assert [(one["seed"], one["success"]) for one in curve["tries"]] == [(7, 1.0)]
+    assert curve["points"] == curve["tries"][0]["points"]
+
+
+def test_it_is_trained_again_until_it_does(tmp_path: Path) -> None:
+    shares: list[float] = []
+    command, curve, seeds = restarted(
+        tmp_path, [-1.0, 0.9, 1.0], lambda share, note: shares.append(share), tries=3
+    )
+    assert (command, seeds) == (0.9, SEEDS[:2])
+    assert [one["success"] for one in curve["tries"]] == [0.0, 1.0]
+    # Forward at 3.75 m/s goals from 1 to 2 m are reached in 3 to 6 steps; backward none in all 40.
+    assert curve["tries"][0]["episode_steps"] == 40 and 3 < curve["tries"][1]["episode_steps"] < 6
+    assert shares == sorted(shares) and max(shares) == pytest.approx(2 / 3)
+    assert not (tmp_path / "try_1").exists()
+
+
+def test_of_those_that_do_not_the_best_is_kept(tmp_path: Path) -> None:
+    # At 0.4 m/s, -0.44 of the range, goals up to 1.6 m are in reach within the 4 s of an episode.
+    command, curve, seeds = restarted(tmp_path, [-1.0, -0.44, -0.9], tries=3)
+    assert (command, seeds) == (-0.44, SEEDS)
+    assert 0.4 < curve["tries"][1]["success"] < 0.8
+
+
+def test_one_that_is_late_does_not_master_it(tmp_path: Path) -> None:
+    # At 0.55 m/s all arrive within 37 of 40 steps.
+    settings: dict[str, Any] = {"tries": 2, "least_success": 0.9}
+    assert len(restarted(tmp_path, [-0.38, 1.0], **settings)[2]) == 1
+    assert len(restarted(tmp_path, [-0.38, 1.0], most_of_horizon=0.5, **settings)[2]) == 2
+
+
+def test_without_tries_nothing_is_tested(tmp_path: Path) -> None:
+    command, curve, seeds = restarted(tmp_path, [-1.0])
+    assert (command, seeds) == (-1.0, [7]) and "tries" not in curve
