@@ -97,8 +97,9 @@ def tables() -> dict[str, Table]:
     return {method.table.name: method.table for method in METHODS.values() if method.table}
 
 
-ROLES: dict[str, str] = {name: method.role for name, method in METHODS.items() if method.role}
-"""What some rows are to the others."""
+def method_role(row: str) -> str | None:
+    """Return what a row is to the others, if it is something."""
+    return METHODS[row].role if row in METHODS else None
 
 
 def method_title(row: str) -> str:

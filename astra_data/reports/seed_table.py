@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.methods import ROLES, method_title
+from astra_data.methods import method_role, method_title
 from astra_data.reports.schema import Cost, GapMeans, MethodResults, Results
 
 Named = tuple[str | None, str | None]
@@ -75,7 +75,7 @@ def row_of(lines: Sequence[Line], gaps: Mapping[str, GapMeans]) -> MethodResults
     grounding = next((line.grounding for line in lines if line.grounding), None)
     return MethodResults(
         title=method_title(method),
-        role=ROLES.get(method),
+        role=method_role(method),
         seeds=[line.seed for line in lines],
         **values | {"learning": values["learning"] or []},
         grounding=grounding,

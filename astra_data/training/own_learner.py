@@ -62,7 +62,8 @@ class OwnLearner(InSimulator):
 
     Attributes:
         learn: given the environment, a vector environment of Gymnasium, and the training, which has the
-            recipe's settings (`training.config.total_steps`) and the seed, returns the policy.
+            recipe's settings (`training.config.total_steps`) and the seed, returns the policy. A hand-written
+            one needs no step.
         policy: the class of what it returns.
     """
 
@@ -73,7 +74,7 @@ class OwnLearner(InSimulator):
         """Return the policy and its learning curve.
 
         Raises:
-            BadInputError: what it returns is no such policy, or it took no step.
+            BadInputError: what it returns is no such policy.
         """
         env, simulation = self.world(training)
         watched = WatchedEnv(env, training)
@@ -84,8 +85,6 @@ class OwnLearner(InSimulator):
                 f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}"
             )
         watched.note()
-        if not watched.points[-1]["steps"]:
-            raise BadInputError("learn took no step in the environment that it was given")
         own = OwnPolicy(learned, env.observation_size, env.action_size)
         episodes = training.episodes
         curve = {"points": watched.points}

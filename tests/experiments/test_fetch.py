@@ -13,6 +13,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.plan import plan
 from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
+from astra_data.worlds.own_code import own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
 
@@ -92,3 +93,16 @@ def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:
     simulator = task.simulator(1)
     simulator.reset_to(torch.tensor([[0.0, 0.0, 0.08, 0.0]]))
     assert simulator.step(torch.tensor([[1.0, 0.0]]))[0].tolist() == pytest.approx([0.05, 0.0, 0.095, 0.0])
+
+
+def test_the_script_pushes_the_puck_to_its_goal() -> None:
+    task, method = task_named(f"{FETCH}/push.py:TASK"), own_object(f"{FETCH}/script.py:METHOD")
+    env, script = task.target(4, seed=3, num_threads=1), method.learn.learn(None, None)
+    assert script.from_file(*script.to_file()).act(np.ones((1, 4))).shape == (1, 2)
+    env.reset()
+    arrived = torch.zeros(4, dtype=torch.bool)
+    for _ in range(task.objective.horizon):
+        observation = task.objective.observe(task.abstraction(env.state), env.goal)
+        step = env.step(torch.from_numpy(script.act(observation.numpy())), ~arrived)
+        arrived |= step.success
+    assert arrived.all() and method.role == "ceiling"

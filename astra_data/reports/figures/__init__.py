@@ -17,12 +17,11 @@ from astra_data.reports.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.sizes import Visits, data_efficiency
 from astra_data.reports.figures.strips import Strip, strips
-from astra_data.reports.figures.style import ROLES, method_colour, method_title, png
+from astra_data.reports.figures.style import method_colour, method_title, png
 from astra_data.reports.figures.validity import SimulatorReturns, predictive_validity
 from astra_data.reports.figures.walks import walk_prediction
 
 __all__ = [
-    "ROLES",
     "Curve",
     "OpenLoop",
     "Panel",

@@ -12,7 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from astra_data.core.naming import base_method, is_plus
-from astra_data.reports.figures.style import FAINT, INK, ROLES, method_colour, method_title, score_axis, style
+from astra_data.methods import method_role
+from astra_data.reports.figures.style import FAINT, INK, method_colour, method_title, score_axis, style
 from astra_data.worlds.score import Score
 
 Floats = NDArray[np.float64]
@@ -158,7 +159,7 @@ def _bar(
 
 def _tick_label(method: str) -> str:
     title = method_title(method)
-    return f"{title} ({ROLES[method]})" if method in ROLES else title
+    return f"{title} ({role})" if (role := method_role(method)) else title
 
 
 def _on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:

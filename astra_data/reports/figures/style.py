@@ -13,7 +13,6 @@ from PIL import Image
 
 from astra_data.core.naming import base_method, is_plus
 from astra_data.methods import METHODS
-from astra_data.methods import ROLES as ROLES
 from astra_data.methods import method_title as method_title
 from astra_data.worlds.score import Score
 
