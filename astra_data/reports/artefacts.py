@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
@@ -120,6 +120,8 @@ class CurveFile(Artefact):
     simulator_steps_per_second: float | None = None
     updates_per_second: float | None = None
     points: list[CurvePoint] = Field(min_length=1)
+    tries: list[dict[str, JsonValue]] = Field(default_factory=list)
+    """Of a training that may be done again: what each try reached; the points are those of the one kept."""
 
 
 class Metrics(Artefact):

@@ -163,6 +163,7 @@ def _values(
         "distance": distance,
         "simulated_success": simulated.get("success"),
         "simulated_steps": simulated.get("steps"),
+        "tries": float(len(curve.tries)) if curve and curve.tries else None,
         "beyond_recorded": evaluation.beyond_recorded,
         "simulator_returns": {
             world: outcomes.means()["return"] for world, outcomes in shared.items() if outcomes is not None

@@ -21,14 +21,14 @@ from astra_data.worlds.score import SUCCESS
 BESIDE = {
     "success": (
         *("failed", "wall_contact", "steps", "distance", "return"),
-        *("simulated_success", "beyond_recorded"),
+        *("simulated_success", "tries", "beyond_recorded"),
     ),
-    "steps": ("failed", "simulated_steps", "beyond_recorded"),
+    "steps": ("failed", "simulated_steps", "tries", "beyond_recorded"),
 }
 """Headline → the other measures in the table of scores."""
 OF_PLANES = {"wall_contact", "distance"}
 """Of these, what tasks without walls and places do not have."""
-NEGLIGIBLE = {"beyond_recorded": 0.01}
+NEGLIGIBLE = {"beyond_recorded": 0.01, "tries": 1.0}
 """Up to which value a measure is left out if no row has more; by default 0."""
 
 COLUMNS = {
@@ -39,6 +39,7 @@ COLUMNS = {
     "return": ("return", 1),
     "simulated_success": ("success in its simulator", 2),
     "simulated_steps": ("survived steps in its simulator", 0),
+    "tries": ("trainings", 1),
     "beyond_recorded": ("beyond recorded commands", 2),
 }
 """Column title and digits of such a measure."""

@@ -127,6 +127,8 @@ class MethodResults(Section):
     """Success in the simulator that the policy was trained in; None if it was trained in none."""
     simulated_steps: list[float] | None = None
     """Length of an episode in that simulator, in control steps."""
+    tries: list[float] | None = Field(default=None, exclude_if=lambda counts: counts is None)
+    """Trainings that its policy took; None where each was trained once, whatever it reached."""
     beyond_recorded: list[float] | None = Field(default=None, exclude_if=lambda shares: shares is None)
     """Share of steps whose command is beyond the range of the row's dataset; None if that is not known."""
     simulator_returns: dict[str, list[float]]
@@ -154,6 +156,7 @@ class MethodResults(Section):
             "simulated_success": self.simulated_success,
             "simulated_steps": self.simulated_steps,
             "distance": self.distance,
+            "tries": self.tries,
             "beyond_recorded": self.beyond_recorded,
         }
 

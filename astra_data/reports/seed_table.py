@@ -14,7 +14,8 @@ Named = tuple[str | None, str | None]
 
 PER_SEED = (
     *("success", "failed", "wall_contact", "steps", "returns", "distance"),
-    *("simulated_success", "simulated_steps", "beyond_recorded", "simulator_returns", "encoders", "learning"),
+    *("simulated_success", "simulated_steps", "tries", "beyond_recorded"),
+    *("simulator_returns", "encoders", "learning"),
 )
 """Fields of `MethodResults` that are lists over its seeds, or mappings to such lists."""
 

@@ -70,6 +70,14 @@ def test_a_task_without_walls_and_places_has_no_columns_of_them(results: Results
     assert "| failed | steps | return |" in changed
 
 
+def test_trainings_are_counted_where_some_were_done_again(results: Results, page: str) -> None:
+    assert "| trainings |" not in page
+    once = page_of(results, methods=rows_of(results, astra={"tries": [1.0, 1.0, 1.0]}))
+    assert "| trainings |" not in once
+    again = page_of(results, methods=rows_of(results, astra={"tries": [1.0, 3.0, 2.0]}))
+    assert "| success in its simulator | trainings |" in again and "| 2.0 ± 1.0 |" in again
+
+
 def test_commands_beyond_what_was_recorded_are_told_where_there_are_some(results: Results, page: str) -> None:
     assert "beyond recorded" not in page.lower()
     few = rows_of(results, astra={"beyond_recorded": [0.01, 0.01, 0.0]})

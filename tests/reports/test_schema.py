@@ -60,7 +60,7 @@ def test_every_measure_has_a_name() -> None:
     )
     assert {name: values and values[0] for name, values in row.measures().items()} == {
         **{"success": 0, "failed": 1, "wall_contact": 2, "steps": 3, "return": 4, "distance": 5},
-        **{"simulated_success": 6, "simulated_steps": None, "beyond_recorded": None},
+        **{"simulated_success": 6, "simulated_steps": None, "tries": None, "beyond_recorded": None},
     }
 
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,11 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.adaptation import Student
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.rma import RmaConfig
+from astra_data.methods import METHODS
 from astra_data.stages.train import train
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig
@@ -261,3 +264,30 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")
     assert "\n" not in str(caught.value)
+
+
+def test_a_simulator_that_is_not_mastered_is_trained_in_again(
+    task: str, paired: Path, grounded: Path, tmp_path: Path
+) -> None:
+    """No policy masters it in six iterations, so both tries are made, and the first is as without tries."""
+    config = TRAIN.model_copy(update={"tries": 2})
+    make(task, "nas", paired, grounded, tmp_path / "twice", config)
+    curve = json.loads((tmp_path / "twice/curve.json").read_text())
+    assert [one["success"] for one in curve["tries"]] == [0.0, 0.0]
+    assert {file.name for file in (tmp_path / "twice").iterdir()} >= {"policy.safetensors", "curve.json"}
+    assert not list((tmp_path / "twice").glob("try_*"))
+    assert (
+        make(task, "nas", paired, grounded, tmp_path / "once")
+        == (tmp_path / "twice/policy.safetensors").read_bytes()
+    )
+
+
+def test_trainings_without_a_simulator_are_made_once(
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever they learned, there is no simulator of theirs to test it in."""
+    policy = PolicyFile(ActorCritic(ActorCriticShape(6, 2)), None, "toy@data-1.0.0", "abc")
+    learned = replace(METHODS["behavior_cloning"], learn=lambda training: (policy, {"points": []}))
+    monkeypatch.setitem(METHODS, "behavior_cloning", learned)
+    make(task, "behavior_cloning", paired, None, tmp_path / "cloned", TRAIN.model_copy(update={"tries": 2}))
+    assert "tries" not in json.loads((tmp_path / "cloned/curve.json").read_text())
