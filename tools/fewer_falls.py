@@ -24,7 +24,7 @@ from astra_data.reports.schema import Results
 
 STUDY = Path(__file__).parents[1] / "recipes" / "cart_study.toml"
 POOL, DRIVES, POOL_SEED = 400, 60, 100
-ROWS = ("nas", "astra")
+ROWS = ["nas", "astra"]
 FALLS, SEEDS = [3, 6, 12, 25, 50], [1, 2, 3]
 
 
@@ -32,22 +32,24 @@ def main(
     folder: Path,
     falls: Annotated[list[int] | None, typer.Option(help="How many of the drives end in a fall.")] = None,
     seed: Annotated[list[int] | None, typer.Option(help="Of groundings and trainings.")] = None,
+    row: Annotated[list[str] | None, typer.Option(help="Of the study.")] = None,
 ) -> None:
-    """Run the study in `folder`; by default 3, 6, 12, 25 and 50 falls, seeds 1 to 3."""
+    """Run the study in `folder`; by default 3, 6, 12, 25 and 50 falls, seeds 1 to 3, NAS and ASTRA."""
     folder.mkdir(parents=True, exist_ok=True)
     pool = collected(folder)
-    print("| falls of 60 drives | steps | " + " | ".join(ROWS) + " |\n|---|---|" + "---|" * len(ROWS))
+    rows = row or ROWS
+    print("| falls of 60 drives | steps | " + " | ".join(rows) + " |\n|---|---|" + "---|" * len(rows))
     for count in falls or FALLS:
         data = with_falls(pool, count, folder / f"drives_{count}")
         recipe = folder / f"falls_{count}.toml"
-        recipe.write_text(text_of(f'data = "{data.resolve()}"', seed or SEEDS))
+        recipe.write_text(text_of(f'data = "{data.resolve()}"', seed or SEEDS, rows))
         found = read_published(run(recipe, root=folder, jobs=1) / "report" / "results.json")
         assert isinstance(found, Results)
-        cells = [", ".join(f"{success:.2f}" for success in found.methods[row].success) for row in ROWS]
+        cells = [", ".join(f"{success:.2f}" for success in found.methods[name].success) for name in rows]
         print(f"| {count} | {Dataset.open(data).lengths.sum():,} | {' | '.join(cells)} |", flush=True)
 
 
-def text_of(data: str, seeds: list[int], rows: tuple[str, ...] = ROWS) -> str:
+def text_of(data: str, seeds: list[int], rows: list[str] = ROWS) -> str:
     """Return the recipe of the study with other data, rows and seeds."""
     text, task = STUDY.read_text(), load_tables(STUDY)["task"]
     before, _, after = text.partition("\n[collect]")
