@@ -32,6 +32,17 @@ def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> 
     assert plan(experiment.recipe, path, experiment.folder)
 
 
+EXAMPLES = [path for path in (HOUSE / "recipes/examples").glob("*/*.toml") if path.name != "logs.toml"]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES), ids=lambda path: path.stem)
+def test_an_example_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
+    first = path.read_text().split("\n\n")[0].split("\n#\n")[0]
+    assert first.splitlines()[-1].endswith(f"astra-data run {path.relative_to(HOUSE)}")
+    experiment = load_experiment(path, Path("runs"))
+    assert plan(experiment.recipe, path, experiment.folder)
+
+
 def test_only_the_legs_differ_in_the_morphology_test() -> None:
     experiment = load_experiment(HOUSE / "recipes" / "leg_scale.toml", Path("runs"))
     assert experiment.recipe.evaluate.leg_scale == 1.25
