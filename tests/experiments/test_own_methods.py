@@ -1,0 +1,69 @@
+"""Methods of one's own, as recipes name them."""
+
+from pathlib import Path
+
+import pytest
+
+import astra_data.methods as registry
+from astra_data.core.errors import AstraDataError
+from astra_data.experiments.own_methods import OwnMethod, add_all, looked_up
+from astra_data.methods import METHODS
+
+EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
+DELTA, ENSEMBLE = (f"{EXAMPLES}/{name}.py:METHOD" for name in ("delta_action", "residual_ensemble"))
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_PLACES", "METHODS"):
+        monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
+    monkeypatch.setattr("astra_data.experiments.own_methods.METHODS", registry.METHODS)
+
+
+def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
+    own = OwnMethod.model_validate(DELTA)
+    own.add("delta")
+    settings = own.settings("delta")
+    assert settings is not None and settings.model_dump() == {"memory": 32, "learning_rate": 0.003}
+    assert own.model_dump() == {"method": DELTA}
+    plain = OwnMethod.model_validate(ENSEMBLE)
+    plain.add("plain")
+    assert plain.settings("plain") is None
+
+
+def test_further_keys_are_its_settings() -> None:
+    own = OwnMethod.model_validate({"method": DELTA, "memory": 5})
+    own.add("delta")
+    settings = own.settings("delta")
+    assert settings is not None and settings.model_dump() == {"memory": 5, "learning_rate": 0.003}
+    assert OwnMethod.model_validate(own.model_dump()) == own
+
+
+def test_those_that_it_does_not_have_are_refused_before_anything_runs() -> None:
+    with pytest.raises(AstraDataError, match=r"own_methods\.delta: memory: expected a whole number"):
+        add_all({"delta": {"method": DELTA, "memory": "much"}})
+    with pytest.raises(AstraDataError, match=r"own_methods\.plain: .* has no settings, got memory"):
+        add_all({"plain": {"method": ENSEMBLE, "memory": 5}})
+
+
+def test_all_of_a_recipe_are_added_as_recipe_json_has_them() -> None:
+    add_all({"one": DELTA, "other": {"method": ENSEMBLE}})
+    assert {"one", "other"} <= registry.METHODS.keys() and "one" not in METHODS
+
+
+def test_files_are_looked_up_beside_the_recipe() -> None:
+    found = looked_up(
+        {
+            "a": "a.py:METHOD",
+            "b": {"method": "b.py:METHOD", "memory": 5},
+            "c": "package.mod:METHOD",
+            "d": 7,
+        },
+        Path("there"),
+    )
+    assert found == {
+        "a": {"method": "there/a.py:METHOD"},
+        "b": {"method": "there/b.py:METHOD", "memory": 5},
+        "c": {"method": "package.mod:METHOD"},
+        "d": 7,
+    }
