@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ConfigDict, model_validator
 
 from astra_data.core.config import Config, validated
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.methods import METHODS, add_method
 from astra_data.worlds.own_code import place_beside
 
@@ -41,11 +41,15 @@ class OwnMethod(Config):
             BadInputError: it has no such settings.
         """
         given = self.model_extra or {}
-        if (table := METHODS[name].table) is not None:
-            return validated(given, table.model, f"own_methods.{name}") if given else table.usual
-        if given:
-            raise BadInputError(f"own_methods.{name}: {self.method} has no settings, got {', '.join(given)}")
-        return None
+        table = METHODS[name].table
+        if table is None and given:
+            raise BadInputError(f"{name}: {self.method} has no settings, got {', '.join(given)}")
+        if table is None or not given:
+            return None if table is None else table.usual
+        try:
+            return validated(given, table.model, name)
+        except RecipeError as error:
+            raise BadInputError(str(error)) from None
 
 
 def add_all(own_methods: Mapping[str, Any]) -> None:

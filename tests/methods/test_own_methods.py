@@ -186,7 +186,7 @@ def test_its_settings_stand_in_the_recipe(tmp_path: Path) -> None:
         (
             "delta_action",
             "memroy = 4",
-            "own_methods.delta_action: memroy: unknown key: did you mean 'memory'",
+            "own.toml: own_methods: delta_action: memroy: unknown key: did you mean 'memory'",
         ),
         ("delta_action", "memory = 0", "memory: expected greater than or equal to 1, got 0"),
         ("residual_ensemble", "members = 3", "residual_ensemble.py:METHOD has no settings, got members"),
