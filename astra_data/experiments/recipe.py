@@ -161,10 +161,10 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
-    def _has_heads_to_disagree(self) -> Self:
-        penalised = self.train.disagreement_penalty or self.plus.disagreement_penalty
-        if penalised and self.ground.correction_heads < 2:
-            raise ValueError("disagreement_penalty: expected ground.correction_heads of 2 or more, got 1")
+    def _has_several_heads(self) -> Self:
+        for key in ("disagreement_penalty", "keep_head"):
+            if (getattr(self.train, key) or getattr(self.plus, key)) and self.ground.correction_heads < 2:
+                raise ValueError(f"{key}: expected ground.correction_heads of 2 or more, got 1")
         return self
 
     @model_validator(mode="after")

@@ -36,6 +36,8 @@ class GroundedSimulator(EpisodeSimulator):
         self.goal = torch.zeros(count, shape.goal_size, device=device)
         self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
         self._predictions = torch.zeros(1, count, shape.state_size, device=device)
+        self._rows = torch.arange(count, device=device)
+        self._heads: Tensor | None = None
 
     @property
     def latent(self) -> Tensor:
@@ -66,6 +68,8 @@ class GroundedSimulator(EpisodeSimulator):
         super().start(state, rows, goal)
         self.goal[rows] = goal
         shape = self.model.shape
+        if self._heads is not None:
+            self._heads[rows] = self._drawn_heads(len(rows))
         if previous_action is None:
             previous_action = torch.zeros(len(state), shape.action_size, device=state.device)
         if hidden is None:
@@ -80,9 +84,17 @@ class GroundedSimulator(EpisodeSimulator):
         self._last = self.latent, action
         landed = self.simulator.step(action)
         self._predictions = self.model.ensemble_predictions(*self._last, landed)
-        state = self._settle(before, self._predictions.mean(0))
+        one = self._predictions.mean(0) if self._heads is None else self._predictions[self._heads, self._rows]
+        state = self._settle(before, one)
         self.hidden = self.model.encoder.step(self.model.encoder_input(state, self.goal, action), self.hidden)
         return state
+
+    def keep_heads(self) -> None:
+        """Correct each row by one head of the ensemble, drawn now and at each start, not by their mean."""
+        self._heads = self._drawn_heads(len(self._rows))
+
+    def _drawn_heads(self, count: int) -> Tensor:
+        return torch.randint(self.model.shape.correction_heads, (count,), device=self._rows.device)
 
     @torch.no_grad()
     def topple_risk(self) -> Tensor:
@@ -96,12 +108,15 @@ class GroundedSimulator(EpisodeSimulator):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
-        return super().state_dict() | {"goal": self.goal, "hidden": self.hidden}
+        heads = {} if self._heads is None else {"heads": self._heads}
+        return super().state_dict() | {"goal": self.goal, "hidden": self.hidden} | heads
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
         super().load_state_dict(state)
         self.goal, self.hidden = state["goal"].clone(), state["hidden"].clone()
+        if self._heads is not None:
+            self._heads = state["heads"].clone()
 
 
 @dataclass(frozen=True)

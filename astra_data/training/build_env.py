@@ -51,6 +51,9 @@ class EnvConfig(Config):
     disagreement_penalty: NotNegative = Field(default=0.0, serialization_alias="doubt_penalty")
     """Subtracted from the reward of a step, times the disagreement of the correction's heads beyond the
     usual; `[ground] correction_heads` has to be 2 or more."""
+    keep_head: bool = False
+    """Correct each simulated episode by one head of the correction, drawn at its start, not by their mean:
+    simulators that differ are harder to exploit. `[ground] correction_heads` has to be 2 or more."""
     command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: Share = 0.0
@@ -167,9 +170,12 @@ def training_env(
     if task.plane is None and (config.support_penalty or config.limits_commands):
         raise task.without_maze()
     scatter = parts.scatter if config.residual_noise else None
+    simulator = grounding.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter)
+    if config.keep_head:
+        simulator.keep_heads()
     return SimulatorEnv(
         task.objective,
-        grounding.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter),
+        simulator,
         reward=config.reward or "abstract",
         topple=config.topple,
         risk_weight=config.risk_weight,

@@ -132,6 +132,46 @@ def test_disagreement_is_what_the_heads_differ_beyond_the_usual() -> None:
     assert (one.disagreement == 0).sum() == 2
 
 
+def test_each_row_may_keep_one_head_until_it_starts_anew() -> None:
+    used = model(heads=3)
+    one = simulator(used)
+    one.keep_heads()
+    one.start(HERE.expand(3, 4), ROWS, GOAL)
+    kept: list[list[int]] = []
+    for number, action in enumerate(actions(40)):
+        latent, before = one.latent, one.state.clone()
+        raw = PointMass(U_MAZE, 3, timestep_s=0.05)
+        raw.reset_to(before)
+        expected = used.ensemble_predictions(latent, action, raw.step(action))
+        apart = (expected - one.step(action)).abs().amax(-1)
+        heads = apart.argmin(0)
+        # Corrections that are stopped at a wall tell nothing.
+        told = apart.min(0).values < 1e-5
+        kept.append([int(head) if known else -1 for head, known in zip(heads, told, strict=True)])
+        if number % 4 == 3:
+            one.start(HERE.expand(2, 4), ROWS[1:], GOAL[1:])
+    first = {row[0] for row in kept} - {-1}
+    stretches = [{row[1] for row in kept[begin : begin + 4]} - {-1} for begin in range(0, 40, 4)]
+    assert len(first) == 1 and all(len(heads) == 1 for heads in stretches)
+    assert set.union(*stretches) == {0, 1, 2}
+
+
+def test_kept_heads_are_part_of_the_state() -> None:
+    used = model(heads=3)
+    one, other = simulator(used), simulator(used)
+    for made in (one, other):
+        made.keep_heads()
+    saved = {name: values.clone() for name, values in one.state_dict().items()}
+    other.load_state_dict(saved)
+    for action in actions(5):
+        assert torch.equal(one.step(action), other.step(action))
+    single = simulator(model())
+    single.keep_heads()  # of one head, which is their mean
+    plain = simulator(model())
+    for action in actions(5):
+        assert torch.equal(single.step(action), plain.step(action))
+
+
 def test_a_saved_state_goes_on_as_it_would_have() -> None:
     first, second = simulator(model()), simulator(model())
     for action in actions(3):

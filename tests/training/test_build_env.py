@@ -68,6 +68,23 @@ def test_without_switches_it_is_the_plain_simulator(
         assert torch.equal(torch.get_rng_state(), drawn)
 
 
+def test_rows_may_differ_by_the_head_that_they_keep(episodes: PairedEpisodes) -> None:
+    torch.manual_seed(0)
+    used = HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8, correction_heads=2)))
+    for head in used.model.corrections:
+        torch.nn.init.normal_(list(head.parameters())[-2], std=0.05)
+    for keeps in (False, True):
+        config = EnvConfig(keep_head=keeps)
+        world = training_env(
+            TASK, config, env_parts(TASK, config, episodes, used), used, num_envs=16, device="cpu"
+        )
+        start = torch.cat([HERE, torch.zeros(2)]).expand(16, 4)
+        world.simulator.start(start, torch.arange(16), torch.zeros(16, 2))
+        with torch.no_grad():
+            landed = world.simulator.step(torch.full((16, 2), 0.5))
+        assert len(landed.unique(dim=0)) == (2 if keeps else 1)
+
+
 def test_scatter_is_what_the_simulator_does_not_explain(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
