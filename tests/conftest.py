@@ -1,6 +1,7 @@
 import dataclasses
 import importlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,21 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of datasets that are known by name."""
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
     return tmp_path / "home"
+
+
+@pytest.fixture
+def forgotten_methods() -> Iterator[None]:
+    """Forget afterwards the methods of one's own that a test adds to this process."""
+    methods, policies = (
+        importlib.import_module(f"astra_data.{name}") for name in ("methods", "training.own_policy")
+    )
+    registered = (methods.METHODS, methods.KINDS, methods._PLACES, policies.KINDS)
+    known, kinds = [dict(found) for found in registered], set(methods._OWN_KINDS)
+    yield
+    for found, before in zip(registered, known, strict=True):
+        found.clear()
+        found.update(before)
+    methods._OWN_KINDS.intersection_update(kinds)
 
 
 @pytest.fixture

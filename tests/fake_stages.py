@@ -37,6 +37,7 @@ class FakeConfig(Config):
     learner: str = "ppo"
     limits_commands: bool = False
     disagreement_penalty: float = 0.0
+    keep_head: bool = False
     reward: str | None = None
     correction_heads: int = 1
 

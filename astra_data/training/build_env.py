@@ -51,7 +51,7 @@ class EnvConfig(Config):
     disagreement_penalty: NotNegative = Field(default=0.0, serialization_alias="doubt_penalty")
     """Subtracted from the reward of a step, times the disagreement of the correction's heads beyond the
     usual; `[ground] correction_heads` has to be 2 or more."""
-    keep_head: bool = False
+    keep_head: bool = Field(default=False, exclude_if=lambda keeps: not keeps)
     """Correct each simulated episode by one head of the correction, drawn at its start, not by their mean:
     simulators that differ are harder to exploit. `[ground] correction_heads` has to be 2 or more."""
     command_limit_m_s: Positive = 2.0

@@ -66,7 +66,7 @@ def in_simulator(
 
 
 @dataclass(frozen=True)
-class Trial:
+class Reached:
     """What a policy reaches in its own simulator.
 
     Attributes:
@@ -77,7 +77,7 @@ class Trial:
     steps: float
 
 
-def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Trial:
+def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
     """Test a policy that was trained in a simulator there, from the task's starts and without noise."""
     assert trained.simulation is not None
     deployed = deploy(task, trained, grounding)
@@ -86,4 +86,4 @@ def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> T
     horizon = task.objective.horizon
     outcome, _ = in_simulator(world, begin, horizon, derive(seed, "trial in its own simulator"))
     steps = [steps for steps, success in zip(outcome.steps, outcome.success, strict=True) if success]
-    return Trial(fmean(outcome.success), fmean(steps) if steps else float(horizon))
+    return Reached(fmean(outcome.success), fmean(steps) if steps else float(horizon))

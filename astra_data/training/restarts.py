@@ -7,7 +7,7 @@ from typing import Any
 from astra_data.core.progress import part
 from astra_data.core.seeding import derive
 from astra_data.grounding.protocols import Grounding
-from astra_data.training.own_world import Trial, trial
+from astra_data.training.own_world import Reached, trial
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.train import Learn, Training
 
@@ -31,7 +31,7 @@ def with_restarts(
     config = training.config
     if config.tries == 1:
         return learn(training)
-    made: list[tuple[Trial, PolicyFile, dict[str, Any]]] = []
+    made: list[tuple[Reached, PolicyFile, dict[str, Any]]] = []
     seeds = [training.seed, *(derive(training.seed, f"try {number}") for number in range(1, config.tries))]
     for number, seed in enumerate(seeds):
         attempt = _attempt(training, seed, number)
@@ -43,8 +43,8 @@ def with_restarts(
             break
     _, policy, curve = max(made, key=lambda one: one[0].success)
     tries = [
-        {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": told["points"]}
-        for seed, (one, _, told) in zip(seeds, made, strict=False)
+        {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": of_try["points"]}
+        for seed, (one, _, of_try) in zip(seeds, made, strict=False)
     ]
     for number in range(1, len(made)):
         shutil.rmtree(_attempt(training, 0, number).folder)
@@ -60,7 +60,7 @@ def _attempt(training: Training, seed: int, number: int) -> Training:
     return replace(training, seed=seed, folder=folder, progress=progress)
 
 
-def _masters(reached: Trial, training: Training) -> bool:
+def _masters(reached: Reached, training: Training) -> bool:
     """Return whether a policy succeeds often enough, and with time to spare where success ends an episode."""
     config, objective = training.config, training.task.objective
     in_time = objective.is_lasting or reached.steps <= config.most_of_horizon * objective.horizon

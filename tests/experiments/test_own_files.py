@@ -8,9 +8,9 @@ import pytest
 from astra_data.core.errors import RecipeError
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.own_files import CODE, record_code
-from astra_data.methods import _PLACES, METHODS
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.usefixtures("forgotten_methods")
 RECIPE = """
 task = "rail.py:TASK"
 methods = ["nas", "mine"]
@@ -36,12 +36,6 @@ def made(tmp_path: Path) -> Path:
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     record_code(experiment.recipe, experiment.folder)
     return tmp_path
-
-
-@pytest.fixture(autouse=True)
-def forgotten() -> None:
-    for name in set(_PLACES):
-        del METHODS[name], _PLACES[name]
 
 
 def load(folder: Path) -> Experiment:

@@ -35,6 +35,7 @@ def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> 
 EXAMPLES = [path for path in (HOUSE / "recipes/examples").glob("*/*.toml") if path.name != "logs.toml"]
 
 
+@pytest.mark.usefixtures("forgotten_methods")
 @pytest.mark.parametrize("path", sorted(EXAMPLES), ids=lambda path: path.stem)
 def test_an_example_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
     first = path.read_text().split("\n\n")[0].split("\n#\n")[0]

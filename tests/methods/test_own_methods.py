@@ -1,6 +1,5 @@
 """Methods of the user's: rows beside those of the package."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +16,7 @@ from astra_data.core.progress import silent
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.plan import plan
 from astra_data.experiments.trained_policy import load_policy
-from astra_data.grounding.files import KINDS, load_grounding
+from astra_data.grounding.files import load_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.methods import METHODS, add_method, method_named
 from astra_data.worlds.own_code import own_object
@@ -25,6 +24,7 @@ from astra_data.worlds.task import Task
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "recipes/examples/methods"
+pytestmark = pytest.mark.usefixtures("forgotten_methods")
 SMALL = """
 [collect]
 episodes = 6
@@ -46,18 +46,6 @@ episodes = 3
 [report]
 bootstrap_replicates = 100
 """
-
-
-@pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
-    """Forget the methods that a test adds."""
-    known = [(registered, dict(registered)) for registered in (METHODS, KINDS, registry._PLACES)]
-    kinds = set(registry._OWN_KINDS)
-    yield
-    for registered, before in known:
-        registered.clear()
-        registered.update(before)  # type: ignore[arg-type]
-    registry._OWN_KINDS.intersection_update(kinds)
 
 
 def recipe(folder: Path, methods: str, own: str) -> Path:

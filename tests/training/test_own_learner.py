@@ -13,10 +13,11 @@ from toy_episodes import toy_episodes
 from astra_data.core.errors import BadInputError
 from astra_data.deployment.graph import write_graphs
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.own_learner import OwnLearner, WatchedEnv
+from astra_data.training.own_learner import OwnLearner
 from astra_data.training.own_policy import KINDS, Array
 from astra_data.training.policy_file import PolicyFile, add_policy_kind, deploy
 from astra_data.training.train import PpoTrainConfig, Training
+from astra_data.training.watched_env import WatchedEnv
 
 
 @pytest.fixture(autouse=True)

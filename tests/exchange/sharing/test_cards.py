@@ -30,5 +30,8 @@ def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert [words for words in notes.model_dump().values() if words.strip() not in text] == []
     figure = path.with_name(f"{path.stem}-coverage.png")
+    if path.stem.startswith("fetch"):  # whose states have no positions by name
+        assert not figure.exists() and figure.name not in text
+        return
     assert f"]({figure.name})" in text
     assert figure.read_bytes().startswith(b"\x89PNG")

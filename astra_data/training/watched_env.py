@@ -1,0 +1,49 @@
+"""The environment that a learner of the user's is given; it keeps the learning curve."""
+
+from typing import Any
+
+from astra_data.core.seeding import derive
+from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv
+from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.train import Training
+
+_POINTS = 50
+"""Of a learning curve."""
+
+
+class WatchedEnv(BatchedVectorEnv):
+    """The environment that a row is trained in, which keeps the learning curve of who learns there.
+
+    Attributes:
+        points: of the curve so far.
+    """
+
+    def __init__(self, env: SimulatorEnv, training: Training) -> None:
+        """Show `env`; its randomness comes from the training's seed."""
+        seeded = SeededSimulatorEnv(env)
+        seeded.reseed(derive(training.seed, "own learner"))
+        super().__init__(seeded, training.simulated_steps)
+        self.points: list[dict[str, Any]] = []
+        self._training, self._total = training, training.config.total_steps
+        self._steps = self._ended = self._succeeded = 0
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Apply actions (B, A) for one control step."""
+        stepped = super().step(actions)
+        infos = stepped[-1]
+        self._steps += self.num_envs
+        if "final_info" in infos:
+            self._ended += int(infos["_final_info"].sum())
+            self._succeeded += int(infos["final_info"]["success"].sum())
+        if self._steps * _POINTS >= (len(self.points) + 1) * self._total:
+            self.note()
+        return stepped
+
+    def note(self) -> None:
+        """Add a point to the curve, of the episodes that ended since the last one."""
+        lasts = self._training.task.objective.is_lasting
+        success = None if lasts or not self._ended else self._succeeded / self._ended
+        self.points.append({"steps": self._steps, "success": success})
+        self._ended = self._succeeded = 0
+        note = "unknown yet" if success is None else f"{success:.2f}"
+        self._training.progress(min(1.0, self._steps / self._total), f"success of training episodes {note}")
