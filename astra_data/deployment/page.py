@@ -41,7 +41,7 @@ brings all that it takes; `python run_policy.py` tries it with zeros.
 
 `policy.onnx` and `policy.torchscript` are the same graph, of one robot and one step, in float32: `state`
 (1, {states}), `goal` (1, {goals}) and `hidden` (1, {hidden}) in, `command` (1, {commands}) and
-`next_hidden` (1, {hidden}) out. All values are in the units above: scaling, φ, the encoder and the
+`next_hidden` (1, {hidden}) out. All values are in the task's units: scaling, φ, the encoder and the
 memory are inside. `hidden` is zeros when an episode begins, and after that what the last step gave as
 `next_hidden`.
 

@@ -49,6 +49,7 @@ class Tally:
         last_terminated: those of them that were terminated.
         last_reward: the sum of their rewards.
         short_rows: rows of episodes that were too short.
+        rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
         endings: how the episodes end.
     """
 
@@ -60,6 +61,7 @@ class Tally:
     last_terminated: int = 0
     last_reward: float = 0.0
     short_rows: int = 0
+    rows_after_end: int = 0
     endings: Endings = field(default_factory=Endings)
 
 
@@ -80,6 +82,7 @@ class Cutter:
         self._counters: NDArray[np.int64] = np.zeros(len(REASONS) - 1, np.int64)
         self._pieces: list[dict[str, Array]] = []
         self._metadata: dict[str, Scalar] = {}
+        self._ended = False
         self._seconds, self._steps = 0.0, 0
 
     @property
@@ -125,6 +128,10 @@ class Cutter:
             return
         episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
         self._pieces = []
+        ended_before, self._ended = self._ended, TERMINATED in episode and bool(episode[TERMINATED][-1])
+        if ended_before and self._ended and len(episode[TERMINATED]) == 1:
+            self.tally.rows_after_end += 1
+            return
         if STATE in episode and NEXT_STATE not in episode:
             episode = self._with_next_states(episode)
         length = len(next(iter(episode.values())))

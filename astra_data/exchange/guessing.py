@@ -68,6 +68,9 @@ LENGTH = re.compile(
 )
 _FULL_TURNS = 4 * math.pi
 """An angle beyond it is taken for degrees."""
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*|[+-]?(nan|inf)", re.IGNORECASE)
+_MOSTLY = 0.9
+"""Share of a field's rows with a number above which the others are faults."""
 _COMMAND = re.compile(rf"(^|_)({_COMMANDED}|u)(_|(?=\d)|$)")
 
 
@@ -94,11 +97,13 @@ class Logs:
 
     Attributes:
         fields: in the order of the logs.
-        episodes: of each, the scaled values (T,) by a field's name.
+        episodes: of each, the scaled values (T,) by a field's name, of the rows with a number in each state.
+        left_out: rows without one: how many by the state's name.
     """
 
     fields: tuple[Field, ...]
     episodes: tuple[dict[str, Floats], ...]
+    left_out: dict[str, int]
 
     @property
     def rate(self) -> int:
@@ -138,7 +143,10 @@ def guess(paths: Sequence[Path]) -> Logs:
         fields = _distinct([_field(name, values) for name, values in joined.items()])
     except BadInputError as error:
         raise BadInputError(f"{files[0]}: {error}") from None
-    found = Logs(fields, tuple(_episodes(fields, tables.values())))
+    states = [field.name for field in fields if field.role == "state"]
+    gaps = {name: int((~np.isfinite(joined[name])).sum()) for name in states}
+    episodes = _episodes(fields, (_whole(table, states) for table in tables.values()))
+    found = Logs(fields, tuple(episodes), {name: gaps[name] for name in states if gaps[name]})
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if not found.of(role):  # type: ignore[arg-type]
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
@@ -188,6 +196,11 @@ def _numbers(path: Path) -> dict[str, Floats]:
         raise BadInputError(f"{path}: there is no such file") from None
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         raise BadInputError(f"{path}: expected CSV with a header ({str(error).splitlines()[0]})") from None
+    for entry in table.schema:
+        if pa.types.is_string(entry.type) and (wrong := _no_number(table[entry.name].to_pylist())):
+            raise BadInputError(
+                f"{path} line {wrong[0] + 2}: {entry.name}: expected a number, got {wrong[1]!r}"
+            )
     kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
     names = [entry.name for entry in table.schema if any(kind(entry.type) for kind in kinds)]
     if len(table) < 2 or not names or len(set(names)) < len(names):
@@ -195,6 +208,12 @@ def _numbers(path: Path) -> dict[str, Floats]:
             f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
         )
     return {name: table[name].cast(pa.float64(), safe=False).to_numpy() for name in names}
+
+
+def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
+    """Return the row and the text of the first of `values` that is no number, if nearly all others are."""
+    wrong = [(row, value) for row, value in enumerate(values) if value and not _NUMBER.fullmatch(value)]
+    return wrong[0] if wrong and len(wrong) < (1 - _MOSTLY) * len(values) else None
 
 
 def _field(name: str, values: Floats) -> Field:
@@ -206,9 +225,8 @@ def _field(name: str, values: Floats) -> Field:
             return Field(name, "left out", plain, "1", 1.0, "a time that does not rise")
         step = float(np.median(np.diff(values)))
         unit = ending or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
-        return Field(
-            name, "time", "time", unit, _TIMES[unit], "its ending" if ending else f"steps of {step:g}"
-        )
+        why = "its ending" if ending else f"steps of {step:g}"
+        return Field(name, "time", "time", unit, _TIMES[unit], why)
     if re.fullmatch(_UNCLEAR, plain):
         return Field(name, "left out", plain, "1", 1.0, "an end, but which? name it success or failed")
     body, ending = _without_unit(plain, [end for end, _, _ in _UNITS])
@@ -225,19 +243,17 @@ def _field(name: str, values: Floats) -> Field:
                 return Field(name, "left out", plain, "1", 1.0, "never changes")
             short = _COMMAND.sub("_", body).strip("_") or "command"
             return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
-    if not np.isfinite(values).all() or np.ptp(values) == 0:
-        return Field(
-            name, "left out", plain, "1", 1.0, "never changes" if np.isfinite(values).all() else "has gaps"
-        )
+    finite = np.isfinite(values)
+    if finite.mean() <= _MOSTLY or np.ptp(values[finite]) == 0:
+        why = "never changes" if finite.all() else f"no number in {(~finite).sum()} rows"
+        return Field(name, "left out", plain, "1", 1.0, why)
     return _with_unit(name, "state", f"s{body}" if body[0].isdigit() else body, ending, values)
 
 
 def _check_finite(name: str, role: Role, values: Floats) -> None:
     if wrong := int((~np.isfinite(values)).sum()):
-        raise BadInputError(
-            f"{name}: expected a number in each row of a {role}, got none in {wrong} of {len(values)}: "
-            "leave these rows out"
-        )
+        found = f"got none in {wrong} of {len(values)}: leave these rows out"
+        raise BadInputError(f"{name}: expected a number in each row of a {role}, {found}")
 
 
 def _without_unit(name: str, endings: Sequence[str] | dict[str, float]) -> tuple[str, str | None]:
@@ -252,14 +268,18 @@ def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Fl
         if ending == known:
             return Field(name, role, short, unit, scale, "its ending")
     if role == "state" and _ANGLE.fullmatch(short):
-        if np.abs(values).max() > _FULL_TURNS:
-            return Field(
-                name, role, short, "rad", math.pi / 180, f"an angle up to {np.abs(values).max():.0f}: degrees"
-            )
+        if (largest := np.nanmax(np.abs(values))) > _FULL_TURNS:
+            return Field(name, role, short, "rad", math.pi / 180, f"an angle up to {largest:.0f}: degrees")
         return Field(name, role, short, "rad", 1.0, "its name")
     if role == "state" and LENGTH.fullmatch(short):
         return Field(name, role, short, "m", 1.0, "its name")
     return Field(name, role, short, "1", 1.0, "no unit in its name")
+
+
+def _whole(table: dict[str, Floats], states: Sequence[str]) -> dict[str, Floats]:
+    """Return the rows of a file with a number in each of its `states`."""
+    kept = np.all([np.isfinite(table[name]) for name in states], axis=0)
+    return {name: values[kept] for name, values in table.items()} if states else table
 
 
 def _episodes(fields: Sequence[Field], tables: Iterable[dict[str, Floats]]) -> list[dict[str, Floats]]:

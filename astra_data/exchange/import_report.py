@@ -38,7 +38,7 @@ class ImportReport:
             f"{ends}"
             f"rejected rows: {tally.rejected_rows}{first}\n"
             f"last rows without a next state: {_last_rows(tally)}; "
-            f"rows of episodes that were too short: {tally.short_rows}"
+            f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}"
         )
 
 
@@ -46,8 +46,12 @@ def losses(tally: Tally) -> str:
     """Say what was dropped, in a line."""
     return (
         f"rows {tally.rows}, rejected {tally.rejected_rows}, last ones without a next state "
-        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}"
+        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}{_after_ends(tally)}"
     )
+
+
+def _after_ends(tally: Tally) -> str:
+    return f"; terminated rows after the end, dropped: {tally.rows_after_end}" if tally.rows_after_end else ""
 
 
 def _last_rows(tally: Tally) -> str:

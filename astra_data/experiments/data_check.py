@@ -20,14 +20,14 @@ def data_condition(recipe: Recipe) -> Condition | None:
     """Return the condition of a recipe's `data`; None if it has none, or has yet to pull it.
 
     Raises:
-        BadInputError: its columns are not those of the task.
+        BadInputError: there are no such data, or their columns are not those of the task.
     """
     if recipe.data is None or is_address(recipe.data):
         return None
     try:
         source = open_dataset(recipe.data)
     except BadInputError as error:
-        return Condition("missing", f"{error}: import or pull it first")
+        raise BadInputError(f"data: {error}: import or pull it first") from None
     task = task_named(recipe.task)
     check_fits(source, task)
     return Condition("finished", "; ".join(unrecorded(task.limits, source)))

@@ -84,8 +84,12 @@ def run_in_order(
 
 
 def pickled(item: Item, prepare: Callable[[], object] | None) -> bytes:
-    """Return the work of `item` for `run_item`, to be unpickled only once its log file is in place."""
-    return pickle.dumps((prepare, item.call))
+    """Return the work of `item` for `run_item`, to be unpickled only once its log file is in place.
+
+    The call is unpickled after `prepare`: it may hold settings of a class in a file of the user's, which only
+    `prepare` runs.
+    """
+    return pickle.dumps((prepare, pickle.dumps(item.call)))
 
 
 def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -> float | AstraDataError:
@@ -103,7 +107,7 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
             prepare, call = pickle.loads(work)
             if prepare:
                 prepare()
-            call(progress=Reporter(send))
+            pickle.loads(call)(progress=Reporter(send))
     except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
         expected = error if isinstance(error, AstraDataError) else disk_error(error)
         if expected:

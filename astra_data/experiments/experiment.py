@@ -261,7 +261,7 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}
     if "task" in changed and _share_target(str(before.get("task")), recipe.task):
         return changed - {"task"} | {_SIMULATOR}
-    return changed
+    return changed - {"plus"} if "train" in changed else changed  # which "plus" takes over
 
 
 def _share_target(task: str, other: str) -> bool:

@@ -86,11 +86,18 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         "timestep_s": repr(1 / logs.rate),
         "rate_hz": f"{logs.rate}" + ("" if logs.of("time") else "  # CHECK: the logs have no time"),
         "time": "".join(time),
+        "not_finite": 'not_finite = "split"  # CHECK: rows without a number end the episode\n'
+        if logs.left_out
+        else "",
         "split": "".join(["\n[split]\n", *split]) if split else "",
         "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)),
         "window": str(max(2, min(20, horizon // 4))),
         "size": str(len(states)),
         "state": texts(field.short for field in states),
+        "state_units": texts(field.unit for field in states),
+        "command_size": str(len(commands)),
+        "command_names": texts(field.short for field in commands),
+        "command_units": texts(field.unit for field in commands),
         "row": json.dumps([round(float(value), 4) for value in logs.values(states)[0][0]]),
         "bounds": repr(bounds).replace("'", '"'),
         "horizon": str(horizon),

@@ -29,6 +29,7 @@ from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
 from astra_data.stages.registry import STAGES
+from astra_data.worlds.own_code import is_own_code
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
 
@@ -77,7 +78,7 @@ def run(
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if stage_of(item) in wanted]
     make(experiment, items, jobs=jobs, device=device)
-    if until == "ground":
+    if "ground" in wanted:
         write_errors(experiment, part)
     return experiment.folder
 
@@ -142,13 +143,18 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
         BadInputError: its task has faults; lists them all. Or its data are not the task's.
     """
     experiment = load_experiment(recipe_path, root)
-    name = experiment.recipe.task
-    if faults := check_task(task_named(name)):
-        raise BadInputError("\n".join(f"{recipe_path}: task {name}: {fault}" for fault in faults))
+    _check_task(experiment)
     data = data_condition(experiment.recipe)
     planned = plan(experiment.recipe, recipe_path, experiment.folder)
     conditions = {item.key: condition(item, experiment, verify=verify) for item in planned}
     return conditions if data is None else {"data": data, **conditions}
+
+
+def _check_task(experiment: Experiment) -> None:
+    """Refuse a task that has faults; list them all."""
+    name = experiment.recipe.task
+    if faults := check_task(task_named(name)):
+        raise BadInputError("\n".join(f"{experiment.path}: task {name}: {fault}" for fault in faults))
 
 
 Show = Callable[[int, Console], AbstractContextManager[Watcher]]
@@ -166,7 +172,8 @@ def make(
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
-    What is made again is set aside before, with a line that says why and where.
+    A task of the user's own is walked through before. What is made again is set aside, with a line that says
+    why and where.
 
     Args:
         experiment: whose artefacts they are.
@@ -191,6 +198,8 @@ def make(
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
+        if is_own_code(recipe.task):
+            _check_task(experiment)
         clean(folder)
         again = to_make_again(items, experiment)
         for key, reason in again.items():

@@ -5,6 +5,7 @@ import hashlib
 import importlib
 import importlib.util
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import Any
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
+
+_PREFIX = "astra_data_own_"
+"""Of the names of modules that are files of the user's."""
 
 
 def is_own_code(name: str) -> bool:
@@ -81,7 +85,7 @@ def _of_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInputError(f"{path} does not exist: expected a Python file")
     key = hashlib.sha256(f"{path.resolve()}".encode()).hexdigest()[:12]
-    name = f"astra_data_own_{path.stem}_{key}"
+    name = f"{_PREFIX}{path.stem}_{key}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -129,6 +133,12 @@ def explained(what: str) -> Iterator[None]:
     except AstraDataError:
         raise
     except Exception as error:
-        raise BadInputError(
-            f"{what} fails with {type(error).__name__}: {error}; ASTRA_DATA_DEBUG=1 shows where"
-        ) from error
+        raise BadInputError(f"{what} fails with {type(error).__name__}: {error} ({_place(error)})") from error
+
+
+def _place(error: Exception) -> str:
+    """Return the file and line of the user's code at which `error` was raised, or else where it was."""
+    own = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
+    frames = traceback.extract_tb(error.__traceback__)
+    last = next((frame for frame in reversed(frames) if frame.filename in own), frames[-1])
+    return f"{Path(last.filename).name}, line {last.lineno}"

@@ -99,8 +99,9 @@ def _abstraction(task: Task) -> None:
         if not isinstance(found, type(given)) or shape != wanted:
             raise BadInputError(
                 f"{what}: expected a {type(given).__name__} of shape {wanted}, got a {type(found).__name__} "
-                f"of {shape}"
+                f"of {shape}; abstract_state has {wanted[1]} values"
             )
+        _expect(what, torch.as_tensor(found), wanted)
 
 
 def _robot(task: Task) -> None:

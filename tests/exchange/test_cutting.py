@@ -113,7 +113,20 @@ def test_a_terminated_row_without_a_next_state_hands_its_flags_to_the_step_befor
     assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False, False], [False], [True]]
     assert cutting.tally.endings == Endings(terminated=2, cut_off=1)
     tally = cutting.tally
-    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (4, 3, 2 + 4 + 5 + 7)
+    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 2 + 4 + 7)
+    assert tally.rows_after_end == 1
+
+
+@BLOCKS
+@pytest.mark.parametrize("terminal", ["drop", "stand_still"])
+def test_a_log_that_goes_on_after_the_end_makes_no_episodes_of_it(block_rows: int, terminal: str) -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
+    cutting = cutter(columns=columns, terminal=terminal)
+    episodes = cut(cutting, block_rows, x=np.arange(9.0), over=[0, 0, 1, 1, 1, 1, 0, 0, 1])
+    wanted = [[0, 1], [6, 7]] if terminal == "drop" else [[0, 1, 2], [6, 7, 8]]
+    assert rows(episodes) == wanted
+    assert [bool(episode[TERMINATED][-1]) for episode in episodes] == [True, True]
+    assert cutting.tally.rows_after_end == 3
 
 
 @BLOCKS

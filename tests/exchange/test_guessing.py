@@ -177,3 +177,32 @@ def test_files_have_to_be_there_and_alike(tmp_path: Path) -> None:
         BadInputError, match=r"two\.csv: expected the fields of .*one\.csv, \['x', 'cmd'\]: got"
     ):
         guess([one, two])
+
+
+def test_rows_without_a_number_are_left_out_and_told(tmp_path: Path) -> None:
+    x, y = np.arange(30.0), np.arange(30.0) ** 2
+    x[[4, 17]] = np.nan
+    sparse = np.where(np.arange(30) % 5, np.nan, y)
+    log = write(tmp_path / "log.csv", {"x": x, "y": y, "gps": sparse, "cmd_x": np.arange(30) % 3}, rows=30)
+    logs = guess([log])
+    found = {field.name: (field.role, field.why) for field in logs.fields}
+    assert found["x"][0] == found["y"][0] == "state"
+    assert found["gps"] == ("left out", "no number in 24 rows")
+    assert logs.left_out == {"x": 2}
+    assert [len(values) for values in logs.values(logs.of("state"))] == [28]
+    assert np.isfinite(logs.values(logs.of("state"))[0]).all()
+
+
+def test_a_text_among_numbers_is_refused_with_its_line(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    rows = [f"{row},{row % 3}" for row in range(20)]
+    rows[7] = "oops,1"
+    log.write_text("\n".join(["x,cmd_x", *rows, ""]))
+    with pytest.raises(BadInputError, match=r"log.csv line 9: x: expected a number, got 'oops'$"):
+        guess([log])
+
+
+def test_texts_are_no_field(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("x,mode,cmd_x\n" + "".join(f"{row}.5,driving,{row % 3}\n" for row in range(20)))
+    assert [field.name for field in guess([log]).fields] == ["x", "cmd_x"]

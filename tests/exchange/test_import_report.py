@@ -13,3 +13,11 @@ def test_what_was_dropped_is_counted_aloud() -> None:
     assert "next state 0 dropped, in" in losses(Tally())
     report = str(ImportReport(Path("out"), 2, 7, tally, 0.25))
     assert report.startswith("out: 2 episodes, 7 frames from 9 rows in 0.2 s\nsplit points: file 1\n")
+
+
+def test_rows_after_the_end_are_told_where_there_are_any() -> None:
+    told = "; terminated rows after the end, dropped: 4"
+    tally = Tally(rows=9, rows_after_end=4)
+    assert losses(tally).endswith(told)
+    assert str(ImportReport(Path("out"), 2, 7, tally, 0.25)).endswith(told)
+    assert "after the end" not in losses(Tally(rows=9))

@@ -8,7 +8,7 @@ from fake_dataset import writer
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.run import check
+from astra_data.experiments.run import check, run
 
 ROOT = Path(__file__).parents[2]
 
@@ -49,11 +49,10 @@ def test_bounds_beyond_what_was_recorded_are_told(
     assert found.why.startswith(expected) and bool(found.why) == bool(expected)
 
 
-def test_data_that_are_not_there_are_to_do(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(recipe.parent / "home"))
-    found = check(recipe, root=recipe.parent / "runs")["data"]
-    assert found.state == "missing"
-    assert found.why.startswith("no dataset 'logs' in ") and found.why.endswith(": import or pull it first")
+    with pytest.raises(BadInputError, match=r"data: no dataset 'logs' in .*: import or pull it first"):
+        check(recipe, root=recipe.parent / "runs")
 
 
 def test_data_of_another_robot_are_refused(recipe: Path) -> None:
@@ -69,3 +68,14 @@ def test_recipes_that_collect_or_pull_have_no_such_line(recipe: Path) -> None:
     recipe.write_text(text.replace('data = "logs"\n', "") + '[collect]\nstart = "task"\n')
     assert load_experiment(recipe, recipe.parent / "runs").recipe.data is None
     assert "data" not in check(recipe, root=recipe.parent / "runs")
+
+
+def test_a_task_of_ones_own_is_walked_through_before_a_run(recipe: Path) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0)
+    task = recipe.parent / "rail.py"
+    task.write_text(task.read_text().replace("+ ends", "+ nothing"))
+    with pytest.raises(
+        BadInputError, match=r"rail.py:TASK: objective.reward.*'nothing'.* \(rail.py, line \d+\)"
+    ):
+        run(recipe, root=recipe.parent / "runs")
+    assert not (recipe.parent / "runs/rail/label").exists()

@@ -1,4 +1,5 @@
 import os
+import sys
 from collections.abc import Collection
 from functools import partial
 from pathlib import Path
@@ -8,6 +9,7 @@ from fake_items import crash, fail, fill_the_disk, touch
 
 from astra_data.core.errors import DiskError, MissingStageError
 from astra_data.experiments.execution import Item, Reporter, pickled, run_in_order, run_item
+from astra_data.worlds.own_code import own_object
 
 
 class Workshop:
@@ -81,6 +83,25 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     assert "ours again\n" in shown.out
     assert "and ours\n" in shown.err
     assert "with care" not in shown.err
+
+
+def keep(path: Path, value: float) -> None:
+    path.write_text(str(value))
+
+
+def no_progress(made: partial[None], progress: object) -> None:
+    made()
+
+
+def test_an_item_may_hold_an_object_of_a_file_that_its_preparation_runs(tmp_path: Path) -> None:
+    (tmp_path / "sizes.py").write_text("class Size(float):\n    pass\n\n\nSIZE = Size(2.5)\n")
+    place = f"{tmp_path / 'sizes.py'}:SIZE"
+    size = own_object(place)
+    call = partial(no_progress, partial(keep, tmp_path / "kept", size))
+    work = pickled(Item("a", (), call), partial(own_object, place))
+    del sys.modules[type(size).__module__]  # as in a process of its own
+    assert isinstance(run_item("a", work, tmp_path / "log", lambda note: None), float)
+    assert (tmp_path / "kept").read_text() == "2.5"
 
 
 def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:

@@ -153,3 +153,24 @@ def test_nothing_is_written_over_or_left_half_done(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="there is no such file"):
         write_robot("other", Path("other"), [Path("nothing.csv")])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cart"]
+
+
+def test_units_of_the_logs_are_those_of_the_task(tmp_path: Path) -> None:
+    write_robot("arm", Path("arm"), [arm(tmp_path / "log.csv")])
+    task = task_named("arm/arm.py:TASK")
+    assert task.action.names == ("q1", "q2", "q3")
+    assert task.state.astra is not None and [*task.state.astra["unit"]] == ["rad"] * 3
+    assert task.action.astra is not None and [*task.action.astra["unit"]] == ["rad/s"] * 3
+
+
+def test_a_hole_in_the_logs_is_marked_and_imported(tmp_path: Path) -> None:
+    log = arm(tmp_path / "log.csv")
+    lines = log.read_text().splitlines()
+    cells = lines[20].split(",")
+    lines[20] = ",".join([*cells[:3], "nan", *cells[4:]])
+    log.write_text("\n".join(lines) + "\n")
+    shown = CliRunner().invoke(app, ["new", "arm", "--from", str(log)])
+    assert "q2_deg has no number in 1 rows, which are left out: logs.toml says how (CHECK)" in shown.output
+    assert 'not_finite = "split"  # CHECK' in Path("arm/logs.toml").read_text()
+    command("import log.csv --mapping arm/logs.toml --out imported")
+    assert len(Dataset.open("imported")) == 3  # two trials, one of them in two

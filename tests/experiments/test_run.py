@@ -84,6 +84,16 @@ def test_trainings_in_the_target_get_their_share_of_the_cores_and_one_table(
     assert "num_threads" not in asked(folder / "train/direct_transfer/seed_0")
 
 
+@pytest.mark.parametrize(("until", "calls"), [("pair", 0), ("ground", 1), (None, 1)])
+def test_every_run_that_grounds_writes_the_page_of_errors(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: str | None, calls: int
+) -> None:
+    told: list[object] = []
+    monkeypatch.setattr("astra_data.experiments.run.write_errors", lambda *given: told.append(given))
+    run(recipe, root=tmp_path, jobs=1, until=until)
+    assert len(told) == calls
+
+
 def test_a_stage_may_make_what_its_own_items_read(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text('task = "maze"\nmethods = ["fine_tuned"]\nseeds = [0]\n')
     run(recipe, root=tmp_path, until="pair")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.own_code import code_digest, file_of, is_own_code, own_object
+from astra_data.worlds.own_code import code_digest, explained, file_of, is_own_code, own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -97,3 +97,12 @@ def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> 
     (tmp_path / "wheel.py").write_text("import cart\nR = 2\n")
     assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
     assert code_digest("antmaze-umaze") is code_digest("some.module:TASK") is None
+
+
+def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) -> None:
+    file = tmp_path / "wheel.py"
+    file.write_text("import numpy as np\n\n\ndef roll():\n    return np.zeros(3).reshape(2, 2)\n")
+    roll = own_object(f"{file}:roll")
+    told = r"^rolling fails with ValueError: .* \(wheel.py, line 5\)$"
+    with pytest.raises(BadInputError, match=told), explained("rolling"):
+        roll()

@@ -133,6 +133,10 @@ WRONG: list[tuple[Task, str]] = [
         "reset of the robot: expected a finite state of 2 numbers, got [0.0, 0.0, 0.0]",
     ),
     (
+        replace(abstraction(lambda state: state[..., :1] * np.nan), robot=None),
+        "abstraction (φ) of states (3, 2): expected finite numbers, got nan",
+    ),
+    (
         replace(abstraction(lambda state: state), robot=None),
         "abstraction (φ) of states (3, 2): expected a ndarray of shape (3, 1), got a ndarray of (3, 2)",
     ),
