@@ -27,7 +27,8 @@ SeedOrSeeds = Annotated[
     ),
 ]
 Behavior = Annotated[
-    str | None, typer.Option(help="random, policy, suboptimal_ppo or suboptimal_sac.", show_default="random")
+    str | None,
+    typer.Option(help="random, stress, policy, suboptimal_ppo or suboptimal_sac.", show_default="random"),
 ]
 Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
 MaxSteps = Annotated[int | None, typer.Option(help="Longest episode, in steps.", show_default="500")]

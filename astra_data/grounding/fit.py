@@ -14,6 +14,7 @@ from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.diagnostics import telemetry
+from astra_data.grounding.failures import compared_foresight, fit_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -59,6 +60,9 @@ class GroundConfig(DescentConfig):
     failure_weight: Positive = 1.0
     """Weight of the failures in the loss of the reward. With 1, predicting the average of the failures costs
     as much as predicting the average of all other steps."""
+    failure_members: Number = Field(default=0, exclude_if=lambda members: not members)
+    """Networks of a failure model, which foresees failures from how the last second went, and replaces what
+    R_pred and the topple head say of them; 0 for none. Without effect where no episode fails."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes that are held out, to measure and to fit the scatter around the correction,
     unless the dataset holds some out itself."""
@@ -155,7 +159,11 @@ class HistoryFit:
         model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
         metrics = _optimise(model, self.weights(config), fitting)
         _fit_scatter(model, fitting.held_out)
-        return HistoryGrounding(model), metrics
+        if not config.failure_members:
+            return HistoryGrounding(model), metrics
+        failures = fit_failures(fitting.task, training, config.failure_members, fitting.seed)
+        metrics["failures"] = compared_foresight(model, failures, fitting.held_out, self.reward)
+        return HistoryGrounding(model, failures), metrics
 
 
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:

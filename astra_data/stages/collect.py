@@ -36,7 +36,7 @@ from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.behaviors import Behavior, PolicyBehavior, RandomCommands, WallWatch
+from astra_data.training.behaviors import Behavior, PolicyBehavior, RandomCommands, StressCommands, WallWatch
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.worlds.batched import TargetEnv
 from astra_data.worlds.registry import task_named
@@ -52,10 +52,10 @@ MOST_STEPS = 10**10
 class CollectConfig(Config):
     """What to collect; the paper uses 200 episodes of random behaviour of up to 500 steps."""
 
-    behavior: Literal["random", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
-    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "policy": a saved policy;
-    "suboptimal_ppo" and "suboptimal_sac": one trained in the target and stopped early. Policies draw actions
-    as in training."""
+    behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
+    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": at the bounds, often
+    reversed, to see failures. "policy": a saved policy; "suboptimal_ppo" and "suboptimal_sac": one trained in
+    the target and stopped early. Policies draw actions as in training."""
     episodes: Count = 200
     """Episodes in all."""
     max_steps: Count = 500
@@ -182,10 +182,10 @@ def _behavior(
     progress: Progress,
 ) -> tuple[Behavior, dict[str, Any]]:
     """Return the behaviour and its metadata; a policy trained for it is stored in the dataset."""
-    if config.behavior == "random":
+    if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
         watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
-        return RandomCommands(task.objective.action_size, (fewest, most), watch), {}
+        return commands(task.objective.action_size, (fewest, most), watch), {}
     if config.behavior.startswith("suboptimal"):
         from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - TorchRL is slow to import
 

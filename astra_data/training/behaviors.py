@@ -70,9 +70,8 @@ class RandomCommands:
         if self._watch is not None:
             over |= self._watch.clearance(state, self._command[:, None])[:, 0] < self._watch.clearance_m
         due = np.flatnonzero(over)
-        fewest, most = self._hold_steps
         self._command[due] = self._drawn(state, due)
-        self._left[due] = self._rng.integers(fewest, most + 1, len(due))
+        self._left[due] = self._times(len(due))
         self._left -= 1
         return torch.from_numpy(self._command).float()
 
@@ -82,10 +81,38 @@ class RandomCommands:
         With a watch, take the first of 16 that stays clear of walls, or else the clearest.
         """
         if self._watch is None:
-            return self._rng.uniform(-1.0, 1.0, (len(due), self._size))
-        choices = self._rng.uniform(-1.0, 1.0, (len(due), _CHOICES, self._size))
+            return self._proposed(due, 1)[:, 0]
+        choices = self._proposed(due, _CHOICES)
         clearance = self._watch.clearance(state[due], choices).clip(max=self._watch.clearance_m)
         return np.asarray(choices[np.arange(len(due)), clearance.argmax(axis=1)])
+
+    def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
+        """Draw `choices` commands (n, K, A) for each of the robots `due` (n,)."""
+        return self._rng.uniform(-1.0, 1.0, (len(due), choices, self._size))
+
+    def _times(self, count: int) -> NDArray[np.int64]:
+        """Draw for how many steps `count` commands are held, (count,)."""
+        fewest, most = self._hold_steps
+        return self._rng.integers(fewest, most + 1, count)
+
+
+class StressCommands(RandomCommands):
+    """Commands that seek failures: at the bounds, half of them the reverse of the one before.
+
+    Times of holding are log-uniform, so that short and long ones are alike frequent.
+    """
+
+    def _proposed(self, due: NDArray[np.intp], choices: int) -> NDArray[np.float64]:
+        drawn = super()._proposed(due, choices)
+        drawn /= np.abs(drawn).max(axis=-1, keepdims=True)
+        before = self._command[due, None]
+        is_reversed = (self._rng.random((len(due), choices, 1)) < 0.5) & before.any(axis=-1, keepdims=True)
+        return np.where(is_reversed, -before, drawn)
+
+    def _times(self, count: int) -> NDArray[np.int64]:
+        fewest, most = self._hold_steps
+        drawn = np.exp(self._rng.uniform(np.log(fewest), np.log(most + 1), count))
+        return drawn.astype(np.int64).clip(fewest, most)
 
 
 class PolicyBehavior:

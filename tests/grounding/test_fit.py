@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -120,3 +121,23 @@ def test_a_methods_weights_are_zero_where_it_predicts_nothing() -> None:
         for reward in (False, True):
             weights = HistoryFit(latent=latent, reward=reward).weights(config)
             assert (weights.latent, weights.reward, weights.state) == (0.3 * latent, 2.0 * reward, 1.0)
+
+
+def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: Path) -> None:
+    config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8)
+    training, held_out = episodes(0), episodes(1, 3)
+    soon = torch.zeros_like(training.windows.mask)
+    soon[0, -4:] = 1
+    windows = replace(training.windows, topples_soon=soon, mask=torch.ones_like(soon))
+    training = replace(training, windows=windows)
+    for members in (0, 2):
+        folder = tmp_path / f"{members}"
+        folder.mkdir()
+        asked = config.model_copy(update={"failure_members": members})
+        given = Fitting(TASKS["antmaze-umaze"], asked, None, training, held_out, 0, "cpu", folder, silent)
+        grounding, metrics = HistoryFit(latent=True, reward=True)(given)
+        assert (grounding.failures is None) == (members == 0)
+        assert ("failures" in metrics) == (members == 2)
+    assert grounding.failures is not None and len(grounding.failures.members) == 2
+    assert {"topple_head", "failure_model"} <= metrics["failures"].keys()
+    assert "failure_members" not in config.model_dump() and asked.model_dump()["failure_members"] == 2

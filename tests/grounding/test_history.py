@@ -1,8 +1,11 @@
+import json
+
 import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
+from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
@@ -197,3 +200,80 @@ def test_scatter_is_the_models_own() -> None:
     assert isinstance(one, GroundedSimulator)
     assert (one.model, one.latent_size, one.latent.shape) == (used, 8, (2, 8))
     assert one.scatter is not None
+
+
+def failure_model() -> FailureModel:
+    torch.manual_seed(3)
+    return FailureModel(FailureShape(4, 2, 0.05, members=2)).requires_grad_(False).eval()
+
+
+def foreseeing(used: GroundingModel, failures: FailureModel) -> GroundedSimulator:
+    one = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), used, failures=failures)
+    one.start(HERE.expand(3, 4), ROWS, GOAL)
+    return one
+
+
+def test_a_failure_model_is_asked_before_each_correction_and_replaces_the_other_heads() -> None:
+    used, failures, raw = model(), failure_model(), PointMass(U_MAZE, 3, timestep_s=0.05)
+    used.failure_cost.fill_(-10.0)
+    one, plain = foreseeing(used, failures), simulator(used)
+    memory = failures.initial_memory(one.state, torch.zeros(3, 2))
+    for action in actions(5):
+        raw.reset_to(one.state)
+        said, memory = failures.step(one.state, action, raw.step(action), memory)
+        latent = one.latent
+        torch.testing.assert_close(one.step(action), plain.step(action))
+        torch.testing.assert_close(one.topple_risk(), failures.hazard(said))
+        going_on, _ = used.predict_reward_parts(latent, action).unbind(-1)
+        expected = going_on - 10.0 * failures.hazard(said)
+        torch.testing.assert_close(one.predicted_reward(torch.zeros(3)), expected)
+    assert not torch.allclose(one.topple_risk(), plain.topple_risk())
+
+
+def test_a_failure_models_memory_is_kept_forgotten_at_a_start_and_taken_from_histories() -> None:
+    used, failures = model(), failure_model()
+    one, played = foreseeing(used, failures), actions(6)
+    states, landed, raw = [one.state], [], PointMass(U_MAZE, 3, timestep_s=0.05)
+    for action in played[:4]:
+        raw.reset_to(one.state)
+        landed.append(raw.step(action))
+        states.append(one.step(action))
+    saved = {name: values.clone() for name, values in one.state_dict().items()}
+    one.step(played[4])
+    wanted = one.topple_risk()
+    resumed = foreseeing(used, failures)
+    resumed.load_state_dict(saved)
+    resumed.step(played[4])
+    torch.testing.assert_close(resumed.topple_risk(), wanted)
+
+    episodes = toy_episodes(
+        torch.stack([*states[:-1], states[-1]], dim=1),
+        torch.stack([*played[:4], played[4]], dim=1),
+        next_state=torch.stack([*states[1:], states[-1]], dim=1),
+        simulated_next=torch.stack([*landed, landed[-1]], dim=1),
+        goal=GOAL[:, None].expand(3, 5, 2),
+    )
+    grounding = HistoryGrounding(used, failures)
+    hidden = grounding.hidden_before(episodes.windows)[:, 4]
+    middle = grounding.corrected(PointMass(U_MAZE, 3, timestep_s=0.05), None)
+    middle.start(states[-1], ROWS, GOAL, hidden=hidden, previous_action=played[3])
+    middle.step(played[4])
+    torch.testing.assert_close(middle.topple_risk(), wanted)
+
+    one.start(HERE.expand(3, 4), ROWS, GOAL)
+    one.step(played[0])
+    fresh = foreseeing(used, failures)
+    fresh.step(played[0])
+    torch.testing.assert_close(one.topple_risk(), fresh.topple_risk())
+
+
+def test_a_failure_model_is_saved_with_its_grounding() -> None:
+    made = HistoryGrounding(model(), failure_model())
+    tensors, metadata = made.to_file()
+    read = HistoryGrounding.from_file(dict(tensors), json.loads(json.dumps(metadata)), "cpu")
+    assert read.failures is not None and read.failures.shape == failure_model().shape
+    assert all(
+        torch.equal(read.failures.state_dict()[name], one)
+        for name, one in failure_model().state_dict().items()
+    )
+    assert "failures" not in HistoryGrounding(model()).to_file()[1]

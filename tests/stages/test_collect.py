@@ -76,6 +76,16 @@ def test_commands_are_held_for_a_while(collected: Path) -> None:
         assert (held <= most).all()
 
 
+def test_stress_is_recorded_with_its_reversals(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"behavior": "stress", "hold_s": (0.05, 0.05)})
+    collect(task, config, seed=0, out=tmp_path / "stress", progress=silent)
+    dataset = Dataset.open(tmp_path / "stress")
+    assert dataset.description["config"]["behavior"] == "stress"
+    commands = [episode.columns[ACTION] for episode in dataset.episodes([ACTION])]
+    assert all(np.abs(each).max(axis=1) == pytest.approx(1.0) for each in commands)
+    assert any((each[1:] == -each[:-1]).all(axis=1).any() for each in commands)
+
+
 def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path: Path) -> None:
     hashes, contents = [], []
     for number, (seed, threads) in enumerate([(1, 1), (1, 2), (2, 2)]):

@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.training.behaviors import RandomCommands, WallWatch
+from astra_data.training.behaviors import RandomCommands, StressCommands, WallWatch
 from astra_data.worlds.registry import task_named
 
 TASK = task_named("nao-navigation")
@@ -71,3 +71,37 @@ def test_each_axis_of_a_command_is_drawn_by_itself() -> None:
     correlation = torch.corrcoef(command.T) - torch.eye(4)
     assert float(correlation.abs().max()) < 0.2
     assert 0.5 < float(command.std()) < 0.65
+
+
+def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
+    """Return the commands (steps, B, A) of a behaviour that was started."""
+    return torch.stack([behavior.act(torch.zeros(200, 47), torch.zeros(200, 0)) for _ in range(steps)])
+
+
+def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_before() -> None:
+    behavior = StressCommands(3, (1, 1))
+    behavior.start(200, seed=0)
+    commands = commands_of(behavior, 20)
+    assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200))
+    assert (commands[0] != 0).all()
+    is_reversed = (commands[1:] == -commands[:-1]).all(-1)
+    assert 0.45 < float(is_reversed.float().mean()) < 0.55
+    new = commands[1:][~is_reversed]
+    assert float(new.mean(0).abs().max()) < 0.1
+    assert float((new.abs() == 1).float().mean()) == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_short_and_long_times_of_stress_are_alike_frequent() -> None:
+    behavior = StressCommands(2, (2, 31))
+    behavior.start(200, seed=0)
+    times = behavior._times(20_000)
+    assert times.min() == 2
+    assert times.max() == 31
+    # Log-uniform on [2, 32): each doubling has a fourth of the draws.
+    for shortest in (2, 4, 8, 16):
+        share = np.mean((times >= shortest) & (times < 2 * shortest))
+        assert share == pytest.approx(0.25, abs=0.02)
+
+
+def test_stress_keeps_clear_of_walls_where_they_are_watched() -> None:
+    assert nearest(StressCommands(2, HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6

@@ -164,9 +164,18 @@ class GroundingModel(nn.Module):
         low, high = self.shape.log_variance_bounds
         return mean, low + (high - low) * torch.sigmoid(raw)
 
-    def target_reward(self, latent: Tensor, action: Tensor, own: Tensor) -> Tensor:
-        """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states."""
-        predicted = self.predict_reward(latent, action)
+    def target_reward(
+        self, latent: Tensor, action: Tensor, own: Tensor, hazard: Tensor | None = None
+    ) -> Tensor:
+        """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states.
+
+        A `hazard` (...), the probability that the step fails by a failure model, replaces R_pred's own.
+        """
+        if hazard is None:
+            predicted = self.predict_reward(latent, action)
+        else:
+            going_on, _ = self.predict_reward_parts(latent, action).unbind(-1)
+            predicted = going_on + hazard * self.failure_cost
         return predicted + own if self.shape.corrects_reward else predicted
 
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:

@@ -1,0 +1,121 @@
+"""Fit the failure model, and measure how well failures are foreseen."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import mannwhitneyu
+from torch import Tensor
+from torch.nn import functional
+
+from astra_data.core.seeding import derive
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.descent import Descent, DescentConfig
+from astra_data.learning.networks.failure import FailureModel, FailureShape
+from astra_data.learning.networks.grounding import GroundingModel
+from astra_data.learning.networks.paired_windows import RISK_STEPS
+from astra_data.worlds.task import Task
+
+AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
+"""Windows before a failure, in steps, in which it is to be foreseen."""
+_BATCH = 1024
+_FAILING_SHARE = 0.25
+"""Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
+_WEIGHT_DECAY = 0.01
+_DESCENT = DescentConfig(updates=300, learning_rate=3e-3)
+_BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Edges of the probabilities in a reliability diagram."""
+
+
+def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) -> FailureModel | None:
+    """Fit a failure model of `members` networks to whole episodes; None where none of them fails."""
+    windows = training.windows
+    mask = windows.mask.bool()
+    if not windows.topples_soon.any():
+        return None
+    maze, device = task.objective.layout, windows.mask.device
+    torch.manual_seed(derive(seed, "failure model"))
+    shape = FailureShape(
+        state_size=windows.state.shape[-1],
+        action_size=windows.action.shape[-1],
+        timestep_s=task.timestep_s,
+        maze_cells=(len(maze.fine_walls), len(maze.fine_walls[0])) if maze else (0, 0),
+        cell_m=maze.fine_m if maze else 1.0,
+        members=members,
+    )
+    model = FailureModel(shape).to(device)
+    if maze is not None:
+        model.clearance.copy_(torch.from_numpy(maze.clearance_field))
+        model.half_extent.copy_(torch.from_numpy(maze.half_extent))
+    model.set_scales(windows)
+    inputs, fails = model.histories(windows)[0][mask], windows.topples_soon[mask]
+    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
+    descent = Descent(model, _DESCENT, weight_decay=_WEIGHT_DECAY)
+    few = round(_BATCH * _FAILING_SHARE)
+    while not descent.is_over:
+        rows = torch.cat([_drawn(failing, few), _drawn(going_on, _BATCH - few)])
+        odds = model.log_odds(inputs[rows])
+        descent.update(functional.binary_cross_entropy_with_logits(odds, fails[rows].expand_as(odds)))
+    rate = fails.mean()
+    model.log_odds_shift.copy_(rate.logit() - torch.tensor(_FAILING_SHARE).logit())
+    return model.requires_grad_(False).eval()
+
+
+def _drawn(rows: Tensor, count: int) -> Tensor:
+    return rows[torch.randint(len(rows), (count,), device=rows.device)]
+
+
+@torch.no_grad()
+def compared_foresight(
+    grounding: GroundingModel, failures: FailureModel | None, held_out: PairedEpisodes, predicts_reward: bool
+) -> dict[str, Any]:
+    """Return the `foresight` of the failure model, and of what it replaces, on held-out episodes."""
+    windows = held_out.windows
+    latent, _ = grounding.encode(windows)
+    compared = {"topple_head": grounding.topple_logit(latent, windows.action, windows.next_state).sigmoid()}
+    if predicts_reward and grounding.failure_cost < 0:
+        parts = grounding.predict_reward_parts(latent, windows.action)
+        compared["predicted_reward"] = (parts[..., 1] / grounding.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
+    if failures is not None:
+        compared["failure_model"] = failures.probability(failures.histories(windows)[0])
+    return {name: foresight(probability, held_out) for name, probability in compared.items()}
+
+
+def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
+    """Measure probabilities (E, T) of a failure within `RISK_STEPS` on episodes that were not fitted.
+
+    Returns:
+        "failures": of the episodes. "auc": by window before the failure, the probability that a step there
+        is ranked above one with no failure within 40 steps. "brier_skill": the share of the squared error of
+        always saying the rate that is removed; "reliability": predicted and observed rate, and number of
+        steps, by predicted probability. All but the first None without failures.
+    """
+    windows = episodes.windows
+    mask = windows.mask.bool()
+    fails = windows.topples_soon.bool() & mask
+    count = int(fails.any(1).sum())
+    if not count:
+        return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
+    left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), mask.shape[1] + 1)
+    safe = probability[mask & (left > AHEAD_STEPS[-1][1])].numpy(force=True)
+    auc = {}
+    for first, last in AHEAD_STEPS:
+        before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
+        ranked = mannwhitneyu(before, safe).statistic / (len(before) * len(safe))
+        auc[f"{first}-{last}"] = float(ranked)
+    predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)
+    usual = np.square(happened - happened.mean()).mean()
+    bins = np.digitize(predicted, _BINS[1:-1])
+    return {
+        "failures": count,
+        "auc": auc,
+        "brier_skill": float(1 - np.square(predicted - happened).mean() / usual),
+        "reliability": [
+            [
+                float(predicted[bins == one].mean()),
+                float(happened[bins == one].mean()),
+                int((bins == one).sum()),
+            ]
+            for one in np.unique(bins)
+        ],
+    }

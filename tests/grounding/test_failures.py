@@ -1,0 +1,91 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from toy_episodes import toy_episodes
+
+from astra_data.grounding.failures import fit_failures, foresight
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.paired_windows import RISK_STEPS
+from astra_data.worlds.registry import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+
+
+def lagging(episodes: int, seed: int) -> PairedEpisodes:
+    """Half of the robots lag behind their simulator from a random step on, and fail 30 steps later."""
+    rng = np.random.default_rng(seed)
+    state, missed = torch.zeros(episodes, 101, 4), 0.01 * torch.randn(episodes, 100, 4)
+    mask = torch.ones(episodes, 100)
+    soon = torch.zeros(episodes, 100)
+    for episode in range(0, episodes, 2):
+        begun = int(rng.integers(20, 70))
+        missed[episode, begun:] += 0.2
+        mask[episode, begun + 30 :] = 0
+        soon[episode, begun + 30 - RISK_STEPS : begun + 30] = 1
+    state[:, 1:] = 0.05 * torch.randn(episodes, 100, 4).cumsum(1)
+    action = 2 * torch.rand(episodes, 100, 2) - 1
+    made = toy_episodes(
+        state[:, :-1], action, next_state=state[:, 1:], simulated_next=state[:, 1:] - missed, mask=mask
+    )
+    return replace(made, windows=replace(made.windows, topples_soon=soon))
+
+
+def test_failures_of_other_episodes_are_foreseen_at_their_rate() -> None:
+    training, fresh = lagging(40, 0), lagging(40, 1)
+    model = fit_failures(TASK, training, 3, seed=0)
+    assert model is not None and len(model.members) == 3
+    found = foresight(model.probability(model.histories(fresh.windows)[0]), fresh)
+    assert found["failures"] == 20
+    assert found["auc"]["1-20"] > 0.95
+    assert found["brier_skill"] > 0.5
+    said = model.probability(model.histories(fresh.windows)[0])[fresh.windows.mask.bool()]
+    rate = fresh.steps(fresh.windows.topples_soon)
+    assert float(said.mean()) == pytest.approx(float(rate.mean()), rel=0.3)
+    again = fit_failures(TASK, training, 3, seed=0)
+    assert again is not None
+    assert all(
+        torch.equal(one, other) for one, other in zip(model.parameters(), again.parameters(), strict=True)
+    )
+
+
+def test_nothing_is_fitted_where_nothing_fails() -> None:
+    episodes = lagging(4, 0)
+    calm = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.zeros(4, 100)))
+    assert fit_failures(TASK, calm, 3, seed=0) is None
+
+
+def steps_left(episodes: PairedEpisodes) -> Tensor:
+    return episodes.windows.mask.flip(1).cumsum(1).flip(1)
+
+
+def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
+    """One episode fails after 60 steps: what is said is right 11 to 30 steps ahead alone."""
+    episodes = lagging(2, 0)
+    mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
+    mask[0, 60:], soon[0, 60 - RISK_STEPS : 60] = 0, 1
+    episodes = replace(episodes, windows=replace(episodes.windows, mask=mask, topples_soon=soon))
+    left = steps_left(episodes)
+    said = torch.where((left >= 11) & (left <= 30) & (torch.arange(2) == 0)[:, None], 0.9, 0.1)
+    auc = foresight(said, episodes)["auc"]
+    # Ten of the twenty steps of the neighbouring windows are above all calm ones, ten level with them.
+    assert auc == {"1-20": pytest.approx(0.75), "11-30": 1.0, "21-40": pytest.approx(0.75)}
+
+
+def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
+    episodes = lagging(20, 0)
+    mask = episodes.windows.mask.bool()
+    rate = float(episodes.windows.topples_soon[mask].mean())
+    found = foresight(torch.full(mask.shape, rate), episodes)
+    assert found["brier_skill"] == pytest.approx(0.0, abs=1e-6)
+    assert found["auc"] == {"1-20": 0.5, "11-30": 0.5, "21-40": 0.5}
+    assert found["reliability"] == [[pytest.approx(rate), pytest.approx(rate), int(mask.sum())]]
+
+
+def test_episodes_without_a_failure_tell_nothing() -> None:
+    episodes = lagging(2, 0)
+    calm = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.zeros(2, 100)))
+    nothing = {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
+    assert foresight(torch.rand(2, 100), calm) == nothing
