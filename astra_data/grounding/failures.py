@@ -21,8 +21,8 @@ AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
 _BATCH = 1024
 _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
-_WEIGHT_DECAY = 0.01
-_DESCENT = DescentConfig(updates=300, learning_rate=3e-3)
+_WEIGHT_DECAY = 1.0
+_DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
 _BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
 

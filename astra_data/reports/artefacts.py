@@ -124,12 +124,26 @@ class CurveFile(Artefact):
     """Of a training that may be done again: what each try reached; the points are those of the one kept."""
 
 
+class Foresight(BaseModel):
+    """How well failures are foreseen on held-out episodes."""
+
+    model_config = ConfigDict(frozen=True)
+
+    failures: int
+    auc: dict[str, float] | None = None
+    brier_skill: float | None = None
+    reliability: list[tuple[float, float, int]] | None = None
+    """Predicted and observed rate, and number of steps, by predicted probability."""
+
+
 class Metrics(Artefact):
     """metrics.json of one row and seed's grounding or alignment."""
 
     windows_per_second: float | None = None
     episodes_per_second: float | None = None
     replays_per_second: float | None = None
+    failures: dict[str, Foresight] = Field(default_factory=dict)
+    """By what foresees them; empty without a failure model."""
 
 
 class Band(BaseModel):

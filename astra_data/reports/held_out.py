@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 
 from astra_data.core.durable import write_file
 from astra_data.core.naming import place
 from astra_data.methods import method_title
-from astra_data.reports.artefacts import Gap, read_json
+from astra_data.reports.artefacts import Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill
 from astra_data.reports.schema import BandMeans, GapMeans
@@ -14,6 +15,8 @@ from astra_data.reports.schema import BandMeans, GapMeans
 PAGE = "gap.md"
 JUDGED_AT = 10
 """Steps ahead, if the episodes are as long: the horizon at which sizes are compared."""
+_SURE = 0.1
+"""Probability of a failure soon above which predictions are compared with what happened."""
 
 
 def write_held_out(
@@ -58,6 +61,7 @@ def write_held_out(
         head=[*(["size"] if percents else []), "simulator"],
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
+        foresight=_foresight(root, groundings, seeds, percents),
         enough=[
             enough(method_title(method), name, sizes, horizons)
             for method, sizes in found.items()
@@ -67,6 +71,33 @@ def write_held_out(
     )
     write_file(root / PAGE, page)
     return root / PAGE
+
+
+def _foresight(
+    root: Path, groundings: Sequence[str], seeds: Sequence[int], percents: Sequence[int]
+) -> list[list[str]]:
+    """Return a line for each size, grounding and part of it that foresees failures, with means over seeds."""
+    lines = []
+    for percent in sorted(percents) or (None,):
+        for method in groundings:
+            files = [root / "ground" / method / place(seed, percent) / "metrics.json" for seed in seeds]
+            measured = [read_json(Metrics, file).failures for file in files if file.is_file()]
+            for part in dict.fromkeys(name for one in measured for name in one):
+                found = [one[part] for one in measured if part in one and one[part].auc]
+                if found:
+                    title = f"{method_title(method)}: {part.replace('_', ' ')}"
+                    lines.append([*([f"{percent} %"] if percents else []), title, *_foresight_cells(found)])
+    return lines
+
+
+def _foresight_cells(found: Sequence[Foresight]) -> list[str]:
+    aucs = [fmean(one.auc[window] for one in found if one.auc) for window in found[0].auc or ()]
+    skill = fmean(one.brier_skill or 0.0 for one in found)
+    sure = [row for one in found for row in one.reliability or () if row[0] > _SURE]
+    steps = sum(count for *_, count in sure)
+    means = [sum(row[index] * row[2] for row in sure) / steps for index in (0, 1)] if steps else []
+    happens = f"{means[1]:.2f} of {means[0]:.2f}" if means else "-"
+    return [f"{sum(one.failures for one in found)}", *(f"{auc:.2f}" for auc in aucs), f"{skill:.2f}", happens]
 
 
 def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], horizons: Sequence[int]) -> str:

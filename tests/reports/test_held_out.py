@@ -49,3 +49,28 @@ def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Pat
     (tmp_path / "ground/nas/percent_025/seed_0/gap.json").write_text("{}")
     with pytest.raises(BadInputError, match="is not what its stage writes"):
         write_held_out("r", tmp_path, ("nas",), (0,), (25,), timestep_s=0.1)
+
+
+def write_foresight(root: Path, seed: int, auc: float) -> None:
+    reliability = [[0.01, 0.01, 900], [0.2, 0.1 * auc, 60], [0.6, 0.5 * auc, 20]]
+    windows = {"1-20": auc, "11-30": auc - 0.1, "21-40": auc - 0.2}
+    of = {"failures": 3, "auc": windows, "brier_skill": auc - 0.7, "reliability": reliability}
+    none = {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
+    file = root / f"ground/nas/percent_100/seed_{seed}/metrics.json"
+    file.write_text(json.dumps({"failures": {"failure_model": of, "topple_head": none}}))
+
+
+def test_how_well_failures_are_foreseen_is_told_where_it_was_measured(tmp_path: Path) -> None:
+    for seed in (0, 1, 2):
+        write(tmp_path, 100, seed, 0.1)
+    given = ("r", tmp_path, ("nas",), (0, 1, 2, 3), (100,))
+    page = write_held_out(*given, timestep_s=0.05)
+    assert page is not None and "Failures foreseen" not in page.read_text()
+    for seed, auc in ((0, 0.8), (1, 0.9)):
+        write_foresight(tmp_path, seed, auc)
+    write_held_out(*given, timestep_s=0.05)
+    lines = [
+        line for line in page.read_text().splitlines() if "failure model" in line or "topple head" in line
+    ]
+    # Above 0.1, each seed has 60 steps at 0.2 and 20 at 0.6: 0.3 in the mean; 0.085 and 0.425 of them fail.
+    assert lines == ["| 100 % | NAS: failure model | 6 | 0.85 | 0.75 | 0.65 | 0.15 | 0.17 of 0.30 |"]
