@@ -129,7 +129,7 @@ class Cutter:
         episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
         self._pieces = []
         ended_before, self._ended = self._ended, TERMINATED in episode and bool(episode[TERMINATED][-1])
-        if ended_before and self._ended and len(episode[TERMINATED]) == 1:
+        if ended_before and self._ended and len(episode[TERMINATED]) == 1 and NEXT_STATE not in episode:
             self.tally.rows_after_end += 1
             return
         if STATE in episode and NEXT_STATE not in episode:

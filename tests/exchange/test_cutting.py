@@ -129,6 +129,14 @@ def test_a_log_that_goes_on_after_the_end_makes_no_episodes_of_it(block_rows: in
     assert cutting.tally.rows_after_end == 3
 
 
+def test_episodes_of_one_step_with_a_next_state_are_kept() -> None:
+    columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (NEXT_STATE, "y"), (ACTION, "a"))}
+    cutting = cutter(columns=columns | {TERMINATED: {"fields": ("over",)}}, min_steps=1)
+    episodes = cut(cutting, x=np.arange(4.0), y=np.arange(4.0) + 1, over=[0, 1, 1, 1])
+    assert rows(episodes) == [[0, 1], [2], [3]]
+    assert cutting.tally.rows_after_end == 0
+
+
 @BLOCKS
 def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
     cutting = cutter(time="t", split={"gap_s": 0.5})

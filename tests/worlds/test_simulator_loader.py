@@ -69,7 +69,7 @@ def test_abstract_states_are_stored_as_float32_under_their_own_name(tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("1 / 0", r"importing .*sim.py fails with ZeroDivisionError: division by zero; ASTRA_DATA_DEBUG=1"),
+        ("1 / 0", r"importing .*sim.py fails with ZeroDivisionError: division by zero \(sim.py, line 1\)$"),
         ("class Other: pass", r"sim.py has no 'Mine'; it has Other$"),
         (
             "class Mine: pass",
@@ -114,7 +114,7 @@ def test_a_map_to_another_shape_is_refused() -> None:
 
 def test_errors_of_the_users_code_keep_their_cause() -> None:
     with (
-        pytest.raises(BadInputError, match=r"^the wheel fails with ValueError: flat; ") as caught,
+        pytest.raises(BadInputError, match=r"^the wheel fails with ValueError: flat \(test_simu") as caught,
         explained("the wheel"),
     ):
         raise ValueError("flat")
