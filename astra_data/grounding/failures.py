@@ -28,10 +28,16 @@ _BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) -> FailureModel | None:
-    """Fit a failure model of `members` networks to whole episodes; None where none of them fails."""
+    """Fit a failure model of `members` networks to whole episodes.
+
+    Returns:
+        None where no step is before a failure, or every one.
+    """
     windows = training.windows
     mask = windows.mask.bool()
-    if not windows.topples_soon.any():
+    fails = windows.topples_soon[mask]
+    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
+    if not len(failing) or not len(going_on):
         return None
     maze, device = task.objective.layout, windows.mask.device
     torch.manual_seed(derive(seed, "failure model"))
@@ -48,8 +54,7 @@ def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) 
         model.clearance.copy_(torch.from_numpy(maze.clearance_field))
         model.half_extent.copy_(torch.from_numpy(maze.half_extent))
     model.set_scales(windows)
-    inputs, fails = model.histories(windows)[0][mask], windows.topples_soon[mask]
-    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
+    inputs = model.histories(windows)[0][mask]
     descent = Descent(model, _DESCENT, weight_decay=_WEIGHT_DECAY)
     few = round(_BATCH * _FAILING_SHARE)
     while not descent.is_over:
@@ -86,9 +91,10 @@ def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
 
     Returns:
         "failures": of the episodes. "auc": by window before the failure, the probability that a step there
-        is ranked above one with no failure within 40 steps. "brier_skill": the share of the squared error of
-        always saying the rate that is removed; "reliability": predicted and observed rate, and number of
-        steps, by predicted probability. All but the first None without failures.
+        is ranked above one with no failure within 40 steps; None where there are no such steps.
+        "brier_skill": the share of the squared error of always saying the rate that is removed, None where
+        there is no such error. "reliability": predicted and observed rate, and number of steps, by predicted
+        probability. All but the first None without failures.
     """
     windows = episodes.windows
     mask = windows.mask.bool()
@@ -98,18 +104,18 @@ def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), mask.shape[1] + 1)
     safe = probability[mask & (left > AHEAD_STEPS[-1][1])].numpy(force=True)
-    auc = {}
+    auc: dict[str, float | None] = {}
     for first, last in AHEAD_STEPS:
         before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
-        ranked = mannwhitneyu(before, safe).statistic / (len(before) * len(safe))
-        auc[f"{first}-{last}"] = float(ranked)
+        pairs = len(before) * len(safe)
+        auc[f"{first}-{last}"] = float(mannwhitneyu(before, safe).statistic / pairs) if pairs else None
     predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)
     usual = np.square(happened - happened.mean()).mean()
     bins = np.digitize(predicted, _BINS[1:-1])
     return {
         "failures": count,
         "auc": auc,
-        "brier_skill": float(1 - np.square(predicted - happened).mean() / usual),
+        "brier_skill": float(1 - np.square(predicted - happened).mean() / usual) if usual else None,
         "reliability": [
             [
                 float(predicted[bins == one].mean()),

@@ -130,7 +130,7 @@ class Foresight(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     failures: int
-    auc: dict[str, float] | None = None
+    auc: dict[str, float | None] | None = None
     brier_skill: float | None = None
     reliability: list[tuple[float, float, int]] | None = None
     """Predicted and observed rate, and number of steps, by predicted probability."""

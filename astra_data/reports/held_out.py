@@ -91,13 +91,18 @@ def _foresight(
 
 
 def _foresight_cells(found: Sequence[Foresight]) -> list[str]:
-    aucs = [fmean(one.auc[window] for one in found if one.auc) for window in found[0].auc or ()]
-    skill = fmean(one.brier_skill or 0.0 for one in found)
+    known = [
+        [value for one in found if one.auc and (value := one.auc[window]) is not None]
+        for window in found[0].auc or ()
+    ]
+    aucs = [f"{fmean(values):.2f}" if values else "-" for values in known]
+    skills = [one.brier_skill for one in found if one.brier_skill is not None]
+    skill = f"{fmean(skills):.2f}" if skills else "-"
     sure = [row for one in found for row in one.reliability or () if row[0] > _SURE]
     steps = sum(count for *_, count in sure)
     means = [sum(row[index] * row[2] for row in sure) / steps for index in (0, 1)] if steps else []
     happens = f"{means[1]:.2f} of {means[0]:.2f}" if means else "-"
-    return [f"{sum(one.failures for one in found)}", *(f"{auc:.2f}" for auc in aucs), f"{skill:.2f}", happens]
+    return [f"{sum(one.failures for one in found)}", *aucs, skill, happens]
 
 
 def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], horizons: Sequence[int]) -> str:

@@ -51,10 +51,11 @@ def test_failures_of_other_episodes_are_foreseen_at_their_rate() -> None:
     )
 
 
-def test_nothing_is_fitted_where_nothing_fails() -> None:
+@pytest.mark.parametrize("soon", [0.0, 1.0])
+def test_nothing_is_fitted_where_nothing_fails_or_everything(soon: float) -> None:
     episodes = lagging(4, 0)
-    calm = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.zeros(4, 100)))
-    assert fit_failures(TASK, calm, 3, seed=0) is None
+    alike = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.full((4, 100), soon)))
+    assert fit_failures(TASK, alike, 3, seed=0) is None
 
 
 def steps_left(episodes: PairedEpisodes) -> Tensor:
@@ -89,3 +90,19 @@ def test_episodes_without_a_failure_tell_nothing() -> None:
     calm = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.zeros(2, 100)))
     nothing = {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     assert foresight(torch.rand(2, 100), calm) == nothing
+
+
+def test_a_window_without_steps_has_no_figure() -> None:
+    """Episodes of 25 steps, of which one fails: none is more than 25 steps before a failure."""
+    episodes = lagging(2, 0)
+    mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
+    mask[0, 25:], soon[0, 5:25] = 0, 1
+    short = replace(episodes, windows=replace(episodes.windows, mask=mask, topples_soon=soon))
+    found = foresight(torch.rand(2, 100), short)["auc"]
+    assert found["1-20"] is not None and found["21-40"] is not None
+    mask[0, 15:], soon[0] = 0, 0
+    soon[0, :15] = 1
+    found = foresight(torch.rand(2, 100), short)["auc"]
+    assert found["1-20"] is not None and found["21-40"] is None
+    soon[1], mask[1, 15:] = 1, 0
+    assert foresight(torch.rand(2, 100), short)["brier_skill"] is None
