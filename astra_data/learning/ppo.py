@@ -54,6 +54,9 @@ class PpoConfig(Config):
     critic_gain: Positive = 1.0
     """Of the critic's last layer at the start. With 1, its values are larger than returns that are small, and
     the first advantages tell of the untrained critic rather than of the rewards."""
+    most_kl: Positive | None = None
+    """Largest KL divergence of a minibatch's policy from the one that collected it, after which an iteration
+    learns no more from its rollout; by default all passes are made."""
     final_std: Positive | None = None
     """Largest deviation of the actions at the end, to which it falls linearly, so that the policy is trained
     as it is tested; by default the policy keeps what it has learned."""
@@ -175,6 +178,8 @@ class Ppo(Learner):
                 learned = ("action", "action_log_prob", "advantage", "value_target")
                 columns = {"features": features} | {name: batch[name] for name in learned}
                 losses = self._loss(TensorDict(columns, batch_size=features.shape[:2]))
+                if config.most_kl is not None and losses["kl_approx"].abs() > config.most_kl:
+                    return
                 total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
                 self._optimizer.zero_grad()
                 total.backward()

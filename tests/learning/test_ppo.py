@@ -255,3 +255,13 @@ def test_the_actions_scatter_may_fall_to_what_is_tested() -> None:
     first = math.exp(-0.5)
     expected = [0.1 + (first - 0.1) * left for left in (1.0, 0.75, 0.5, 0.25)]
     assert [point["std"] for point in train(learner)] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("most_kl", "updates"), [(None, 10), (1e9, 10), (1e-9, 1)])
+def test_an_iteration_ends_once_the_policy_has_moved_too_far(most_kl: float | None, updates: int) -> None:
+    """Before the first update nothing has moved; the second minibatch of the first pass sees that it has."""
+    learner = ppo(GoToZero(8), 3, horizon=7, epochs=5, minibatches=2, most_kl=most_kl)
+    made: list[None] = []
+    learner._optimizer.register_step_post_hook(lambda *_: made.append(None))
+    learner.iterate()
+    assert len(made) == updates
