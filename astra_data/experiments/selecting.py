@@ -91,8 +91,9 @@ def select(
     """Try every trained policy of a run in groundings that were fitted to other episodes; rank them.
 
     A judge is the grounding of another seed of the run, which has episodes of its own. Its states are
-    scattered as the target's are around it, and where it has a failure model, that ends episodes. Writes
-    `select/select.json` and `select/select.md` in the run's folder.
+    scattered as the target's are around it, and where it has a failure model, that ends episodes. Where a
+    recipe has `data`, all seeds share their episodes, and the page says so. Writes `select/select.json` and
+    `select/select.md` in the run's folder.
 
     Args:
         run: the folder of a run whose recipe has two seeds or more.
@@ -124,7 +125,7 @@ def select(
         found.append(Candidate(row, seed, success, _in_target(folder, row, seed)))
         progress((number + 1) / len(points), f"{row}, seed {seed}: {found[-1].predicted:.2f}")
     ranked = sorted(found, key=lambda one: (one.lower, one.predicted), reverse=True)
-    _write(folder, ranked, str(judging), episodes)
+    _write(folder, ranked, str(judging), episodes, shares_episodes=settings.get("data") is not None)
     return ranked
 
 
@@ -203,7 +204,9 @@ def _in_target(folder: Path, row: str, seed: int) -> float | None:
     return None if tested is None else fmean(tested.success)
 
 
-def _write(folder: Path, ranked: Sequence[Candidate], judge: str, episodes: int) -> None:
+def _write(
+    folder: Path, ranked: Sequence[Candidate], judge: str, episodes: int, *, shares_episodes: bool
+) -> None:
     make_folder(folder / FOLDER)
     compared = worth(ranked)
     candidates = [asdict(one) | {"predicted": one.predicted, "lower": one.lower} for one in ranked]
@@ -217,12 +220,18 @@ def _write(folder: Path, ranked: Sequence[Candidate], judge: str, episodes: int)
         ]
         for one in ranked
     ]
+    of = "the same episodes, from other seeds" if shares_episodes else "the episodes of other seeds"
     text = [
         f"# {folder.name}: a choice without the target",
-        f"Success in {episodes} episodes in the groundings of {judge} that were fitted to the episodes of "
-        "other seeds, with the scatter of the target around them. Ranked by the lower quartile over these.",
-        table(head, lines, words=1),
+        f"Success in {episodes} episodes in the groundings of {judge} that were fitted to {of}, with the "
+        "scatter of the target around them. Ranked by the lower quartile over these.",
     ]
+    if shares_episodes:
+        text.append(
+            "All seeds of this run have the same episodes, so no judge is independent of what it judges: an "
+            "error that all groundings share is not seen."
+        )
+    text.append(table(head, lines, words=1))
     if compared is not None:
         correlation = compared["rank_correlation"]
         known = "not known (fewer than three seeds)" if correlation is None else f"{correlation:.2f}"

@@ -164,3 +164,16 @@ def test_what_is_not_there_is_asked_for(folder: Path, given: dict[str, object], 
         select(folder, episodes=5, **given)  # type: ignore[arg-type]
     with pytest.raises(BadInputError, match="expected the folder of a run"):
         select(folder / "nowhere")
+
+
+def test_judges_of_the_same_episodes_are_told(folder: Path) -> None:
+    select(folder, rows=["nas"], episodes=5)
+    page = (folder / "select/select.md").read_text()
+    assert "fitted to the episodes of other seeds" in page and "no judge is independent" not in page
+    recipe = folder / "recipe.json"
+    before = recipe.read_text()
+    recipe.write_text(json.dumps(json.loads(before) | {"data": "logs@data-1.0.0"}))
+    select(folder, rows=["nas"], episodes=5)
+    page = (folder / "select/select.md").read_text()
+    recipe.write_text(before)
+    assert "fitted to the same episodes" in page and "no judge is independent of what it judges" in page
