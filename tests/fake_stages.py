@@ -37,9 +37,10 @@ class FakeConfig(Config):
     learner: str = "ppo"
     limits_commands: bool = False
     disagreement_penalty: float = 0.0
-    keep_head: bool = False
+    keep_member: bool = False
     reward: str | None = None
     correction_heads: int = 1
+    members: int = 0
 
 
 class FakeCollectConfig(FakeConfig):

@@ -161,10 +161,15 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
-    def _has_several_heads(self) -> Self:
-        for key in ("disagreement_penalty", "keep_head"):
-            if (getattr(self.train, key) or getattr(self.plus, key)) and self.ground.correction_heads < 2:
-                raise ValueError(f"{key}: expected ground.correction_heads of 2 or more, got 1")
+    def _has_several_corrections(self) -> Self:
+        ground = self.ground
+        for table in (self.train, self.plus):
+            if table.keep_member and ground.members < 2:
+                raise ValueError(f"keep_member: expected ground.members of 2 or more, got {ground.members}")
+            if table.disagreement_penalty and not table.keep_member and ground.correction_heads < 2:
+                raise ValueError(
+                    "disagreement_penalty: expected ground.correction_heads of 2 or more, or keep_member"
+                )
         return self
 
     @model_validator(mode="after")

@@ -74,15 +74,18 @@ def _drawn(rows: Tensor, count: int) -> Tensor:
 def compared_foresight(
     grounding: GroundingModel, failures: FailureModel | None, held_out: PairedEpisodes, predicts_reward: bool
 ) -> dict[str, Any]:
-    """Return the `foresight` of the failure model, and of what it replaces, on held-out episodes."""
+    """Return the `foresight` on held-out episodes: of R_pred, and of the failure model or the topple head."""
     windows = held_out.windows
     latent, _ = grounding.encode(windows)
-    compared = {"topple_head": grounding.topple_logit(latent, windows.action, windows.next_state).sigmoid()}
+    compared = {}
     if predicts_reward and grounding.failure_cost < 0:
         parts = grounding.predict_reward_parts(latent, windows.action)
         compared["predicted_reward"] = (parts[..., 1] / grounding.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
     if failures is not None:
         compared["failure_model"] = failures.probability(failures.histories(windows)[0])
+    else:
+        logit = grounding.topple_logit(latent, windows.action, windows.next_state)
+        compared["topple_head"] = logit.sigmoid()
     return {name: foresight(probability, held_out) for name, probability in compared.items()}
 
 

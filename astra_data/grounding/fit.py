@@ -1,17 +1,18 @@
 """Fit a grounding: the inputs of a method's fit, and the fit of history models."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
+from torch import Tensor
 
 from astra_data.core.config import AtOnce, Config, Number, Positive, Share
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress
-from astra_data.core.seeding import derive
+from astra_data.core.progress import Progress, part
+from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.failures import compared_foresight, fit_failures
@@ -51,6 +52,9 @@ class GroundConfig(DescentConfig):
     correction_heads: AtOnce = 1
     """Heads that correct the state. Each learns from its own random half of every batch; their mean is the
     correction, and `disagreement_penalty` keeps policies away from where they disagree."""
+    members: Number = Field(default=0, exclude_if=lambda members: not members)
+    """Further models, each fitted to a draw of as many training episodes, with replacement (a bootstrap).
+    With `keep_member` they correct simulated episodes in place of the model, which is fitted to all."""
     reward: Literal["whole", "correction"] = "whole"
     """What R_pred learns: "whole", the target's reward, as in the paper; "correction", the residual reward:
     the target's less the task's own on the recorded abstract states. It matters only to policies that learn
@@ -107,11 +111,12 @@ class HistoryFit:
     latent: bool
     reward: bool
 
-    def weights(self, config: GroundConfig) -> LossWeights:
-        """Return the weights of the losses."""
+    def weights(self, config: GroundConfig, *, topple: bool = True) -> LossWeights:
+        """Return the weights of the losses; `topple` is whether the topple head is needed."""
         return LossWeights(
             latent=config.latent_weight if self.latent else 0.0,
             reward=config.reward_weight if self.reward else 0.0,
+            topple=float(topple),
         )
 
     def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
@@ -132,38 +137,59 @@ class HistoryFit:
                 training=residual_rewards(fitting.task, fitting.training),
                 held_out=residual_rewards(fitting.task, fitting.held_out),
             )
-        torch.manual_seed(derive(fitting.seed, "grounding"))
-        training = fitting.training
-        windows = training.windows
-        model = GroundingModel(
-            GroundingShape(
-                state_size=windows.state.shape[-1],
-                action_size=windows.action.shape[-1],
-                goal_size=windows.goal.shape[-1],
-                latent_size=config.latent_size,
-                position_octaves=config.position_octaves if fitting.task.plane else 0,
-                ball_index=fitting.task.ball_index,
-                correction_heads=config.correction_heads,
-                corrects_reward=config.reward == "correction",
-                reward_dropout=config.reward_dropout,
-            ),
-            config.target,
-        ).to(fitting.device)
-        model.set_scales(
-            {
-                "state": training.steps(windows.state),
-                "goal": training.steps(windows.goal),
-                "correction": training.steps(windows.next_state - windows.simulated_next),
-            }
-        )
-        model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
-        metrics = _optimise(model, self.weights(config), fitting)
-        _fit_scatter(model, fitting.held_out)
-        if not config.failure_members:
-            return HistoryGrounding(model), metrics
-        failures = fit_failures(fitting.task, training, config.failure_members, fitting.seed)
-        metrics["failures"] = compared_foresight(model, failures, fitting.held_out, self.reward)
-        return HistoryGrounding(model, failures), metrics
+        failures = None
+        if config.failure_members:
+            failures = fit_failures(fitting.task, fitting.training, config.failure_members, fitting.seed)
+        weights, count = self.weights(config, topple=failures is None), 1 + config.members
+        first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
+        (model, metrics), members = first, tuple(other for other, _ in others)
+        _fit_scatter(model, members, fitting.held_out)
+        if members:
+            metrics["members"] = [figures["epochs"][-1] for _, figures in others]
+            for spent in ("wall_seconds", "cpu_seconds"):
+                metrics[spent] += sum(figures[spent] for _, figures in others)
+        if config.failure_members:
+            metrics["failures"] = compared_foresight(model, failures, fitting.held_out, self.reward)
+        return HistoryGrounding(model, failures, members), metrics
+
+
+def _fitted(
+    whole: Fitting, weights: LossWeights, number: int, count: int
+) -> tuple[GroundingModel, dict[str, Any]]:
+    """Fit model `number` of `count`, and return its figures; 0 is fitted to all the training episodes."""
+    config, training, seed = whole.config, whole.training, whole.seed
+    name = "checkpoint.safetensors"
+    if number:
+        seed, name = derive(seed, f"member {number}"), f"member_{number}_{name}"
+        drawn = generator(seed, "bootstrap").integers(len(training), size=len(training))
+        training = training.select(torch.from_numpy(drawn).to(training.target_state.device))
+    progress = part(whole.progress, number / count, (number + 1) / count)
+    torch.manual_seed(derive(seed, "grounding"))
+    windows = training.windows
+    model = GroundingModel(
+        GroundingShape(
+            state_size=windows.state.shape[-1],
+            action_size=windows.action.shape[-1],
+            goal_size=windows.goal.shape[-1],
+            latent_size=config.latent_size,
+            position_octaves=config.position_octaves if whole.task.plane else 0,
+            ball_index=whole.task.ball_index,
+            correction_heads=config.correction_heads,
+            corrects_reward=config.reward == "correction",
+            reward_dropout=config.reward_dropout,
+        ),
+        config.target,
+    ).to(whole.device)
+    model.set_scales(
+        {
+            "state": training.steps(windows.state),
+            "goal": training.steps(windows.goal),
+            "correction": training.steps(windows.next_state - windows.simulated_next),
+        }
+    )
+    model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
+    fitting = replace(whole, training=training, seed=seed, progress=progress)
+    return model, _optimise(model, weights, fitting, whole.folder / name)
 
 
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
@@ -191,9 +217,11 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     return replace(episodes, windows=replace(windows, reward=residual))
 
 
-def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:
+def _optimise(
+    model: GroundingModel, weights: LossWeights, fitting: Fitting, checkpoint: Path
+) -> dict[str, Any]:
     config = fitting.config
-    descent = Descent(model, config, checkpoint=fitting.folder / "checkpoint.safetensors")
+    descent = Descent(model, config, checkpoint=checkpoint)
     while not descent.is_over:
         torch.manual_seed(derive(fitting.seed, f"grounding update {descent.done}"))
         windows, _ = fitting.training.draw_windows(config.batch_windows, config.window)
@@ -218,11 +246,22 @@ def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> 
 
 
 @torch.no_grad()
-def _fit_scatter(model: GroundingModel, held_out: PairedEpisodes) -> None:
-    """Fit the scatter of the target around the correction, and the usual disagreement of its heads."""
+def _fit_scatter(model: GroundingModel, members: Sequence[GroundingModel], held_out: PairedEpisodes) -> None:
+    """Fit the scatter of the target around the correction, and how far corrections are usually apart.
+
+    That is between the heads of the `model`, or between it and each of its `members`.
+    """
     windows = held_out.windows
-    latent, _ = model.encode(windows)
-    predictions = model.ensemble_predictions(latent, windows.action, windows.simulated_next)
-    model.residual_factor.copy_(scatter_factor(held_out.steps(windows.next_state - predictions.mean(0))))
+
+    def corrected(by: GroundingModel) -> Tensor:
+        latent, _ = by.encode(windows)
+        return by.ensemble_predictions(latent, windows.action, windows.simulated_next)
+
+    predictions = corrected(model)
+    own = predictions.mean(0)
+    model.residual_factor.copy_(scatter_factor(held_out.steps(windows.next_state - own)))
     if len(predictions) > 1:
         model.usual_disagreement.copy_(held_out.steps(model.disagreement(predictions)).mean())
+    for member in members:
+        apart = member.disagreement(torch.stack([own, corrected(member).mean(0)]))
+        member.usual_disagreement.mul_(held_out.steps(apart).mean())

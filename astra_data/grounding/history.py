@@ -1,7 +1,8 @@
 """A grounding by a history model: each step is corrected given a latent of the history (Algorithm 2)."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from typing import Any, ClassVar, Self
 
 import torch
@@ -16,17 +17,21 @@ from astra_data.learning.networks.grounding import GroundingModel, GroundingShap
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.worlds.protocols import PlacedSimulator
 
-_FAILURES = "failures"
-"""Of a failure model's tensors and sizes in files."""
+_FAILURES, _MEMBERS = "failures", "members"
+"""Of the tensors and sizes of a failure model, and of members, in files."""
 
 
 class GroundedSimulator(EpisodeSimulator):
     """Step the simulator, correct where it landed, set it there, and encode the longer history.
 
+    With members, each corrects its own share of the rows and predicts their rewards, by its own latents; the
+    latents that policies observe are the model's in every row.
+
     Attributes:
         model: the trained grounding model; only read.
+        members: models that were fitted to other draws of the episodes; only read.
         failures: the failure model, if one was fitted; only read.
-        hidden: of the encoder, (B, Z). goal: (B, G).
+        hidden: of the model's encoder, (B, Z). goal: (B, G).
     """
 
     def __init__(
@@ -36,19 +41,20 @@ class GroundedSimulator(EpisodeSimulator):
         *,
         scatter: Tensor | None = None,
         failures: FailureModel | None = None,
+        members: tuple[GroundingModel, ...] = (),
     ) -> None:
         """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
         super().__init__(simulator, scatter=scatter)
-        self.model = model
+        self.model, self.members, self.failures = model, members, failures
         shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size
         self.hidden = torch.zeros(count, shape.latent_size, device=device)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
-        self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
+        self._own_hidden = self.hidden.clone() if members else None
+        self._shares = _shares(members or (model,), count)
+        self._last = self.latent, self._own_latent, torch.zeros(count, shape.action_size, device=device)
         self._predictions = torch.zeros(1, count, shape.state_size, device=device)
-        self._rows = torch.arange(count, device=device)
-        self._heads: Tensor | None = None
-        self.failures = failures
+        self._landed = simulator.state
         self._remembered = torch.zeros(count, 0 if failures is None else failures.memory_size, device=device)
         self._hazard: Tensor | None = None
 
@@ -58,14 +64,30 @@ class GroundedSimulator(EpisodeSimulator):
         return self.model.encoder.latent(self.hidden)
 
     @property
-    def disagreement(self) -> Tensor:
-        """By how much more than on the data the correction's heads disagreed on the last step, (B,).
+    def _own_latent(self) -> Tensor:
+        """The latents (B, Z) by the member of each row."""
+        return self.latent if self._own_hidden is None else self.model.encoder.latent(self._own_hidden)
 
-        Zero before the first step, and where there is only one head.
+    @property
+    @torch.no_grad()
+    def disagreement(self) -> Tensor:
+        """By how much more than on the data the last step's corrections differed, (B,).
+
+        That is between each row's member and the model, or else between the heads of the correction. Zero
+        before the first step, and where there is only one correction.
         """
-        if len(self._predictions) == 1:
-            return torch.zeros_like(self._predictions[0, :, 0])
-        return (self.model.disagreement(self._predictions) - 1.0).clamp_min(0.0)
+        latent, _, action = self._last
+        predictions = self._predictions
+        if self.members:
+            predictions = torch.stack([self.model.correct(latent, action, self._landed), predictions.mean(0)])
+        if len(predictions) == 1:
+            return torch.zeros_like(predictions[0, :, 0])
+        apart = self._by_share(lambda model, rows: model.disagreement(predictions[:, rows]))
+        return (apart - 1.0).clamp_min(0.0)
+
+    def _by_share(self, of: Callable[[GroundingModel, slice], Tensor]) -> Tensor:
+        """Return (B, ...) what the model that corrects it says `of` each row."""
+        return torch.cat([of(model, rows) for model, rows in self._shares])
 
     @torch.no_grad()
     def start(
@@ -80,96 +102,140 @@ class GroundedSimulator(EpisodeSimulator):
         """Start episodes in `rows` (n,); see `EpisodeSimulator.start`."""
         super().start(state, rows, goal)
         self.goal[rows] = goal
-        shape = self.model.shape
-        if self._heads is not None:
-            self._heads[rows] = self._drawn_heads(len(rows))
+        latent_size, count = self.model.shape.latent_size, len(self.members)
         if previous_action is None:
-            previous_action = torch.zeros(len(state), shape.action_size, device=state.device)
-        remembered = None
+            previous_action = torch.zeros(len(state), self.model.shape.action_size, device=state.device)
         if hidden is None:
-            hidden = torch.zeros(len(state), shape.latent_size, device=state.device)
-        elif self.failures is not None:
-            hidden, remembered = hidden.split([shape.latent_size, self.failures.memory_size], dim=-1)
-        if self.failures is not None:
-            if remembered is None:
-                remembered = self.failures.initial_memory(state, previous_action)
-            self._remembered[rows] = remembered
-        inputs = self.model.encoder_input(state, goal, previous_action)
-        self.hidden[rows] = self.model.encoder.step(inputs, hidden)
+            hidden = torch.zeros(len(state), latent_size * (1 + count), device=state.device)
+            if self.failures is not None:
+                self._remembered[rows] = self.failures.initial_memory(state, previous_action)
+        else:
+            memory_size = self._remembered.shape[1]
+            sizes = [latent_size, latent_size * count, memory_size]
+            *parts, self._remembered[rows] = hidden.split(sizes, dim=-1)
+            hidden = torch.cat(parts, dim=-1)
+        first, *others = hidden.split(latent_size, dim=-1)
+        self.hidden[rows] = _encoded(self.model, state, goal, previous_action, first)
+        if self._own_hidden is not None:
+            for before, (model, share) in zip(others, self._shares, strict=True):
+                of = (rows >= share.start) & (rows < share.stop)
+                inputs = (values[of] for values in (state, goal, previous_action, before))
+                self._own_hidden[rows[of]] = _encoded(model, *inputs)
 
     @torch.no_grad()
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the corrected states (B, X)."""
         before = self.state
-        self._last = self.latent, action
-        landed = self.simulator.step(action)
+        _, own, _ = self._last = self.latent, self._own_latent, action
+        landed = self._landed = self.simulator.step(action)
         if self.failures is not None:
             soon, self._remembered = self.failures.step(before, action, landed, self._remembered)
             self._hazard = self.failures.hazard(soon)
-        self._predictions = self.model.ensemble_predictions(*self._last, landed)
-        one = self._predictions.mean(0) if self._heads is None else self._predictions[self._heads, self._rows]
-        state = self._settle(before, one)
-        self.hidden = self.model.encoder.step(self.model.encoder_input(state, self.goal, action), self.hidden)
+        self._predictions = torch.cat(
+            [
+                model.ensemble_predictions(own[rows], action[rows], landed[rows])
+                for model, rows in self._shares
+            ],
+            dim=1,
+        )
+        state = self._settle(before, self._predictions.mean(0))
+        self.hidden = _encoded(self.model, state, self.goal, action, self.hidden)
+        if (hidden := self._own_hidden) is not None:
+            inputs = state, self.goal, action, hidden
+            self._own_hidden = self._by_share(
+                lambda model, rows: _encoded(model, *(values[rows] for values in inputs))
+            )
         return state
-
-    def keep_heads(self) -> None:
-        """Correct each row by one head of the ensemble, drawn now and at each start, not by their mean."""
-        self._heads = self._drawn_heads(len(self._rows))
-
-    def _drawn_heads(self, count: int) -> Tensor:
-        return torch.randint(self.model.shape.correction_heads, (count,), device=self._rows.device)
 
     @torch.no_grad()
     def topple_risk(self) -> Tensor:
         """Return the probability (B,) that the target toppled in the last step."""
-        return self._hazard if self._hazard is not None else self.model.topple_risk(*self._last, self.state)
+        if self._hazard is not None:
+            return self._hazard
+        _, *known = self._last
+        known.append(self.state)
+        return self._by_share(lambda model, rows: model.topple_risk(*(values[rows] for values in known)))
 
     @torch.no_grad()
     def predicted_reward(self, own: Tensor) -> Tensor:
         """Return the target's reward (B,) of the last step, by R_pred; see `EpisodeSimulator`."""
-        return self.model.target_reward(*self._last, own, self._hazard)
+        _, latent, action = self._last
+        known = [latent, action, own, *([] if self._hazard is None else [self._hazard])]
+        return self._by_share(lambda model, rows: model.target_reward(*(values[rows] for values in known)))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
-        heads = {} if self._heads is None else {"heads": self._heads}
+        own = {} if self._own_hidden is None else {"own_hidden": self._own_hidden}
         remembered = {} if self.failures is None else {"remembered": self._remembered}
-        return super().state_dict() | {"goal": self.goal, "hidden": self.hidden} | heads | remembered
+        return super().state_dict() | {"goal": self.goal, "hidden": self.hidden} | own | remembered
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
         super().load_state_dict(state)
         self.goal, self.hidden = state["goal"].clone(), state["hidden"].clone()
-        if self._heads is not None:
-            self._heads = state["heads"].clone()
+        if self._own_hidden is not None:
+            self._own_hidden = state["own_hidden"].clone()
         if self.failures is not None:
             self._remembered = state["remembered"].clone()
 
 
+def _shares(models: Sequence[GroundingModel], count: int) -> list[tuple[GroundingModel, slice]]:
+    """Divide `count` rows among `models`, as equally as they can be: rows keep their model."""
+    ends = [round(count * number / len(models)) for number in range(len(models) + 1)]
+    return [(model, slice(*between)) for model, between in zip(models, pairwise(ends), strict=True)]
+
+
+def _encoded(
+    model: GroundingModel, state: Tensor, goal: Tensor, previous_action: Tensor, hidden: Tensor
+) -> Tensor:
+    """Return the hidden states (n, Z) of a model's encoder after one more step."""
+    return model.encoder.step(model.encoder_input(state, goal, previous_action), hidden)
+
+
 @dataclass(frozen=True)
 class HistoryGrounding(FittedGrounding):
-    """Correct each step by a history model, whose latents policies observe; it may have a failure model."""
+    """Correct each step by a history model, whose latents policies observe.
+
+    Attributes:
+        model: fitted to all training episodes. failures: the failure model, if there is one.
+        members: models that were fitted to other draws of the episodes, and correct in its place.
+    """
 
     kind: ClassVar[str] = "history"
 
     model: GroundingModel
     failures: FailureModel | None = None
+    members: tuple[GroundingModel, ...] = ()
 
     @property
     def encoder(self) -> GroundingModel:
         """The model, whose encoder is ψ^s."""
         return self.model
 
+    def reduced(self, *, members: bool, failures: bool) -> "HistoryGrounding":
+        """Return the grounding without what is not asked for."""
+        return replace(
+            self, failures=self.failures if failures else None, members=self.members if members else ()
+        )
+
+    def for_replay(self) -> "HistoryGrounding":
+        """Return the model alone."""
+        return self.reduced(members=False, failures=False)
+
     def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> GroundedSimulator:
         """Wrap `simulator`; see `Grounding.corrected`."""
-        return GroundedSimulator(simulator, self.model, scatter=scatter, failures=self.failures)
+        return GroundedSimulator(
+            simulator, self.model, scatter=scatter, failures=self.failures, members=self.members
+        )
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
         """Return what is remembered before each `every`-th step, (E, ceil(T / every), H).
 
-        That is the encoder's hidden state, and the failure model's memory if there is one.
+        That is the hidden state of the model's encoder and of each member's, and the failure model's memory
+        if there is one.
         """
-        _, after = self.model.encode(windows)
+        after = torch.cat([model.encode(windows)[1] for model in (self.model, *self.members)], dim=-1)
         hidden = functional.pad(after[:, :-1], (0, 0, 1, 0))
         if self.failures is not None:
             hidden = torch.cat([hidden, self.failures.histories(windows)[1]], dim=-1)
@@ -186,20 +252,38 @@ class HistoryGrounding(FittedGrounding):
         if self.failures is not None:
             tensors |= {f"{_FAILURES}.{name}": one for name, one in self.failures.state_dict().items()}
             metadata[_FAILURES] = asdict(self.failures.shape)
+        if self.members:
+            metadata[_MEMBERS] = len(self.members)
+        for number, member in enumerate(self.members):
+            tensors |= {f"{_MEMBERS}.{number}.{name}": one for name, one in member.state_dict().items()}
         return tensors, metadata
 
     @classmethod
     def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
         """Read what `to_file` returned."""
-        model = GroundingModel(GroundingShape(**_tuples(metadata["shape"])), metadata["target"])
-        prefix, failures = f"{_FAILURES}.", None
-        model.load_state_dict({name: one for name, one in tensors.items() if not name.startswith(prefix)})
+        prefixes = f"{_FAILURES}.", f"{_MEMBERS}."
+        own = {name: one for name, one in tensors.items() if not name.startswith(prefixes)}
+        shape, failures = GroundingShape(**_tuples(metadata["shape"])), None
         if _FAILURES in metadata:
             failures = FailureModel(FailureShape(**_tuples(metadata[_FAILURES])))
-            own = {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
-            failures.load_state_dict(own)
+            failures.load_state_dict(_within(tensors, _FAILURES))
             failures = failures.to(device).requires_grad_(False).eval()
-        return cls(model.to(device).requires_grad_(False).eval(), failures)
+        others = [_within(tensors, f"{_MEMBERS}.{number}") for number in range(metadata.get(_MEMBERS, 0))]
+        model, *members = (
+            _loaded(GroundingModel(shape, metadata["target"]), weights, device) for weights in (own, *others)
+        )
+        return cls(model, failures, tuple(members))
+
+
+def _loaded(model: GroundingModel, weights: Mapping[str, Tensor], device: str) -> GroundingModel:
+    model.load_state_dict(weights)
+    return model.to(device).requires_grad_(False).eval()
+
+
+def _within(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """Return the tensors of a `part`, by their names within it."""
+    prefix = f"{part}."
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def _tuples(shape: Mapping[str, Any]) -> dict[str, Any]:

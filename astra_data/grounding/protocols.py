@@ -63,6 +63,10 @@ class Grounding(Protocol):
         """Return the factor (X, X) of the target's scatter around the corrected simulator."""
         ...
 
+    def reduced(self, *, members: bool, failures: bool) -> "Grounding":
+        """Return the grounding without its members, or its failure model, where they are not asked for."""
+        return self
+
     def for_replay(self) -> "Grounding":
         """Return the grounding to replay recorded actions with: without noise of sensors and actions."""
         return self

@@ -82,9 +82,6 @@ class EpisodeSimulator:
         landed = self.simulator.step(action)
         return landed if self.scatter is None else self._settle(before, landed)
 
-    def keep_heads(self) -> None:
-        """Correct each row by one head of an ensemble, if there is one, drawn anew at each start."""
-
     def _settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Scatter `landed` (B, X) and move there from `before` (B, X), as far as walls allow."""
         if self.scatter is not None:

@@ -85,7 +85,7 @@ class Ppo(Learner):
         with torch.no_grad():
             policy.value_layer.weight.mul_(config.critic_gain)
         self._first_std = float(policy.log_std.detach().exp().max())
-        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5)
+        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
         self._loss = _ppo_loss(policy, config)
         parts: dict[str, Resumable] = {"policy": policy, "optimizer": self._optimizer}
         self._returns = None

@@ -72,5 +72,6 @@ def ground(
         save_grounding(folder / "grounding.safetensors", grounding, episodes)
         (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
-        (folder / "checkpoint.safetensors").unlink(missing_ok=True)
+        for checkpoint in folder.glob("*checkpoint.safetensors"):
+            checkpoint.unlink()
         write_manifest(folder, {"dataset": episodes.content_hash})

@@ -49,11 +49,11 @@ class EnvConfig(Config):
     support_density: Positive = 0.3
     """Data is thin where its density is below this share of the median density of the free space."""
     disagreement_penalty: NotNegative = Field(default=0.0, serialization_alias="doubt_penalty")
-    """Subtracted from the reward of a step, times the disagreement of the correction's heads beyond the
-    usual; `[ground] correction_heads` has to be 2 or more."""
-    keep_head: bool = Field(default=False, exclude_if=lambda keeps: not keeps)
-    """Correct each simulated episode by one head of the correction, drawn at its start, not by their mean:
-    simulators that differ are harder to exploit. `[ground] correction_heads` has to be 2 or more."""
+    """Subtracted from the reward of a step, times the disagreement beyond the usual of the correction's heads
+    (`[ground] correction_heads`), or with `keep_member` of a row's member with the model."""
+    keep_member: bool = Field(default=False, exclude_if=lambda keeps: not keeps)
+    """Correct each row, and predict its reward, by one of the `[ground] members`, in equal shares: simulators
+    that differ are harder to exploit."""
     command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: Share = 0.0
@@ -72,6 +72,11 @@ class EnvConfig(Config):
             return values
         current = {key: value for key, value in values.items() if key not in RENAMED}
         return {new: values[old] for old, new in RENAMED.items() if old in values} | current
+
+    @property
+    def foresees(self) -> bool:
+        """Whether it makes a difference how probably the target fails."""
+        return self.topple or self.reward in ("predicted", "blend")
 
     @property
     def limits_commands(self) -> bool:
@@ -114,7 +119,7 @@ def env_parts(
     if config.data_start_share > 0:
         every = grounding.start_stride
         moments = windows.mask[:, ::every].bool()
-        hidden = grounding.hidden_before(windows, every)
+        hidden = _used(grounding, config).hidden_before(windows, every)
         starts = DataStarts(
             state=windows.state[:, ::every][moments],
             goal=windows.goal[:, ::every][moments],
@@ -137,6 +142,11 @@ def recorded_steps(task: Task, episodes: PairedEpisodes, grounding: Grounding) -
         action=windows.action,
         lengths=episodes.lengths,
     )
+
+
+def _used(grounding: Grounding, config: EnvConfig) -> Grounding:
+    """Return what `config` makes use of in a grounding."""
+    return grounding.reduced(members=config.keep_member, failures=config.foresees)
 
 
 def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:
@@ -170,9 +180,8 @@ def training_env(
     if task.plane is None and (config.support_penalty or config.limits_commands):
         raise task.without_maze()
     scatter = parts.scatter if config.residual_noise else None
-    simulator = grounding.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter)
-    if config.keep_head:
-        simulator.keep_heads()
+    used = _used(grounding, config)
+    simulator = used.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter)
     return SimulatorEnv(
         task.objective,
         simulator,

@@ -106,9 +106,9 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
         (
             {"train": {"disagreement_penalty": 1.0}},
-            "disagreement_penalty: expected ground.correction_heads of 2 or more",
+            "disagreement_penalty: expected ground.correction_heads of 2 or more, or keep_member",
         ),
-        ({"plus": {"keep_head": True}}, "keep_head: expected ground.correction_heads of 2 or more, got 1"),
+        ({"plus": {"keep_member": True}}, "keep_member: expected ground.members of 2 or more, got 0"),
         ({"train": 3}, "train: expected a table, got 3"),
         ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -7,9 +8,9 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
-from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, residual_rewards
+from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, _optimise, residual_rewards
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.grounding import GroundingModel
+from astra_data.learning.networks.grounding import GroundingModel, LossWeights
 from astra_data.worlds.registry import TASKS
 
 
@@ -92,6 +93,47 @@ def test_scales_are_of_the_training_episodes_and_the_scatter_of_those_held_out(t
     assert (shape.position_octaves, shape.ball_index, shape.goal_size) == (4, None, 2)
 
 
+def test_members_are_fitted_to_draws_of_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[Fitting] = []
+
+    def seen(
+        model: GroundingModel, weights: LossWeights, fitting: Fitting, checkpoint: Path
+    ) -> dict[str, Any]:
+        fitted.append(fitting)
+        return _optimise(model, weights, fitting, checkpoint)
+
+    monkeypatch.setattr("astra_data.grounding.fit._optimise", seen)
+    alone, _ = fit(tmp_path, "alone")
+    fitted.clear()
+    config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8, members=2)
+    (tmp_path / "three").mkdir()
+    task, whole, held_out = TASKS["antmaze-umaze"], episodes(0), episodes(1, 3)
+    folder, shares = tmp_path / "three", list[float]()
+    given = Fitting(
+        task, config, None, whole, held_out, 0, "cpu", folder, lambda share, _: shares.append(share)
+    )
+    grounding, metrics = HistoryFit(latent=True, reward=True)(given)
+    # The model itself is what it is without members.
+    assert all(map(torch.equal, grounding.model.state_dict().values(), alone.state_dict().values()))
+    first, *draws = (one.training.windows.action for one in fitted)
+    assert torch.equal(first, whole.windows.action) and len(grounding.members) == len(draws) == 2
+    known = [row.tolist() for row in whole.windows.action]
+    drawn = [[known.index(row.tolist()) for row in draw] for draw in draws]
+    assert drawn[0] != drawn[1] and all(len(one) == len(whole) > len(set(one)) for one in drawn)
+    weights = [one.encoder.embedding.weight for one in (grounding.model, *grounding.members)]
+    assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
+    windows = held_out.windows
+    ways = [
+        one.correct(one.encode(windows)[0], windows.action, windows.simulated_next)
+        for one in (grounding.model, *grounding.members)
+    ]
+    for way, member in zip(ways[1:], grounding.members, strict=True):
+        apart = held_out.steps(member.disagreement(torch.stack([ways[0], way])))
+        assert float(apart.mean().detach()) == pytest.approx(1.0, rel=1e-4)
+    assert len(metrics["members"]) == 2 and metrics["members"][0] != metrics["members"][1]
+    assert shares == sorted(shares) and "members" not in GroundConfig().model_dump()
+
+
 def test_the_slow_encoder_follows_at_its_rate(tmp_path: Path) -> None:
     rates = {rate: fit(tmp_path, str(rate), ema_rate=rate)[0] for rate in (0.0, 0.5, 1.0)}
     slow = {rate: model.target_encoder.embedding.weight for rate, model in rates.items()}
@@ -119,8 +161,10 @@ def test_a_methods_weights_are_zero_where_it_predicts_nothing() -> None:
     config = GroundConfig(latent_weight=0.3, reward_weight=2.0)
     for latent in (False, True):
         for reward in (False, True):
-            weights = HistoryFit(latent=latent, reward=reward).weights(config)
-            assert (weights.latent, weights.reward, weights.state) == (0.3 * latent, 2.0 * reward, 1.0)
+            for topple in (False, True):
+                weights = HistoryFit(latent=latent, reward=reward).weights(config, topple=topple)
+                assert (weights.latent, weights.reward) == (0.3 * latent, 2.0 * reward)
+                assert (weights.state, weights.topple) == (1.0, float(topple))
 
 
 def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: Path) -> None:
@@ -139,5 +183,5 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
         assert (grounding.failures is None) == (members == 0)
         assert ("failures" in metrics) == (members == 2)
     assert grounding.failures is not None and len(grounding.failures.members) == 2
-    assert {"topple_head", "failure_model"} <= metrics["failures"].keys()
+    assert metrics["failures"].keys() == {"predicted_reward", "failure_model"}
     assert "failure_members" not in config.model_dump() and asked.model_dump()["failure_members"] == 2

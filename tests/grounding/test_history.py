@@ -135,44 +135,141 @@ def test_disagreement_is_what_the_heads_differ_beyond_the_usual() -> None:
     assert (one.disagreement == 0).sum() == 2
 
 
-def test_each_row_may_keep_one_head_until_it_starts_anew() -> None:
-    used = model(heads=3)
-    one = simulator(used)
-    one.keep_heads()
-    one.start(HERE.expand(3, 4), ROWS, GOAL)
-    kept: list[list[int]] = []
-    for number, action in enumerate(actions(40)):
-        latent, before = one.latent, one.state.clone()
-        raw = PointMass(U_MAZE, 3, timestep_s=0.05)
-        raw.reset_to(before)
-        expected = used.ensemble_predictions(latent, action, raw.step(action))
-        apart = (expected - one.step(action)).abs().amax(-1)
-        heads = apart.argmin(0)
-        # Corrections that are stopped at a wall tell nothing.
-        told = apart.min(0).values < 1e-5
-        kept.append([int(head) if known else -1 for head, known in zip(heads, told, strict=True)])
-        if number % 4 == 3:
-            one.start(HERE.expand(2, 4), ROWS[1:], GOAL[1:])
-    first = {row[0] for row in kept} - {-1}
-    stretches = [{row[1] for row in kept[begin : begin + 4]} - {-1} for begin in range(0, 40, 4)]
-    assert len(first) == 1 and all(len(heads) == 1 for heads in stretches)
-    assert set.union(*stretches) == {0, 1, 2}
+def members(count: int = 2) -> tuple[GroundingModel, ...]:
+    """Models that differ from each other and from `model()`, in what they expect of states, too."""
+    made = []
+    for number in range(count):
+        one = model()
+        for parameter in one.parameters():
+            parameter.mul_(1.1 + 0.1 * number)
+        one.state_mean.fill_(0.1 * (1 + number))
+        made.append(one)
+    return tuple(made)
 
 
-def test_kept_heads_are_part_of_the_state() -> None:
-    used = model(heads=3)
-    one, other = simulator(used), simulator(used)
+def divided(used: GroundingModel, others: tuple[GroundingModel, ...], count: int = 5) -> GroundedSimulator:
+    one = GroundedSimulator(PointMass(U_MAZE, count, timestep_s=0.05), used, members=others)
+    one.start(HERE.expand(count, 4), torch.arange(count), GOAL[0].expand(count, 2))
+    return one
+
+
+def test_members_correct_and_reward_their_shares_and_policies_see_the_models_latents() -> None:
+    used, others = model(), members()
+    one, action = divided(used, others), torch.full((5, 2), 0.4)
+    apart = [simulator(other) for other in (used, *others)]  # each alone, in three rows
+    for alone in apart:
+        alone.start(HERE.expand(3, 4), ROWS, GOAL[0].expand(3, 2))
+    for _ in range(4):
+        assert torch.equal(one.latent, used.encoder.latent(one.hidden))
+        state = one.step(action)
+        first, second = (alone.step(action[:3]) for alone in apart[1:])
+        torch.testing.assert_close(state, torch.cat([first[:2], second]))
+        nothing = torch.zeros(5)
+        rewards = [alone.predicted_reward(nothing[:3]) for alone in apart]
+        torch.testing.assert_close(one.predicted_reward(nothing), torch.cat([rewards[1][:2], rewards[2]]))
+        risks = [alone.topple_risk() for alone in apart]
+        torch.testing.assert_close(one.topple_risk(), torch.cat([risks[1][:2], risks[2]]))
+        assert not torch.allclose(rewards[1], rewards[2]) and not torch.allclose(first, second)
+    follows = torch.zeros(5, 8)
+    state, previous = HERE.expand(5, 4), torch.zeros(5, 2)
+    again = divided(used, others)
+    for _ in range(4):
+        follows = used.encoder.step(used.encoder_input(state, GOAL[0].expand(5, 2), previous), follows)
+        torch.testing.assert_close(again.hidden, follows)
+        state, previous = again.step(action), action
+
+
+def test_members_that_start_again_forget_and_the_others_do_not() -> None:
+    one, other = (divided(model(), members()) for _ in range(2))
+    action = torch.full((5, 2), 0.4)
     for made in (one, other):
-        made.keep_heads()
-    saved = {name: values.clone() for name, values in one.state_dict().items()}
-    other.load_state_dict(saved)
-    for action in actions(5):
-        assert torch.equal(one.step(action), other.step(action))
-    single = simulator(model())
-    single.keep_heads()  # of one head, which is their mean
-    plain = simulator(model())
-    for action in actions(5):
-        assert torch.equal(single.step(action), plain.step(action))
+        for _ in range(3):
+            made.step(action)
+    rows = torch.tensor([4, 1])
+    one.start(HERE.expand(2, 4), rows, GOAL[:1].expand(2, 2))
+    fresh, after, before = divided(model(), members()).step(action), one.step(action), other.step(action)
+    torch.testing.assert_close(after[rows], fresh[rows])
+    kept = torch.tensor([0, 2, 3])
+    torch.testing.assert_close(after[kept], before[kept])
+    assert not torch.allclose(before[rows], fresh[rows])
+
+
+def test_members_go_on_from_recorded_histories_by_their_own_memories() -> None:
+    torch.manual_seed(3)
+    states, acts = torch.randn(1, 6, 4) * 0.1 + HERE, torch.rand(1, 6, 2)
+    episodes = toy_episodes(states, acts, next_state=states)
+    windows, others = episodes.windows, members()
+    grounding = HistoryGrounding(model(), None, others)
+    before = grounding.hidden_before(windows)
+    assert before.shape == (1, 6, 3 * 8)
+    rows = torch.arange(4)
+    one = grounding.simulator(TASK, 4)
+    assert isinstance(one, GroundedSimulator)
+    at = 4
+    goal = windows.goal[0, at].expand(4, 2)
+    one.start(
+        states[0, at].expand(4, 4),
+        rows,
+        goal,
+        hidden=before[0, at].expand(4, -1),
+        previous_action=acts[0, at - 1].expand(4, 2),
+    )
+    latents = [other.encode(windows)[0][0, at] for other in (grounding.model, *others)]
+    torch.testing.assert_close(one.latent, latents[0].expand(4, 8))
+    raw = TASK.simulator(4)
+    raw.reset_to(states[0, at].expand(4, 4))
+    action = torch.full((4, 2), 0.3)
+    landed = raw.step(action)
+    expected = [
+        other.correct(latent.expand(2, 8), action[:2], landed[:2])
+        for other, latent in zip(others, latents[1:], strict=True)
+    ]
+    torch.testing.assert_close(one.step(action), torch.cat(expected))
+
+
+def test_disagreement_is_that_of_a_rows_member_with_the_model() -> None:
+    used, others = model(), members()
+    one, action = divided(used, others), torch.full((5, 2), 0.4)
+    assert not one.disagreement.any()
+    for number, other in enumerate(others):
+        other.correction_std.fill_(0.2 + 0.1 * number)
+        other.usual_disagreement.fill_(1e-3)
+    latent = one.latent
+    raw = PointMass(U_MAZE, 5, timestep_s=0.05)
+    raw.reset_to(HERE.expand(5, 4))
+    landed = raw.step(action)
+    own = one.step(action)
+    # The deviation of two numbers is their distance by the root of two.
+    spread = (own - used.correct(latent, action, landed)).square().mean(-1).div(2).sqrt()
+    scale = torch.tensor([0.2, 0.2, 0.3, 0.3, 0.3])
+    torch.testing.assert_close(one.disagreement, (spread / scale / 1e-3 - 1).clamp_min(0.0))
+    assert one.disagreement.max() > 0
+
+
+def test_what_is_not_asked_for_is_left_out() -> None:
+    failures = FailureModel(FailureShape(4, 2, 0.05, members=1))
+    whole = HistoryGrounding(model(), failures, members())
+    assert whole.reduced(members=True, failures=True) == whole
+    assert whole.reduced(members=False, failures=True) == HistoryGrounding(whole.model, failures)
+    assert whole.reduced(members=True, failures=False) == HistoryGrounding(whole.model, None, whole.members)
+    assert whole.for_replay() == HistoryGrounding(whole.model)
+
+
+def test_members_are_part_of_files_and_of_the_state() -> None:
+    whole = HistoryGrounding(model(), None, members())
+    tensors, metadata = whole.to_file()
+    read = HistoryGrounding.from_file(tensors, json.loads(json.dumps(metadata)), "cpu")
+    assert len(read.members) == 2
+    for one, other in zip(read.members, whole.members, strict=True):
+        assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
+    first, second = divided(read.model, read.members), divided(read.model, read.members)
+    action = torch.full((5, 2), 0.4)
+    first.step(action)
+    saved = {name: values.clone() for name, values in first.state_dict().items()}
+    assert saved.keys() == {"state", "goal", "hidden", "own_hidden"}
+    second.load_state_dict(saved)
+    for _ in range(3):
+        assert torch.equal(first.step(action), second.step(action))
 
 
 def test_a_saved_state_goes_on_as_it_would_have() -> None:

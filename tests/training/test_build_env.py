@@ -68,13 +68,14 @@ def test_without_switches_it_is_the_plain_simulator(
         assert torch.equal(torch.get_rng_state(), drawn)
 
 
-def test_rows_may_differ_by_the_head_that_they_keep(episodes: PairedEpisodes) -> None:
+def test_rows_may_differ_by_their_members(episodes: PairedEpisodes) -> None:
     torch.manual_seed(0)
-    used = HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8, correction_heads=2)))
-    for head in used.model.corrections:
-        torch.nn.init.normal_(list(head.parameters())[-2], std=0.05)
+    model, *members = (GroundingModel(GroundingShape(4, 2, 2, latent_size=8)) for _ in range(3))
+    for one in members:
+        torch.nn.init.normal_(list(one.corrections.parameters())[-2], std=0.05)
+    used = HistoryGrounding(model, None, tuple(members))
     for keeps in (False, True):
-        config = EnvConfig(keep_head=keeps)
+        config = EnvConfig(keep_member=keeps, data_start_share=0.5)
         world = training_env(
             TASK, config, env_parts(TASK, config, episodes, used), used, num_envs=16, device="cpu"
         )

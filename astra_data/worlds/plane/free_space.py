@@ -120,12 +120,16 @@ class GoalDistance:
         return GoalDistance(fields, lattice, half_extent, self.cell_m)
 
     def __call__(self, position: Tensor, goal: Tensor) -> Tensor:
-        """Return the distance in m (B,) from `position` (B, 2) to `goal` (B, 2), bilinear in position."""
+        """Return the distance in m (..., B) from `position` (..., B, 2) to `goal` (B, 2).
+
+        It is bilinear in the position.
+        """
         field = (goal[:, None] - self.lattice).square().sum(-1).argmin(dim=1)
         _, height, width = self.fields.shape
         # Values are those at cell centres.
         grid = (position + self.half_extent) / self.cell_m - 0.5
-        grid = torch.stack([grid[:, 0].clamp(0, width - 1.001), grid[:, 1].clamp(0, height - 1.001)], dim=-1)
+        x, y = grid.unbind(-1)
+        grid = torch.stack([x.clamp(0, width - 1.001), y.clamp(0, height - 1.001)], dim=-1)
         corner = grid.floor()
         (fx, fy), (column, row) = (grid - corner).unbind(-1), corner.long().unbind(-1)
         lower = self.fields[field, row, column] * (1 - fx) + self.fields[field, row, column + 1] * fx

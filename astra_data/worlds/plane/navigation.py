@@ -100,8 +100,8 @@ class Navigation(PlanarObjective):
         """Return the progress in m (B,) toward `goal` (B, 2) from `before` to `after`, (B, 2 or more)."""
         before, after = before[:, :2], after[:, :2]
         if self.reward_kind == "geodesic":
-            distance = self._goal_distance_on(goal.device)
-            return distance(before, goal) - distance(after, goal)
+            distance = self._goal_distance_on(goal.device)(torch.stack([before, after]), goal)
+            return distance[0] - distance[1]
         if self.reward_kind == "euclidean":
             return torch.pairwise_distance(before, goal, eps=0) - torch.pairwise_distance(after, goal, eps=0)
         return torch.zeros(len(goal), device=goal.device)
