@@ -157,10 +157,11 @@ class GroundedSimulator(EpisodeSimulator):
         return self._by_share(lambda model, rows: model.topple_risk(*(values[rows] for values in known)))
 
     @torch.no_grad()
-    def predicted_reward(self, own: Tensor) -> Tensor:
+    def predicted_reward(self, own: Tensor, *, with_failures: bool = True) -> Tensor:
         """Return the target's reward (B,) of the last step, by R_pred; see `EpisodeSimulator`."""
         _, latent, action = self._last
-        known = [latent, action, own, *([] if self._hazard is None else [self._hazard])]
+        hazard = self._hazard if with_failures else torch.zeros_like(own)
+        known = [latent, action, own, *([] if hazard is None else [hazard])]
         return self._by_share(lambda model, rows: model.target_reward(*(values[rows] for values in known)))
 
     def state_dict(self) -> dict[str, Tensor]:

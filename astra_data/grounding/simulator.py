@@ -92,10 +92,12 @@ class EpisodeSimulator:
         """Return the probability (B,) that the target toppled in the last step; None where unknown."""
         return None
 
-    def predicted_reward(self, own: Tensor) -> Tensor | None:
+    def predicted_reward(self, own: Tensor, *, with_failures: bool = True) -> Tensor | None:
         """Return the target's reward (B,) of the last step as predicted; None where nothing predicts it.
 
-        `own` (B,) is the task's own reward on abstract states, to which residual rewards are added.
+        Args:
+            own: the task's own reward on abstract states (B,), to which residual rewards are added.
+            with_failures: whether it holds what a failure costs, times its probability.
         """
         return None
 

@@ -166,7 +166,8 @@ class SimulatorEnv:
         if self.reward == "predicted":
             none_failed = torch.zeros_like(decided)
             own = self.objective.reward(before, after, self.goal, none_failed)
-            predicted = self.simulator.predicted_reward(own)
+            # Failures that are drawn are paid when they come.
+            predicted = self.simulator.predicted_reward(own, with_failures=not self.topple)
             if predicted is not None:
                 reward = torch.where(decided, reward, predicted)
         return Step(

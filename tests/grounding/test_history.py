@@ -108,6 +108,10 @@ def test_risk_and_reward_are_of_the_last_step() -> None:
     torch.testing.assert_close(one.topple_risk(), used.topple_risk(latent, second, after))
     own = torch.tensor([1.0, 2.0, 3.0])
     torch.testing.assert_close(one.predicted_reward(own), used.predict_reward(latent, second))
+    used.failure_cost.fill_(-10.0)
+    going_on, failing = used.predict_reward_parts(latent, second).unbind(-1)
+    assert (failing < -1).all()
+    torch.testing.assert_close(one.predicted_reward(own, with_failures=False), going_on)
 
 
 def test_residual_rewards_are_added_to_the_tasks_own() -> None:

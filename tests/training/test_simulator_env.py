@@ -282,6 +282,26 @@ def test_topples_are_drawn_at_the_predicted_risk_and_end_the_episode() -> None:
         torch.testing.assert_close(step.reward, own)
 
 
+def test_topples_that_are_drawn_are_no_part_of_the_predicted_reward() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    model.failure_cost.fill_(-10.0)
+    list(model.topple_head.parameters())[-1].fill_(-50.0)
+    goal = torch.tensor([[-4.0, -4.0]]).expand(3, 2)
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4)
+    rewards = []
+    for topple in (False, True):
+        inner = PointMass(U_MAZE, 3, timestep_s=0.05)
+        one = SimulatorEnv(TASK, GroundedSimulator(inner, model), topple=topple, reward="predicted")
+        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+        latent, action = one.simulator.latent, torch.full((3, 2), 0.2)
+        rewards.append(one.step(action).reward)
+    assert latent is not None
+    going_on, failing = model.predict_reward_parts(latent, action).unbind(-1)
+    torch.testing.assert_close(rewards, [going_on + failing, going_on])
+    assert (failing < -1).all()
+
+
 def test_recorded_starts_hand_over_their_history() -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
