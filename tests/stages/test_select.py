@@ -172,5 +172,11 @@ def test_what_is_not_there_is_asked_for(root: Path) -> None:
     with pytest.raises(BadInputError, match="got none, and NAS is not among the rows"):
         judge_of(None, ("direct_transfer", "astra"))
     assert judge_of("astra_plus", ()) == "astra" and judge_of(None, ("nas_plus",)) == "nas"
+    (root / "alone").mkdir()
+    alone = Path(shutil.copytree(root / "train", root / "alone/train")).parent
+    shutil.copytree(root / "ground/nas/seed_1", alone / "ground/nas/seed_1")
+    shutil.copytree(root / "pair", alone / "pair")
+    with pytest.raises(BadInputError, match="groundings of nas for two seeds or more, found 1"):
+        select(reported(root), root=alone)
     shutil.rmtree(root / "ground/nas/seed_1")
     assert len(judged(root, reported(root)).candidates) == 5  # of NAS, seed 1 has no encoder
