@@ -69,7 +69,7 @@ def choose_by_trials(
     with held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
-        return begun if begun.chosen else _halve(folder, judged, candidates, begun, progress)
+        return _halve(folder, judged, candidates, begun, progress)
 
 
 def _check_enough(trials: int, field: int) -> None:
@@ -107,6 +107,7 @@ def _begun(folder: Path, trials: int, field: int, percent: int | None) -> Trials
 def _halve(
     folder: Path, judged: Judged, candidates: list[Candidate], begun: TrialsFile, progress: Progress
 ) -> TrialsFile:
+    """Go on with what was begun; of what is finished, nothing is tried again."""
     rounds = list(begun.rounds)
 
     def attempt(number: int, those: tuple[int, ...], each: int) -> list[int]:
