@@ -10,8 +10,8 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from astra_data.core.naming import place
+from astra_data.reports.runs import Reported
 from astra_data.reports.schema import MethodResults, Results
-from astra_data.stages.report import Reported
 
 ROWS = ("direct_transfer", "astra", "astra_plus", "follower")
 SEEDS = (0, 1, 2)
@@ -125,6 +125,17 @@ def write_runs(parent: Path) -> Path:
                     | {"steps_per_second": 48000.0, "simulator_steps_per_second": 96000.0, "points": points},
                 )
     return root
+
+
+def write_choice(root: Path) -> None:
+    """Write what the stage `select` predicts of ASTRA and ASTRA+; ASTRA+ is said to be the worse."""
+    candidates = [
+        {"row": row, "seed": seed, "percent": None, "success": {"7": share, "8": share, "9": share}}
+        for row, shares in {"astra": (0.9, 0.8, 1.0), "astra_plus": (0.5, 0.25, 0.25)}.items()
+        for seed, share in zip(SEEDS, shares, strict=True)
+    ]
+    values = {"judge": "astra", "episodes": 4, "shares_episodes": False, "candidates": candidates}
+    write_json(root / "select/select.json", values | MADE | {"wall_seconds": 8.0})
 
 
 def write_elsewhere(root: Path, name: str, like: str = "direct_transfer") -> None:

@@ -48,10 +48,15 @@ class FakeCollectConfig(FakeConfig):
     behavior: str = "random"
 
 
+class FakeSelectConfig(FakeConfig):
+    judge: str | None = None
+
+
 CONFIGS: dict[str, Any] = dict.fromkeys(
     ("augment", "pair", "ground", "train", "align", "evaluate", "report"), FakeConfig
 )
 CONFIGS["collect"] = FakeCollectConfig
+CONFIGS["select"] = FakeSelectConfig
 """Models of the stages' tables."""
 
 
@@ -116,8 +121,13 @@ def _write(
         (folder / f"{name}.json").write_text(json.dumps(content))
     made_from = {name: _digest(Path(read)) for name, read in asked.items() if name in READ and read}
     stage = next(part for part in reversed(out.parts) if part in (*DATASETS, *RESULTS))
+    if stage == "select":
+        read = ("train/*/", "ground/*/", "pair/")
+        folders = [path for pattern in read for path in sorted(out.parent.glob(f"{pattern}seed_*"))]
+        made_from = {path.relative_to(out.parent).as_posix(): _digest(path) for path in folders}
     if stage == "report":
-        made_from = {str(file): file_digest(file) for file in out.parent.glob("evaluate/**/evaluation.json")}
+        read_files = [*out.parent.glob("evaluate/**/evaluation.json"), *out.parent.glob("select/select.json")]
+        made_from = {str(file): file_digest(file) for file in read_files}
     if stage in DATASETS:
         parents = [{"hash": digest} for digest in made_from.values()]
         description = {"stage": stage, "content_hash": file_digest(folder / "asked.json"), "parents": parents}
@@ -135,6 +145,7 @@ RESULTS = {
     "ground": "grounding.safetensors",
     "train": "policy.safetensors",
     "align": "target_encoder.safetensors",
+    "select": "select.json",
     "evaluate": "evaluation.json",
     "report": "results.json",
 }
@@ -285,6 +296,10 @@ def evaluate(
         "simulated": None if policy is None else outcomes,
     }
     _write(config, out, progress, {"evaluation": evaluation}, **asked)
+
+
+def select(recipe: Reported, config: FakeConfig, *, root: Path, progress: Progress) -> None:
+    _write(config, root / "select", progress, name=recipe.name, methods=recipe.methods, seeds=recipe.seeds)
 
 
 def report(

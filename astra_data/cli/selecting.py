@@ -1,9 +1,11 @@
 """`astra-data select`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from astra_data.core.errors import BadInputError
 
 
 def select(
@@ -16,16 +18,44 @@ def select(
     judge: Annotated[
         str | None, typer.Option(help="The row whose groundings judge.", show_default="the reference")
     ] = None,
-    episodes: Annotated[int, typer.Option(help="Of each policy with each judge.", min=1)] = 100,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="Of each policy with each judge.", min=1, show_default="the recipe's, or 100"),
+    ] = None,
+    trials: Annotated[
+        int | None,
+        typer.Option(help="Episodes in the target to spend on the candidates.", min=1, show_default="none"),
+    ] = None,
+    field: Annotated[
+        int | None,
+        typer.Option(help="Candidates that are tried at all.", show_default="as many as the trials allow"),
+    ] = None,
+    percent: Annotated[
+        int | None,
+        typer.Option(help="Size of the dataset whose policies are tried, of a sweep.", show_default=False),
+    ] = None,
 ) -> None:
-    """Rank the trained policies of a run without the target, in simulators of other episodes."""
+    """Rank the trained policies of a run without the target, or with few trials there."""
     from astra_data.experiments.display import shown
-    from astra_data.experiments.selecting import FOLDER
     from astra_data.experiments.selecting import select as rank
+    from astra_data.experiments.trials import choose_by_trials
 
+    given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
+    if trials is None and (field is not None or percent is not None):
+        raise BadInputError("--field and --percent are of --trials: give that too, or leave them out")
+    if trials is not None:
+        with shown("select") as progress:
+            made = choose_by_trials(run, trials, field=field, percent=percent, progress=progress, **given)
+        assert made.chosen is not None
+        best, seed = made.chosen
+        typer.echo(f"chosen by {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}")
+        typer.echo(f"written: {run / 'select' / 'select.md'}")
+        return
     with shown("select") as progress:
-        ranked = rank(run, rows=row or (), judge=judge, episodes=episodes, progress=progress)
-    first = ranked[0]
-    reached = f"{first.lower:.2f} in the lower quartile of its judges"
-    typer.echo(f"chosen: {first.row}, seed {first.seed}: {reached}")
-    typer.echo(f"written: {run / FOLDER / 'select.md'}")
+        judged = rank(run, progress=progress, **given)
+    for percent in judged.percents:
+        first = judged.ranked(percent)[0]
+        reached = f"{first.lower:.2f} in the lower quartile of its judges"
+        size = f" at {percent} %" if percent else ""
+        typer.echo(f"chosen{size}: {first.row}, seed {first.seed}: {reached}")
+    typer.echo(f"written: {run / 'select' / 'select.md'}")

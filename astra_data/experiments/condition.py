@@ -21,6 +21,7 @@ from astra_data.experiments.experiment import ALWAYS_NEW, Experiment
 from astra_data.experiments.plan import stage_of
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.reports.artefacts import Evaluation, read_json
+from astra_data.reports.choice import Judged
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.training.policy_file import PolicyFile
 
@@ -28,6 +29,7 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "ground": load_grounding,
     "train": PolicyFile.load,
     "align": load_target_encoder,
+    "select": lambda path: read_json(Judged, path),
     "evaluate": lambda path: read_json(Evaluation, path),
 }
 """What reads the results of stages as other stages do."""
@@ -140,13 +142,17 @@ def _unreadable(key: str, experiment: Experiment) -> str:
 
 
 def _replaced(item: Item, experiment: Experiment) -> str:
-    """Return which of the artefacts that `item` was made from is another now."""
+    """Return which of the artefacts that `item` is made from it was not made from."""
     folder = experiment.place(item.key)
     made_from: Collection[str]
     if _stage(item.key).makes_dataset:
         made_from = [parent["hash"] for parent in read_description(folder)["parents"]]
     elif manifest := read_manifest(folder):
         made_from = manifest.made_from.values()
+        # A choice is among the policies that the recipe has now.
+        absent = [key for key in item.inputs if item.key == "select" and key not in manifest.made_from]
+        if absent:
+            return f"made without {absent[0]}"
     else:
         return ""
     digests = {key: _digest(key, experiment) for key in item.inputs if experiment.has(key)}

@@ -167,7 +167,7 @@ class Experiment:
         """
         points = set()
         for percent, found in by_size(read_published(self.published_in)).items():
-            changed = _differences(found.settings, self.recipe) - ALWAYS_NEW
+            changed = _differences(found.settings, self.recipe) - ALWAYS_NEW - {"select"}
             changed -= {
                 table for table in _ROWS_TABLES if not any(_reads(row, table) for row in found.methods)
             }

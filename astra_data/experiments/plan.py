@@ -1,7 +1,8 @@
 """The artefacts that a recipe's rows, seeds and sizes need, each once.
 
-    collect ──┬── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ── report
-    or label ─┘                       │            └── align ──┘
+    collect ──┬── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ──┬── report
+    or label ─┘                       │            └── align ──┘              │
+                                      │   (all seeds of ground and train) ── (select)
                                       └── (rows without grounding train on the pairs alone)
 
 A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` settings; it shares the
@@ -24,8 +25,9 @@ from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.methods import METHODS
 from astra_data.methods.method import Method
+from astra_data.reports.runs import Reported
 from astra_data.stages.registry import STAGES, Stage
-from astra_data.stages.report import Reported
+from astra_data.stages.select import benches, judge_of
 
 ARTEFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
 """Parameters of stages that are folders of artefacts."""
@@ -55,18 +57,22 @@ def plan(
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
     report, keys = STAGES["report"], tuple(point.key for point in selection.points())
-    groundings = {row: grounded_as(base_method(row)) for row in selection.methods}
+    reported = Reported(
+        path.stem,
+        recipe.task,
+        selection.methods,
+        selection.seeds,
+        {row: grounded_as(base_method(row)) for row in selection.methods},
+        recipe.settings,
+        selection.percents,
+    )
+    # One seed alone has no judges.
+    if recipe.select is not None and len(selection.seeds) > 1:
+        items.append(_choice(recipe, reported, folder))
+        keys += ("select",)
     call = partial(
         report.run,
-        Reported(
-            path.stem,
-            recipe.task,
-            selection.methods,
-            selection.seeds,
-            groundings,
-            recipe.settings,
-            selection.percents,
-        ),
+        reported,
         root=folder,
         command=_command(recipe, path, selection),
         publish=publish,
@@ -74,6 +80,17 @@ def plan(
         config=recipe.report,
     )
     return (*items, Item("report", keys, call))
+
+
+def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item:
+    """Return the choice among the policies of the selection."""
+    of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
+    inputs = dict.fromkeys(key for bench in of for key in bench.keys)
+    return Item(
+        "select",
+        tuple(inputs),
+        partial(STAGES["select"].run, reported, recipe.select, root=folder),
+    )
 
 
 def stage_of(item: Item) -> str:
@@ -121,7 +138,8 @@ class _Plan:
         rows = self.selection.methods
         bases = tuple(dict.fromkeys(map(base_method, rows)))
         reference = reference_of(self.recipe.methods)
-        candidates = (*bases, *([reference] if reference else []))
+        judge = [judge_of(self.recipe.select.judge, self.recipe.methods)] if self.recipe.select else []
+        candidates = (*bases, *([reference] if reference else []), *judge)
         groundings = dict.fromkeys(grounded_as(base) for base in candidates if METHODS[base].grounds)
         initial = [first for base in bases if (first := METHODS[base].initial)]
         trained = [row for row in rows if METHODS[base_method(row)].trains]

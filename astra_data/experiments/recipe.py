@@ -1,14 +1,12 @@
 """The model of recipes: task, rows, seeds and sizes, and a table of settings per stage and method."""
 
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import (
     Field,
     JsonValue,
     ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
     create_model,
     field_validator,
     model_validator,
@@ -19,9 +17,11 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
 from astra_data.experiments.own_methods import OwnMethod, add_all
+from astra_data.experiments.recipe_tables import method_field, stage_field
 from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
 from astra_data.stages.registry import STAGES, Stage
+from astra_data.stages.select import judge_of
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.score import Score
 
@@ -184,6 +184,21 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
+    def _has_judges(self) -> Self:
+        if self.select is None:
+            return self
+        try:
+            judge_of(self.select.judge, self.methods)
+        except BadInputError as error:
+            raise ValueError(f"select.judge: {error}") from None
+        if len(self.seeds) < 2:
+            raise ValueError("select: expected two seeds or more, got 1: judges are of other seeds")
+        methods = [METHODS[base_method(row)] for row in self.methods]
+        if not any(method.trains and not method.steps_target for method in methods):
+            raise ValueError("select: expected a row with policies of abstract states, got none")
+        return self
+
+    @model_validator(mode="after")
     def _limits_all_commands(self) -> Self:
         rows = {row: METHODS[base_method(row)] for row in self.methods}
         elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]
@@ -257,45 +272,12 @@ def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[T
     Further keys: `based_on`, the recipe that provides the settings not given here and the artefacts that do
     not change; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
     """
-    fields: dict[str, Any] = {stage.name: _stage_field(stage) for stage in stages if stage.config}
+    fields: dict[str, Any] = {stage.name: stage_field(stage) for stage in stages if stage.config}
     fields["based_on"] = (str | None, None)
     fields["sweep"] = (SweepConfig, SweepConfig())
     fields["plus"] = fields["train"]
-    fields |= {table.name: _method_field(table) for table in methods}
+    fields |= {table.name: method_field(table) for table in methods}
     return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
-
-
-_FILLED: Any = Field(default_factory=dict, validate_default=True)
-"""A table that a recipe leaves out is read as an empty one."""
-
-
-def _stage_field(stage: Stage) -> tuple[Any, Any]:
-    if stage.name == "collect":
-        return stage.config | None, _FILLED
-    return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
-
-
-def _method_field(table: Table) -> tuple[Any, Any]:
-    if table.ranges is None:
-        return table.model, table.usual
-    return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
-
-
-def _laid_over(ranges: Literal["randomized", "wide"]) -> Callable[..., Any]:
-    """Return how a table of ranges is read: laid over `ranges` of the recipe's task."""
-
-    def read(overrides: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
-        if "task" not in info.data or not isinstance(overrides, dict):
-            return check(overrides)
-        usual = getattr(task_named(info.data["task"]).varied, ranges)
-        found = check(usual.model_dump() | overrides)
-        try:
-            found.of_kind(type(usual))
-        except BadInputError as error:
-            raise ValueError(str(error)) from None
-        return found
-
-    return read
 
 
 if not TYPE_CHECKING:

@@ -213,7 +213,7 @@ def make(
         experiment.link_borrowed()
         console = Console()
         for key, reason in again.items():
-            line = f"{key} is made again: {reason}; the old one is in {_set_aside(folder, key)}"
+            line = f"{key} is made again: {reason}; the old one is in {set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
         record_code(recipe, folder)
@@ -256,7 +256,7 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
         raise MissingStageError(f"{experiment.place(key)} is {fault}: run `{command}{option}` first")
 
 
-def _set_aside(folder: Path, key: str) -> Path:
+def set_aside(folder: Path, key: str) -> Path:
     """Move the artefact `key` out of the way; return where it is now."""
     places = (folder / SET_ASIDE / str(number) / key for number in count(1))
     aside = next(place for place in places if not place.exists())

@@ -21,6 +21,7 @@ from astra_data.reports.artefacts import (
     files_of,
     way_to_success,
 )
+from astra_data.reports.choice import Judged, choice_of, read_judged
 from astra_data.reports.comparing import SHARED_WORLDS
 from astra_data.reports.costs import Files, seconds, seed_cost, throughput
 from astra_data.reports.merging import merge
@@ -64,15 +65,37 @@ def assemble(
         # The published results may be of the recipe that this one is based on.
         own = {"recipe": recipe, "command": command, "settings": settings}
         sources.append(published.model_copy(update=own))
+    judged = read_judged(root)
     if read.any_finished or not published:
-        sources.append(_read(read, task, command, scores, settings))
+        sources.append(_read(read, task, command, scores, settings, judged))
     merged = merge(sources, methods=methods, seeds=asked, replicates=replicates)
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
-    return merged.model_copy(update={"paper_success": printed})
+    choice = published.choice if published else None
+    if judged:
+        measured = _measured(merged)
+        choice = choice_of(
+            judged, percent, measured=measured, rows=methods, seeds=asked, replicates=replicates
+        )
+    return merged.model_copy(update={"paper_success": printed, "choice": choice})
+
+
+def _measured(results: Results) -> dict[tuple[str, int], float]:
+    """Return the success in the target of every row and seed that was tested there."""
+    rows = results.methods if results.tested_in == "target" else {}
+    return {
+        (method, seed): success
+        for method, row in rows.items()
+        for seed, success in zip(row.seeds, row.success, strict=True)
+    }
 
 
 def _read(
-    read: Runs, task: str, command: str, scores: tuple[Score, ...], settings: dict[str, JsonValue]
+    read: Runs,
+    task: str,
+    command: str,
+    scores: tuple[Score, ...],
+    settings: dict[str, JsonValue],
+    judged: Judged | None,
 ) -> Results:
     """Return the results under one root, before rows are summarised and compared."""
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
@@ -119,6 +142,7 @@ def _read(
         "ground": _listed(metrics),
         "train": _listed(curves),
         "align": _listed(alignments),
+        **({"select": {"all": [judged]}} if judged else {}),
         "evaluate": _listed(evaluations),
     }
     return Results(

@@ -15,7 +15,7 @@ COSTED = ("ground", "train", "align", "evaluate")
 def stage_costs(results: Results) -> list[list[str]]:
     """Return lines of wall time, CPU time and speed by stage, and of the whole recipe."""
     lines = []
-    for stage in ("collect", "pair", *COSTED):
+    for stage in ("collect", "pair", *COSTED[:-1], "select", COSTED[-1]):
         speeds = results.throughput.get(stage, {})
         shown = [f"{_rates(rows)} {_unit(figure)}" for figure, rows in speeds.items() if rows]
         wall, cpu = (spent.get(stage) for spent in (results.wall_seconds, results.cpu_seconds))

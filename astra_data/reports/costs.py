@@ -13,6 +13,7 @@ THROUGHPUT = {
     "ground": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.fit_rates)),
     "train": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.learn_rates)),
     "align": ("windows_per_second",),
+    "select": (),
     "evaluate": ("target_steps_per_second",),
 }
 """The keys under which each stage records its speed."""

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 from astra_data.core.naming import is_plus, reference_of
 from astra_data.methods import method_title
+from astra_data.reports.choice_page import choice_values
 from astra_data.reports.cost_and_origin import (
     COSTED,
     dataset_lines,
@@ -79,6 +80,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         correlation=_correlation,
         grounding=f"{method_title(reference)}'s, of the same seed" if reference else "each row's own",
         untested=[row.title for row in rows.values() if "raw" not in row.simulator_returns],
+        choice=choice_values(results.choice),
         costed=COSTED,
         stage_costs=stage_costs(results),
         row_costs=row_costs(results),

@@ -5,12 +5,35 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from pydantic import JsonValue
+
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import base_method, place
 from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
 
 SHARED = ("ground", "align")
 """Stages whose artefacts a "_plus" row takes from its base row."""
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What stages of a whole recipe need of it, small enough to be sent to another process.
+
+    Attributes:
+        name: of the recipe's file, without its ending. task: name of a task.
+        methods: rows, in the order of the table. seeds: those to report, as far as they are finished.
+        groundings: row → the method whose grounding and alignment it uses.
+        settings: all settings of the recipe.
+        percents: dataset sizes in percent that every row is repeated on; empty if only on the whole.
+    """
+
+    name: str
+    task: str
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    groundings: Mapping[str, str]
+    settings: Mapping[str, JsonValue]
+    percents: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

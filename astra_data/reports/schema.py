@@ -104,6 +104,54 @@ class Validity(Section):
     spearman: Correlation | None
 
 
+class Ranked(Section):
+    """A policy as its judges see it, the simulators of other episodes."""
+
+    row: str
+    seed: int
+    judges: int
+    lower: float
+    """Lower quartile of its success over the judges: what policies are ranked by."""
+    predicted: float
+    """Mean over the judges."""
+    low: float | None
+    """Ends of the 95 % interval of `predicted` over judges (Student's t); None with too few judges."""
+    high: float | None
+    target: float | None
+    """Success in the target; None where it was not tested there."""
+
+
+class Calibration(Section):
+    """Predicted success less that in the target, over the seeds of a row."""
+
+    seeds: int
+    signed: float
+    absolute: float
+
+
+class Choice(Section):
+    """A choice without the target; below `candidates`, what it is worth there, None until that is tested."""
+
+    judge: str
+    """The method whose groundings judge."""
+    episodes: int
+    """Of each policy with each judge."""
+    shares_episodes: bool
+    """Whether the judges were fitted to the same episodes as the policies."""
+    candidates: list[Ranked]
+    """Best first: the first is chosen."""
+    rank_correlation: Correlation | None = None
+    """With the target, within rows: Spearman's, a mean over rows; its interval resamples seeds."""
+    regret: float | None = None
+    """Success in the target of the best there, less that of the chosen."""
+    random_regret: float | None = None
+    """The same of one drawn at random, on average."""
+    calibration: dict[str, Calibration] = Field(default_factory=dict)
+    """By row."""
+    withheld: dict[str, str] = Field(default_factory=dict)
+    """Why a figure is None."""
+
+
 class MethodResults(Section):
     """One row. Each measure is a list over seeds: its mean over the episodes in the target."""
 
@@ -202,6 +250,8 @@ class Results(Section):
     """ASTRA's row → comparable row → probability that a seed of the first beats one of the second."""
     predictive_validity: dict[str, Validity] = Field(default_factory=dict)
     """By shared test simulator: "raw", and "grounded" if there is one."""
+    choice: Choice | None = Field(default=None, exclude_if=lambda choice: choice is None)
+    """None where `select` was not run."""
     throughput: dict[str, dict[str, dict[str, list[float]]]]
     """stage → figure → row, or grounding that rows share, or "all" → one value per seed."""
 

@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from typing import Literal
 
+from astra_data.methods import method_title
 from astra_data.reports.cost_and_origin import provenance
 from astra_data.reports.formatting import fill, interval, spread
 from astra_data.reports.schema import Results, Section
 from astra_data.reports.tested import warning, where
 
-SHARED = ("collect", "pair")
+SHARED = ("collect", "pair", "select")
 """Stages that run once for all sizes."""
 
 
@@ -69,5 +70,19 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         head=["method", *(f"{size.percent} %" for size in found.sizes)],
         means=means,
         intervals=intervals,
+        choices=[_choice(size) for size in found.sizes if size.results.choice],
         made=provenance([origin for size in found.sizes for origin in size.results.origins]),
     )
+
+
+def _choice(size: SizeResults) -> list[str]:
+    """Return the line of what was chosen at a size."""
+    choice = size.results.choice
+    assert choice is not None
+    best = choice.candidates[0]
+    known = [best.target, choice.regret, choice.random_regret]
+    return [
+        *(f"{size.percent} %", f"{method_title(best.row)}, seed {best.seed}"),
+        interval(best.predicted, best.low, best.high),
+        *("-" if value is None else f"{value:.2f}" for value in known),
+    ]

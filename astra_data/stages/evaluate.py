@@ -6,14 +6,12 @@ own reward. Of a task without a target, there are the simulators alone.
 """
 
 import json
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from astra_data.core.checkpoint import finished_folder, save_tensors
@@ -31,12 +29,12 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
 from astra_data.training.deployment import EncoderKind
-from astra_data.training.episode_record import EpisodeRecord, Outcome
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import Act, Begin, in_simulator, own_world, started
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.target_episodes import in_target
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -159,8 +157,15 @@ def evaluate(
         outcomes, filmed = {}, {}
         for kind, robot in robots.items():
             counted = asked if kind == headline else None
-            outcomes[kind], filmed[kind], rate = _in_target(
-                world, robot, config, seed, num_threads, progress, counted
+            outcomes[kind], filmed[kind], rate = in_target(
+                world,
+                robot,
+                config.episodes,
+                derive(seed, "evaluation"),
+                leg_scale=config.leg_scale,
+                num_threads=num_threads,
+                progress=progress,
+                asked=counted,
             )
         if policy is not None:
             results["encoders"] = {
@@ -199,40 +204,6 @@ def evaluate(
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
     act = careful(task, goal)
     return lambda state, goal: act(task.abstraction(state), goal)
-
-
-def _in_target(
-    task: Task,
-    begin: Begin,
-    config: EvaluateConfig,
-    seed: int,
-    num_threads: int | None,
-    progress: Progress,
-    asked: RecordedRange | None,
-) -> tuple[Outcome, Tensor, float]:
-    """Return the outcome in the target, the states (T + 1, S) of the first episode, and target steps/s."""
-    legs = {} if config.leg_scale == 1.0 else {"leg_scale": config.leg_scale}
-    env = task.target(config.episodes, seed=derive(seed, "evaluation"), num_threads=num_threads, **legs)
-    env.reset()
-    act = begin(env.goal)
-    record = EpisodeRecord(env.position)
-    filmed = [env.state[0]]
-    began = time.perf_counter()
-    for step in range(task.objective.horizon):
-        is_filmed = bool(record.active[0])
-        action = act(env.state, env.goal)
-        if asked is not None:
-            asked.count(action, record.active)
-        outcome = env.step(action, record.active)
-        success = task.objective.succeeded(outcome.success, env.failed, step + 1)
-        record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
-        if is_filmed:
-            filmed.append(env.state[0])
-        rate = record.total_steps / (time.perf_counter() - began)
-        progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
-        if not record.active.any():
-            break
-    return record.outcome(), torch.stack(filmed), rate
 
 
 def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str, Tensor]:

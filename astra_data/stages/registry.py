@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from astra_data.grounding.fit import GroundConfig
 from astra_data.reports.artefacts import EVALUATION
+from astra_data.reports.choice import SELECTED
 from astra_data.stages.align import AlignConfig, align
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.collect import CollectConfig, collect
@@ -14,6 +15,7 @@ from astra_data.stages.ground import ground
 from astra_data.stages.label import label
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.report import ReportConfig, report
+from astra_data.stages.select import SelectConfig, select
 from astra_data.stages.subset import subset
 from astra_data.stages.train import train
 from astra_data.training.train import AnyTrainConfig
@@ -62,6 +64,11 @@ STAGES: dict[str, Stage] = {
         Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result="grounding.safetensors"),
         Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result="policy.safetensors"),
         Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result="target_encoder.safetensors"),
+        Stage(
+            *("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig),
+            asked_by="select",
+            result=SELECTED,
+        ),
         Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
         Stage("report", report, "recipe", ("evaluate",), ReportConfig),
     )

@@ -1,12 +1,11 @@
 """Report: the results of all rows and seeds of a recipe, as results.json, results.md and figures."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import Field, JsonValue
+from pydantic import Field
 
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, Share
@@ -17,9 +16,11 @@ from astra_data.core.progress import Progress
 from astra_data.methods import method_named
 from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.assembly import assemble
+from astra_data.reports.choice import SELECTED
 from astra_data.reports.command_replay import replay_commands
 from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
 from astra_data.reports.page import render
+from astra_data.reports.runs import Reported
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
 from astra_data.reports.statistics import REPLICATES
@@ -47,27 +48,6 @@ class ReportConfig(Config):
 
 
 DEFAULTS = ReportConfig()
-
-
-@dataclass(frozen=True)
-class Reported:
-    """What a report needs of a recipe, small enough to be sent to another process.
-
-    Attributes:
-        name: of the recipe's file, without its ending. task: name of a task.
-        methods: rows, in the order of the table. seeds: those to report, as far as they are finished.
-        groundings: row → the method whose grounding and alignment it uses.
-        settings: all settings of the recipe.
-        percents: dataset sizes in percent that every row is repeated on; empty if only on the whole.
-    """
-
-    name: str
-    task: str
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...]
-    groundings: Mapping[str, str]
-    settings: Mapping[str, JsonValue]
-    percents: tuple[int, ...] = ()
 
 
 def report(
@@ -101,7 +81,7 @@ def report(
 
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
-    evaluations = _evaluations(recipe, root)
+    read = _read(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
     sizes = _with_common_rows(
         assemble(
@@ -148,22 +128,24 @@ def report(
     progress(0.9, f"{len(images)} figures")
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
-        write_manifest(folder, evaluations)
+        write_manifest(folder, read)
     if publish is not None:
         kept = {} if add_to is None else published_figures(publish, recipe.name)
         publish_results(found, page, kept | images, publish)
     progress(1.0, _headline(sizes[-1]))
 
 
-def _evaluations(recipe: Reported, root: Path) -> dict[str, str]:
-    """Return the digest of each evaluation of the recipe that is finished, by its folder in `root`."""
+def _read(recipe: Reported, root: Path) -> dict[str, str]:
+    """Return the digest of each evaluation that is finished, and of a choice, by its folder in `root`."""
     folders = [
         f"evaluate/{row}/{place(seed, percent)}"
         for row in recipe.methods
         for percent in recipe.percents or (None,)
         for seed in recipe.seeds
     ]
-    files = {folder: root / folder / EVALUATION for folder in folders}
+    files = {folder: root / folder / EVALUATION for folder in folders} | {
+        "select": root / "select" / SELECTED
+    }
     return {folder: file_digest(file) for folder, file in files.items() if file.exists()}
 
 

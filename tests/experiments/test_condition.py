@@ -189,3 +189,39 @@ def test_the_command_lists_what_is_wrong_and_fails(recipe: Path, folder: Path) -
     assert f"  to do     {PLUS[1]}\n" in output
     assert isinstance(error, AstraDataError)
     assert f"{recipe}: " in str(error) and "damaged" in str(error) and "astra-data run" in str(error)
+
+
+def test_a_choice_is_made_again_once_there_are_more_policies(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "r.toml"
+    rows = 'task = "maze"\nmethods = ["nas"]\nseeds = [0, 1]\n'
+    recipe.write_text(rows + "[select]\n")
+    folder = run(recipe, root=tmp_path, jobs=1)
+    assert states(recipe, verify=False) == {}
+    recipe.write_text(rows.replace("[0, 1]", "[0, 1, 2]") + "[select]\n")
+    assert states(recipe)["select"] == ("stale", "made without train/nas/seed_2")
+    capsys.readouterr()
+    run(recipe, root=tmp_path, jobs=1)
+    why = "select is made again: stale (made without train/nas/seed_2)"
+    assert why in capsys.readouterr().out and states(recipe) == {}
+    # Of fewer policies it need not be made again.
+    run(recipe, root=tmp_path, jobs=1, seeds=[0, 1])
+    assert [path.name for path in (folder / "set_aside").iterdir()] == ["1"]
+    shutil.rmtree(folder / "train/nas/seed_1")
+    run(recipe, root=tmp_path, jobs=1, until="select")
+    assert states(recipe) == {}
+
+
+def test_a_choice_is_asked_for_by_its_table_which_changes_nothing_else(tmp_path: Path) -> None:
+    recipe, record = tmp_path / "r.toml", tmp_path / "r/recipe.json"
+    rows = 'task = "maze"\nmethods = ["nas"]\nseeds = [0, 1]\n'
+    recipe.write_text(rows)
+    folder = run(recipe, root=tmp_path, jobs=1)
+    assert not (folder / "select").exists() and "select" not in json.loads(record.read_text())
+    recipe.write_text(rows + "[select]\nsteps = 2\n")
+    run(recipe, root=tmp_path, jobs=1)
+    assert (folder / "select").is_dir() and not (folder / "set_aside").exists()
+    recipe.write_text(rows + "[select]\nsteps = 3\n")
+    with pytest.raises(AstraDataError, match=f"select changed in the recipe.* remove {folder}/select$"):
+        run(recipe, root=tmp_path, jobs=1)

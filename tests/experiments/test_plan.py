@@ -219,3 +219,67 @@ def test_a_recipe_with_data_labels_that_and_collects_nothing(
     ):
         with pytest.raises(RecipeError, match=expected):
             load(tmp_path, fake_recipe, 'data = "walks"\n' + HEAD + more)
+
+
+SELECT = HEAD.replace('"astra_plus"', '"astra_plus", "target", "nas"') + "[select]\nsteps = 3\n"
+
+
+def test_a_choice_reads_all_policies_and_groundings_that_it_needs(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    recipe = load(tmp_path, fake_recipe, SELECT)
+    planned = plan(recipe, tmp_path / "r.toml", tmp_path)
+    items = {item.key: item for item in planned}
+    rows, seeds = ("direct_transfer", "astra", "astra_plus", "nas"), (0, 7)
+    policies = {f"train/{row}/seed_{seed}" for row in rows for seed in seeds}  # neither follower nor target
+    groundings = {f"ground/{owner}/seed_{seed}" for owner in ("astra", "nas") for seed in seeds}
+    assert set(items["select"].inputs) == policies | groundings | {"pair/seed_0", "pair/seed_7"}
+    assert [item.key for item in planned][-2:] == ["select", "report"]
+    assert items["report"].inputs[-1] == "select"
+    call = items["select"].call
+    assert isinstance(call, partial) and call.keywords == {"root": tmp_path}
+    assert call.args[0].methods == recipe.methods and call.args[1].steps == 3
+    assert "select" not in {item.key for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path, tmp_path)}
+
+
+def test_one_seed_alone_is_not_judged(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, SELECT)
+    items = {item.key: item for item in plan(recipe, tmp_path, tmp_path, Selection.of(recipe, seeds=[7]))}
+    assert "select" not in items and "select" not in items["report"].inputs
+
+
+def test_the_judge_is_grounded_even_if_its_row_is_left_out(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, SELECT.replace("steps = 3", 'judge = "astra_again"'))
+    part = Selection.of(recipe, methods=["direct_transfer"])
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
+    assert "ground/astra/seed_7" in items and "ground/astra/seed_7" in items["select"].inputs
+    assert "ground/nas/seed_7" not in items["select"].inputs
+
+
+def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+    recipe = load(tmp_path, fake_recipe, SELECT + "[sweep]\npercent = [50, 150]\n")
+    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
+    inputs = items["select"].inputs
+    assert "train/nas/percent_050/seed_0" in inputs and "ground/nas/percent_150/seed_7" in inputs
+    assert "subset/percent_050/seed_7" in inputs and "pair/seed_7" not in inputs
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SELECT.replace("[0, 7]", "[0]"), "select: expected two seeds or more, got 1"),
+        (SELECT.replace(', "nas"]', "]"), "select.judge: expected a row that grounds its simulator"),
+        (SELECT + 'judge = "target"\n', "expected a row that grounds its simulator as judge, got target"),
+        (SELECT + 'judge = "nash"\n', "nash"),
+        (
+            HEAD.replace('"direct_transfer", "astra", "astra_plus"', '"target"')
+            + '[select]\njudge = "nas"\n',
+            "select: expected a row with policies of abstract states, got none",
+        ),
+    ],
+)
+def test_a_choice_that_cannot_be_made_is_refused(
+    text: str, message: str, tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    with pytest.raises(RecipeError, match=message):
+        load(tmp_path, fake_recipe, text)

@@ -1,5 +1,6 @@
 from fake_runs import bare_results
 
+from astra_data.reports.choice import Candidate, Judged, choice_of
 from astra_data.reports.comparing import summarised
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
@@ -47,3 +48,17 @@ def test_the_figure_is_on_the_page_where_it_was_drawn() -> None:
     page = render_sizes(FOUND, {"data_efficiency": "some.png"})
     assert "## Data efficiency\n\n![data_efficiency](some.png)\n\nAbove: where the robot was" in page
     assert "Below: success in the target over the size;" in page
+
+
+def test_what_was_chosen_is_a_line_for_each_size() -> None:
+    assert "Chosen without the target" not in render_sizes(FOUND, {})
+    one = Candidate(row="astra", seed=1, percent=50, success={0: 0.5, 2: 0.7})
+    judged = Judged(judge="nas", episodes=5, candidates=[one])
+    choice = choice_of(judged, 50, measured={("astra", 1): 0.4}, replicates=100)
+    small = SMALL.model_copy(update={"choice": choice})
+    sizes = [SizeResults(percent=50, results=small), FOUND.sizes[1]]
+    page = render_sizes(FOUND.model_copy(update={"sizes": sizes}), {})
+    assert "| 50 % | ASTRA, seed 1 | 0.60 | 0.40 | 0.00 | 0.00 |" in page and "| 100 % | ASTRA" not in page
+    untested = small.model_copy(update={"choice": choice_of(judged, 50, measured={}, replicates=100)})
+    page = render_sizes(FOUND.model_copy(update={"sizes": [SizeResults(percent=50, results=untested)]}), {})
+    assert "| 50 % | ASTRA, seed 1 | 0.60 | - | - | - |" in page

@@ -4,11 +4,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.stats import pearsonr, rankdata, spearmanr, trim_mean
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
-from astra_data.reports.statistics import Summary, correlation, probability_of_improvement, summarise
+from astra_data.reports.statistics import (
+    Summary,
+    correlation,
+    mean_interval,
+    mean_rank_correlation,
+    probability_of_improvement,
+    summarise,
+)
 
 Floats = NDArray[np.float64]
 
@@ -193,3 +201,47 @@ def test_missing_scores_are_refused(scores: list[float]) -> None:
         summarise(np.array(scores))
     with pytest.raises(BadInputError, match="one finite score per seed"):
         probability_of_improvement(np.array([0.1, 0.2]), np.array(scores))
+
+
+def test_the_mean_of_shares_has_students_interval() -> None:
+    shares = [0.2, 0.4, 0.3, 0.5]
+    expected = stats.t.interval(0.95, 3, loc=0.35, scale=stats.sem(shares))
+    assert mean_interval(shares) == pytest.approx(expected)
+    assert mean_interval([0.0, 1.0]) == (0.0, 1.0)
+
+
+def test_students_interval_covers_the_mean_where_a_bootstrap_does_not() -> None:
+    rng = np.random.default_rng(0)
+    samples = rng.beta(4, 4, (400, 4))
+    found = [mean_interval(list(sample)) for sample in samples]
+    assert np.mean([low <= 0.5 <= high for low, high in found]) == pytest.approx(0.95, abs=0.03)
+    resampled = np.array([rng.choice(sample, (500, 4)).mean(axis=1) for sample in samples])
+    low, high = np.quantile(resampled, [0.025, 0.975], axis=1)
+    assert np.mean((low <= 0.5) & (high >= 0.5)) < 0.87
+
+
+def test_ranks_are_correlated_within_rows() -> None:
+    rng = np.random.default_rng(0)
+    rows = [
+        {seed: (float(one), float(one + rng.normal())) for seed, one in enumerate(rng.normal(size=9))}
+        for _ in range(3)
+    ]
+    found = mean_rank_correlation(rows, least=3, replicates=500)
+    expected = np.mean([stats.spearmanr(*np.array(list(row.values())).T).statistic for row in rows])
+    assert found is not None and found.value == pytest.approx(expected)
+    assert -1 <= found.low < found.value < found.high <= 1
+    again = mean_rank_correlation(rows, least=3, replicates=500)
+    assert again == found
+    short = {seed: (float(seed), -float(seed)) for seed in (0, 1)}
+    assert mean_rank_correlation([*rows, short], least=3, replicates=10) is not None
+    assert mean_rank_correlation([*rows, short], least=3, replicates=500).value == found.value  # type: ignore[union-attr]
+    level = {seed: (1.0, float(seed)) for seed in range(5)}
+    assert mean_rank_correlation([short, level], least=3) is None
+
+
+def test_seeds_are_resampled_for_all_rows_at_once() -> None:
+    """Two rows with the same scores are no more certain than one."""
+    rng = np.random.default_rng(1)
+    row = {seed: (float(rng.normal()), float(rng.normal())) for seed in range(8)}
+    one, two = (mean_rank_correlation([row] * count, least=3, replicates=300) for count in (1, 2))
+    assert one == two

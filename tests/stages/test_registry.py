@@ -20,6 +20,7 @@ def test_a_stage_reads_earlier_ones() -> None:
         "ground": ("pair", "subset"),
         "train": ("pair", "subset", "ground"),
         "align": ("pair", "subset", "ground"),
+        "select": ("pair", "subset", "ground", "train"),
         "evaluate": ("train", "ground", "align"),
         "report": ("evaluate",),
     }
@@ -45,5 +46,5 @@ def test_datasets_are_made_of_seeds_and_sizes() -> None:
         *("collect", "label", "augment", "pair", "subset")
     ]
     assert {name: stage.asked_by for name, stage in STAGES.items() if stage.asked_by} == {
-        **{"collect": "collect", "label": "data", "augment": "augment"}
+        **{"collect": "collect", "label": "data", "augment": "augment", "select": "select"}
     }

@@ -18,6 +18,7 @@ from fake_runs import (
     FakeRecipe,
     edit_json,
     outcomes,
+    write_choice,
     write_elsewhere,
     write_evaluation,
     write_runs,
@@ -289,3 +290,35 @@ def test_of_lasting_tasks_the_page_tells_survived_steps_and_return(
     found = Results.model_validate_json(stored)
     assert found.scores == (SURVIVED_STEPS, RETURN)
     assert render(found, {name: f"{name}.png" for name in drawn}) == page
+
+
+def test_a_choice_without_the_target_is_reported(root: Path, tmp_path: Path) -> None:
+    write_choice(root)
+    make(root, tmp_path / "results")
+    choice = json.loads((root / "report/results.json").read_text())["choice"]
+    assert [(one["row"], one["seed"]) for one in choice["candidates"][:3]] == [
+        ("astra", s) for s in (2, 0, 1)
+    ]
+    # ASTRA has 0.5, 0.25 and 0.75 in the target, its ranks are right; the best there is ASTRA+ with 1.
+    assert choice["regret"] == pytest.approx(0.25)
+    assert choice["calibration"]["astra"]["signed"] == pytest.approx(0.4)
+    page = (tmp_path / "results/antmaze_u.md").read_text()
+    assert "**ASTRA, seed 2**, of 6 policies: predicted success 1.00 [1.00, 1.00]." in page
+    assert "| ASTRA | 2 | 1.00 | 1.00 [1.00, 1.00] | 3 | 0.75 |" in page
+    assert "| ASTRA | 3 | +0.40 | 0.40 |" in page and "| ASTRA+ | 3 | -0.58 | 0.58 |" in page
+    assert "Regret of the chosen, by success in the target: 0.25; of one drawn at random: 0.29." in page
+    assert "| select | 8 s | - |  |" in page
+    manifest = read_manifest(root / "report")
+    assert manifest and manifest.made_from["select"] == file_digest(root / "select/select.json")
+
+
+def test_a_published_choice_stays_where_there_is_no_other(root: Path, tmp_path: Path) -> None:
+    published = tmp_path / "results"
+    write_choice(root)
+    make(root, published)
+    before = json.loads((published / "antmaze_u.json").read_text())["choice"]
+    shutil.rmtree(root / "select")
+    make(root, published, add_to=published / "antmaze_u.json")
+    assert json.loads((published / "antmaze_u.json").read_text())["choice"] == before
+    make(root, published)
+    assert "choice" not in json.loads((published / "antmaze_u.json").read_text())

@@ -1,0 +1,47 @@
+"""The tables of recipes: their types and defaults, by stage and by method."""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator
+
+from astra_data.core.errors import BadInputError
+from astra_data.methods.method import Table
+from astra_data.stages.registry import Stage
+from astra_data.worlds.registry import task_named
+
+_FILLED: Any = Field(default_factory=dict, validate_default=True)
+"""A table that a recipe leaves out is read as an empty one."""
+
+
+def stage_field(stage: Stage) -> tuple[Any, Any]:
+    """Return the type and the default of a stage's table."""
+    if stage.name == "collect":
+        return stage.config | None, _FILLED
+    if stage.name == "select":
+        return stage.config | None, Field(default=None, exclude_if=lambda table: table is None)
+    return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
+
+
+def method_field(table: Table) -> tuple[Any, Any]:
+    """Return the type and the default of a method's table."""
+    if table.ranges is None:
+        return table.model, table.usual
+    return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
+
+
+def _laid_over(ranges: Literal["randomized", "wide"]) -> Callable[..., Any]:
+    """Return how a table of ranges is read: laid over `ranges` of the recipe's task."""
+
+    def read(overrides: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+        if "task" not in info.data or not isinstance(overrides, dict):
+            return check(overrides)
+        usual = getattr(task_named(info.data["task"]).varied, ranges)
+        found = check(usual.model_dump() | overrides)
+        try:
+            found.of_kind(type(usual))
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return found
+
+    return read

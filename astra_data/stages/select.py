@@ -1,0 +1,235 @@
+"""Select: choose among a recipe's policies without the target, by simulators of other episodes.
+
+A judge is the grounding of another seed, which has episodes of its own. Its states are scattered as the
+target's are around it, and where it has a failure model, that ends episodes.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.checkpoint import finished_folder
+from astra_data.core.config import AtOnce, Config
+from astra_data.core.digest import file_digest
+from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
+from astra_data.core.naming import base_method, place, reference_of
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.dataset.meta_files import read_description
+from astra_data.grounding.files import load_grounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.methods import method_named
+from astra_data.reports.choice import SELECTED, Candidate, Judged
+from astra_data.reports.choice_page import select_page
+from astra_data.reports.runs import Reported
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.judging import Judge
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.worlds.registry import task_named
+
+FOLDER = "select"
+_POLICY, _GROUNDING = "policy.safetensors", "grounding.safetensors"
+_BEGUN = "begun.json"
+"""Digests of a policy and of its judge → success, of a choice that was interrupted."""
+
+
+class SelectConfig(Config):
+    """How policies are chosen without the target."""
+
+    episodes: AtOnce = 100
+    """Of each policy with each judge, in one batch."""
+    judge: str | None = None
+    """Row whose groundings judge; by default the reference, NAS."""
+
+
+DEFAULTS = SelectConfig()
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A policy to judge: the keys of its artefacts in a run's folder; `grounding` is None without one."""
+
+    row: str
+    seed: int
+    percent: int | None
+    policy: str
+    grounding: str | None
+
+    def load(self, root: Path, task: str) -> DeployedPolicy:
+        """Return the policy, with the encoder of its own grounding."""
+        model = load_grounding(root / self.grounding / _GROUNDING) if self.grounding else NO_GROUNDING
+        return deploy(task_named(task), PolicyFile.load(root / self.policy / _POLICY), model)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Who is judged by whom at one size of the dataset.
+
+    Attributes:
+        percent: the size, if there are several. entries: the policies.
+        judges: the seed of each judge → the keys of its grounding and of the dataset it was fitted to.
+    """
+
+    percent: int | None
+    entries: tuple[Entry, ...]
+    judges: dict[int, tuple[str, str]]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The artefacts that are read, each once."""
+        read = [key for one in self.entries for key in (one.policy, one.grounding) if key]
+        return tuple(dict.fromkeys([*read, *(key for judge in self.judges.values() for key in judge)]))
+
+    def finished(self, root: Path) -> "Bench":
+        """Return those whose artefacts are in a run's folder."""
+        entries = [
+            one
+            for one in self.entries
+            if (root / one.policy / _POLICY).is_file()
+            and (one.grounding is None or (root / one.grounding / _GROUNDING).is_file())
+        ]
+        judges = {seed: of for seed, of in self.judges.items() if (root / of[0] / _GROUNDING).is_file()}
+        return Bench(self.percent, tuple(entries), judges)
+
+
+def judge_of(judge: str | None, rows: tuple[str, ...]) -> str:
+    """Return the method whose groundings judge the policies of `rows`, by default the reference.
+
+    Raises:
+        BadInputError: it grounds nothing.
+    """
+    asked = judge or reference_of(rows)
+    if asked is None or not method_named(asked).grounds:
+        known = "none, and NAS is not among the rows" if asked is None else asked
+        raise BadInputError(f"expected a row that grounds its simulator as judge, got {known}")
+    return _owner(asked)
+
+
+def benches(recipe: Reported, judge: str) -> list[Bench]:
+    """Return who is judged by whom, at each size; policies that do not act on abstract states are not."""
+    able = [row for row in recipe.methods if method_named(row).trains and not method_named(row).steps_target]
+    return [_bench(recipe, able, judge, percent) for percent in recipe.percents or (None,)]
+
+
+def digests(of: list[Bench], root: Path) -> dict[str, str]:
+    """Return the digest of each artefact that is read, by its key."""
+    keys = dict.fromkeys(key for bench in of for key in bench.keys)
+    return {key: _digest(root / key) for key in keys}
+
+
+def select(
+    recipe: Reported,
+    config: SelectConfig = DEFAULTS,
+    *,
+    root: Path,
+    progress: Progress = silent,
+) -> None:
+    """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked.
+
+    Where a recipe has `data`, all seeds share their episodes, and the page says so. Policies of a size are
+    judged by groundings of that size. An interrupted call goes on with the next policy.
+
+    Args:
+        recipe: names the task, the rows and the seeds.
+        config: the recipe's `[select]`.
+        root: the recipe's folder of runs.
+        progress: called with the fraction done and a note.
+
+    Raises:
+        BadInputError: there is no policy, no judge, or there are groundings of fewer than two seeds.
+    """
+    judge = judge_of(config.judge, tuple(recipe.settings["methods"]))  # type: ignore[arg-type]
+    contests = [bench.finished(root) for bench in benches(recipe, judge)]
+    for bench in contests:
+        _check(bench, recipe, root, judge)
+    made_from, stopwatch = digests(contests, root), Stopwatch()
+    total, found = sum(len(bench.entries) for bench in contests), list[Candidate]()
+    with finished_folder(root / FOLDER, config=config.model_dump_json(indent=1)) as folder:
+        begun = folder / _BEGUN
+        known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
+        for bench in contests:
+            judges = dict(_judges(bench, recipe.task, root))
+            for entry in bench.entries:
+                policy, success = entry.load(root, recipe.task), {}
+                for other, one in judges.items():
+                    if other == entry.seed:
+                        continue
+                    read = f"{made_from[entry.policy]}/{made_from[bench.judges[other][0]]}"
+                    if read not in known:
+                        drawn = derive(other, f"judged: {entry.seed}")
+                        known[read] = one.success(policy, config.episodes, drawn)
+                    success[other] = known[read]
+                write_file(begun, json.dumps(known))
+                found.append(
+                    Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success)
+                )
+                note = f"{entry.row}, seed {entry.seed}: {found[-1].predicted:.2f}"
+                progress(len(found) / total * 0.99, note)
+        record: dict[str, Any] = {
+            "judge": judge,
+            "episodes": config.episodes,
+            "shares_episodes": recipe.settings.get("data") is not None,
+            "candidates": found,
+        }
+        judged = Judged(**record | origin() | stopwatch.spent())
+        begun.unlink()
+        (folder / SELECTED).write_text(judged.model_dump_json(indent=1))
+        (folder / "select.md").write_text(select_page(recipe.name, judged))
+        write_manifest(folder, made_from)
+    first = judged.ranked(judged.percents[-1])[0]
+    progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")
+
+
+def _owner(row: str) -> str:
+    """Return the method whose grounding a row uses."""
+    return method_named(row).grounded_as or base_method(row)
+
+
+def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
+    dataset = "pair" if percent is None else "subset"
+    where = {seed: place(seed, percent) for seed in recipe.seeds}
+    entries = [
+        Entry(
+            row,
+            seed,
+            percent,
+            f"train/{row}/{where[seed]}",
+            f"ground/{_owner(row)}/{where[seed]}" if method_named(row).grounds else None,
+        )
+        for row in rows
+        for seed in recipe.seeds
+    ]
+    judges = {seed: (f"ground/{judge}/{of}", f"{dataset}/{of}") for seed, of in where.items()}
+    return Bench(percent, tuple(entries), judges)
+
+
+def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
+    size = f" at {bench.percent} %" if bench.percent else ""
+    if not bench.entries:
+        named = ", ".join(recipe.methods)
+        raise BadInputError(f"{root}: found no policy of {named}{size}: run the recipe until train first")
+    if len(bench.judges) < 2:
+        raise BadInputError(
+            f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
+            "a policy is judged by those of other episodes; add seeds to the recipe and run it"
+        )
+
+
+def _judges(bench: Bench, task: str, root: Path) -> Iterator[tuple[int, Judge]]:
+    """Yield the judges by their seeds."""
+    for seed, (grounding, dataset) in bench.judges.items():
+        made = load_grounding(root / grounding / _GROUNDING)
+        yield seed, Judge.of(task_named(task), made, PairedEpisodes.load(root / dataset))
+
+
+def _digest(folder: Path) -> str:
+    files = [folder / name for name in (_POLICY, _GROUNDING)]
+    file = next((file for file in files if file.is_file()), None)
+    return file_digest(file) if file else str(read_description(folder)["content_hash"])

@@ -1,0 +1,42 @@
+"""Judge policies without the target: by a simulator that was fitted to other episodes than theirs."""
+
+from dataclasses import dataclass
+from functools import partial
+from statistics import fmean
+
+from torch import Tensor
+
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.own_world import in_simulator, started
+from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.worlds.task import Task
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A grounding of other episodes, and the factor (X, X) of the target's scatter around it."""
+
+    task: Task
+    grounding: FittedGrounding
+    scatter: Tensor
+
+    @classmethod
+    def of(cls, task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> "Judge":
+        """Return the judge that a grounding makes, with the scatter of the `episodes` it was fitted to."""
+        return cls(task, grounding, grounding.scatter(episodes))
+
+    def simulator(self, episodes: int) -> SimulatorEnv:
+        """Return its simulator, in which its failure model ends episodes, if it has one."""
+        made = self.grounding
+        foresees = isinstance(made, HistoryGrounding) and made.failures is not None
+        simulator = made.simulator(self.task, episodes, scatter=self.scatter)
+        return SimulatorEnv(self.task.objective, simulator, topple=foresees)
+
+    def success(self, policy: DeployedPolicy, episodes: int, seed: int) -> float:
+        """Return the share of so many episodes in which a policy succeeds; starts and goals are of `seed`."""
+        begin = partial(started, policy, policy.act_in_simulator)
+        outcome, _ = in_simulator(self.simulator(episodes), begin, self.task.objective.horizon, seed)
+        return fmean(outcome.success)

@@ -1,0 +1,68 @@
+"""Run a policy in the target environment."""
+
+import time
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from astra_data.core.progress import Progress, silent
+from astra_data.training.episode_record import EpisodeRecord, Outcome
+from astra_data.training.own_world import Begin
+from astra_data.training.recorded_range import RecordedRange
+from astra_data.worlds.task import Task
+
+
+class TargetEpisodes(NamedTuple):
+    """Episodes in the target: their outcome, the states (T + 1, S) of the first, and target steps/s."""
+
+    outcome: Outcome
+    filmed: Tensor
+    rate: float
+
+
+def in_target(
+    task: Task,
+    begin: Begin,
+    episodes: int,
+    seed: int,
+    *,
+    leg_scale: float = 1.0,
+    num_threads: int | None = None,
+    progress: Progress = silent,
+    asked: RecordedRange | None = None,
+) -> TargetEpisodes:
+    """Run so many episodes side by side; starts and goals depend on the seed alone.
+
+    Args:
+        task: with a target.
+        begin: starts the policy.
+        episodes: their number.
+        seed: of the target.
+        leg_scale: of the ant.
+        num_threads: of the physics, by default one per core; the outcome is the same with any number.
+        progress: called with the fraction done and the speed.
+        asked: counts commands beyond what was recorded.
+    """
+    legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
+    env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
+    env.reset()
+    act = begin(env.goal)
+    record = EpisodeRecord(env.position)
+    filmed = [env.state[0]]
+    began = time.perf_counter()
+    for step in range(task.objective.horizon):
+        is_filmed = bool(record.active[0])
+        action = act(env.state, env.goal)
+        if asked is not None:
+            asked.count(action, record.active)
+        outcome = env.step(action, record.active)
+        success = task.objective.succeeded(outcome.success, env.failed, step + 1)
+        record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
+        if is_filmed:
+            filmed.append(env.state[0])
+        rate = record.total_steps / (time.perf_counter() - began)
+        progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
+        if not record.active.any():
+            break
+    return TargetEpisodes(record.outcome(), torch.stack(filmed), rate)

@@ -1,0 +1,55 @@
+"""A small run on the rail: seeds and rows that are trained and not tested, in seconds."""
+
+from pathlib import Path
+
+from astra_data.core.progress import silent
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.plan import plan, stage_of
+
+ROOT = Path(__file__).parents[1]
+SMALL = """
+[collect]
+episodes = 8
+max_steps = 40
+start = "task"
+hold_s = [0.1, 0.4]
+[ground]
+updates = 3
+window = 5
+held_out_share = 0.25
+failure_members = 2
+[train]
+num_envs = 4
+rollout_steps = 8
+total_steps = 32
+hidden_sizes = [8]
+memory_size = 4
+[align]
+updates = 2
+batch_windows = 2
+window = 5
+held_out_share = 0.25
+[evaluate]
+episodes = 3
+"""
+
+
+def write_recipe(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", more: str = "") -> Path:
+    """Write the recipe of such a run."""
+    path = place / "rail.toml"
+    task = f'task = "{ROOT}/tests/small_cart.py:TASK"\n'
+    rows = methods or '["direct_transfer", "nas"]'
+    path.write_text(f"{task}methods = {rows}\nseeds = {seeds}\n{SMALL}{more}")
+    return path
+
+
+def make_rail_run(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", more: str = "") -> Path:
+    """Make such a run up to its policies; return its folder."""
+    path = write_recipe(place, seeds=seeds, methods=methods, more=more)
+    experiment = load_experiment(path, place / "runs")
+    made = ("collect", "pair", "subset", "ground", "train", "align")
+    for item in plan(experiment.recipe, path, experiment.folder):
+        if stage_of(item) in made:
+            item.call(progress=silent)
+    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    return experiment.folder

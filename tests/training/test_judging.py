@@ -1,0 +1,68 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rail_run import make_rail_run
+from small_cart import TASK
+
+from astra_data.grounding.files import load_grounding
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.training import judging
+from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.judging import Judge
+from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.simulator_env import SimulatorEnv
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_rail_run(tmp_path_factory.mktemp("judging"), seeds="[0]", methods='["nas"]')
+
+
+@pytest.fixture
+def judge(folder: Path) -> Judge:
+    made = load_grounding(folder / "ground/nas/seed_0/grounding.safetensors")
+    return Judge.of(TASK, made, PairedEpisodes.load(folder / "pair/seed_0"))
+
+
+@pytest.fixture
+def policy(folder: Path, judge: Judge) -> DeployedPolicy:
+    return deploy(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
+
+
+def test_a_judge_is_the_scattered_simulator_that_ends_episodes_by_its_failure_model(
+    judge: Judge, policy: DeployedPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def seen(world: SimulatorEnv, begin: object, horizon: int, seed: int) -> object:
+        made.append((world, horizon, seed))
+        raise StopIteration
+
+    monkeypatch.setattr(judging, "in_simulator", seen)
+    with pytest.raises(StopIteration):
+        judge.success(policy, 5, 7)
+    world, horizon, seed = made[0]
+    assert horizon == TASK.objective.horizon and seed == 7 and world.num_envs == 5
+    grounding: Any = judge.grounding
+    assert isinstance(grounding, HistoryGrounding) and grounding.failures is not None
+    assert world.topple  # episodes end where the failure model says
+    assert grounding.model.residual_factor.abs().sum() > 0
+    simulator: Any = world.simulator
+    assert torch.equal(simulator.scatter, grounding.model.residual_factor)
+
+
+def test_success_is_the_share_of_the_episodes(
+    judge: Judge, policy: DeployedPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy that drives on reaches every goal within the horizon, where nothing fails."""
+    monkeypatch.setattr(judging, "HistoryGrounding", int)
+    for speed, success in ((0.5, 1.0), (-0.6, 0.0)):
+
+        def act(_: object, state: object, goal: torch.Tensor, speed: float = speed) -> torch.Tensor:
+            return goal * 0 + speed
+
+        monkeypatch.setattr(DeployedPolicy, "act_in_simulator", act)
+        assert judge.success(policy, 5, 0) == success
