@@ -156,7 +156,8 @@ class HistoryFit:
                 "correction": training.steps(windows.next_state - windows.simulated_next),
             }
         )
-        model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
+        rewards, goes_on = training.steps(windows.reward), training.steps(windows.goes_on)
+        model.set_reward_scales(rewards, goes_on, config.failure_weight)
         metrics = _optimise(model, self.weights(config), fitting)
         _fit_scatter(model, fitting.held_out)
         if not config.failure_members:
@@ -169,8 +170,8 @@ class HistoryFit:
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     """Subtract the task's own reward on abstract states from the rewards in the windows of `episodes`.
 
-    Where abstract states show that the goal is reached, or out of reach, but the target goes on, the residual
-    is zero: there the simulator ends the episode, and R_pred is not used.
+    Where abstract states show that the goal is reached, or out of reach, but the target goes on, there is no
+    residual: there the simulator ends the episode, and R_pred is not used.
     """
     windows, objective = episodes.windows, task.objective
     before, after, goal = (
@@ -180,15 +181,15 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     own = objective.reward(before, after, goal, torch.zeros_like(decided))
     going_on, failing = windows.reward.unbind(-1)
     own, decided = own.reshape(going_on.shape), decided.reshape(going_on.shape)
-    is_used = windows.mask.bool() & ~decided
+    goes_on = windows.goes_on * ~decided
     residual = torch.stack(
         [
-            torch.where(is_used & ~episodes.terminated, going_on - own, 0.0),
-            torch.where(is_used & (failing != 0), failing - own, failing),
+            torch.where(goes_on.bool(), going_on - own, 0.0),
+            torch.where(~decided & (failing != 0), failing - own, failing),
         ],
         dim=-1,
     )
-    return replace(episodes, windows=replace(windows, reward=residual))
+    return replace(episodes, windows=replace(windows, reward=residual, goes_on=goes_on))
 
 
 def _optimise(model: GroundingModel, weights: LossWeights, fitting: Fitting) -> dict[str, Any]:
