@@ -1,5 +1,6 @@
 """Fit the failure model, and measure how well failures are foreseen."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.seeding import derive
+from astra_data.grounding.calibration import calibration, folds
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.failure import FailureModel, FailureShape
@@ -28,19 +30,39 @@ _BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) -> FailureModel | None:
-    """Fit a failure model of `members` networks to whole episodes.
+    """Fit a failure model of `members` networks to whole episodes, and calibrate it by cross-fitting.
 
     Returns:
         None where no step is before a failure, or every one.
     """
     windows = training.windows
-    mask = windows.mask.bool()
-    fails = windows.topples_soon[mask]
-    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
-    if not len(failing) or not len(going_on):
+    fails = windows.topples_soon
+    if not _has_both(training.steps(fails)):
         return None
-    maze, device = task.objective.layout, windows.mask.device
     torch.manual_seed(derive(seed, "failure model"))
+    untrained = _untrained(task, training, members)
+    inputs = untrained.histories(windows)[0]
+    model = _descended(untrained, training.steps(inputs), training.steps(fails))
+    odds, happened = [], []
+    for fold in folds(fails.any(1)):
+        others = training.select((~fold).nonzero().squeeze(1))
+        if not _has_both(others.steps(others.windows.topples_soon)):
+            continue
+        fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.topples_soon))
+        own = training.select(fold.nonzero().squeeze(1))
+        odds.append(fitted.log_odds(own.steps(inputs[fold])).detach())
+        happened.append(own.steps(own.windows.topples_soon))
+    if odds and _has_both(torch.cat(happened)):
+        model.calibrate(*calibration(torch.cat(odds, dim=1), torch.cat(happened)))
+    return model.requires_grad_(False).eval()
+
+
+def _has_both(fails: Tensor) -> bool:
+    return bool(fails.any() and not fails.all())
+
+
+def _untrained(task: Task, training: PairedEpisodes, members: int) -> FailureModel:
+    windows, maze = training.windows, task.objective.layout
     shape = FailureShape(
         state_size=windows.state.shape[-1],
         action_size=windows.action.shape[-1],
@@ -49,21 +71,26 @@ def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) 
         cell_m=maze.fine_m if maze else 1.0,
         members=members,
     )
-    model = FailureModel(shape).to(device)
+    model = FailureModel(shape).to(windows.mask.device)
     if maze is not None:
         model.clearance.copy_(torch.from_numpy(maze.clearance_field))
         model.half_extent.copy_(torch.from_numpy(maze.half_extent))
     model.set_scales(windows)
-    inputs = model.histories(windows)[0][mask]
+    return model
+
+
+def _descended(untrained: FailureModel, inputs: Tensor, fails: Tensor) -> FailureModel:
+    """Return a copy of `untrained`, fitted to inputs (N, I) of steps and whether they fail soon (N,)."""
+    model = copy.deepcopy(untrained)
+    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
     descent = Descent(model, _DESCENT, weight_decay=_WEIGHT_DECAY)
     few = round(_BATCH * _FAILING_SHARE)
     while not descent.is_over:
         rows = torch.cat([_drawn(failing, few), _drawn(going_on, _BATCH - few)])
         odds = model.log_odds(inputs[rows])
         descent.update(functional.binary_cross_entropy_with_logits(odds, fails[rows].expand_as(odds)))
-    rate = fails.mean()
-    model.log_odds_shift.copy_(rate.logit() - torch.tensor(_FAILING_SHARE).logit())
-    return model.requires_grad_(False).eval()
+    model.log_odds_shift.copy_(fails.mean().logit() - torch.tensor(_FAILING_SHARE).logit())
+    return model.eval()
 
 
 def _drawn(rows: Tensor, count: int) -> Tensor:

@@ -148,6 +148,14 @@ class FailureModel(nn.Module):
         normal = normalised(inputs, self.input_mean, self.input_std)
         return torch.stack([member(normal).squeeze(-1) for member in self.members])
 
+    @torch.no_grad()
+    def calibrate(self, scale: Tensor, shift: Tensor) -> None:
+        """Scale what each member says, and let `shift` tell how frequent failures are."""
+        for member in self.members:
+            for parameter in list(member.parameters())[-2:]:
+                parameter.mul_(scale)
+        self.log_odds_shift.copy_(shift)
+
     def hazard(self, probability: Tensor) -> Tensor:
         """Return the probability (...) of a failure in the very step, given that within `RISK_STEPS`."""
         return probability / RISK_STEPS
