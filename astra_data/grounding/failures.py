@@ -1,6 +1,7 @@
 """Fit the failure model, and measure how well failures are foreseen."""
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
 _WEIGHT_DECAY = 1.0
 _DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
-_BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
 
 
@@ -113,12 +114,14 @@ def compared_foresight(
     return {name: foresight(probability, held_out) for name, probability in compared.items()}
 
 
-def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
+def foresight(
+    probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
+) -> dict[str, Any]:
     """Measure probabilities (E, T) of a failure within `RISK_STEPS` on episodes that were not fitted.
 
     Returns:
-        "failures": of the episodes. "auc": by window before the failure, the probability that a step there
-        is ranked above one with no failure within 40 steps; None where there are no such steps.
+        "failures": of the episodes. "auc": by window `ahead` of the failure, the probability that a step
+        there is ranked above one with no failure up to the end of the last; None without such steps.
         "brier_skill": the share of the squared error of always saying the rate that is removed, None where
         there is no such error. "reliability": predicted and observed rate, and number of steps, by predicted
         probability. All but the first None without failures.
@@ -130,15 +133,15 @@ def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
     if not count:
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), mask.shape[1] + 1)
-    safe = probability[mask & (left > AHEAD_STEPS[-1][1])].numpy(force=True)
+    safe = probability[mask & (left > ahead[-1][1])].numpy(force=True)
     auc: dict[str, float | None] = {}
-    for first, last in AHEAD_STEPS:
+    for first, last in ahead:
         before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
         pairs = len(before) * len(safe)
         auc[f"{first}-{last}"] = float(mannwhitneyu(before, safe).statistic / pairs) if pairs else None
     predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)
     usual = np.square(happened - happened.mean()).mean()
-    bins = np.digitize(predicted, _BINS[1:-1])
+    bins = np.digitize(predicted, BINS[1:-1])
     return {
         "failures": count,
         "auc": auc,

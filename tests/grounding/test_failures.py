@@ -73,6 +73,9 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     auc = foresight(said, episodes)["auc"]
     # Ten of the twenty steps of the neighbouring windows are above all calm ones, ten level with them.
     assert auc == {"1-20": pytest.approx(0.75), "11-30": 1.0, "21-40": pytest.approx(0.75)}
+    # Before the last window of others, its steps are calm ones, too: 20 of 110 on the level.
+    near = foresight(said, episodes, [(11, 20)])["auc"]
+    assert near == {"11-20": pytest.approx((130 + 10 / 2) / 140)}
 
 
 def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
