@@ -27,6 +27,7 @@ def toy_episodes(
     """
     nothing = torch.zeros(state.shape[:2])
     none = torch.zeros(*state.shape[:2], 2)
+    ended = nothing.bool() if terminated is None else terminated
     windows = PairedWindows(
         state=state,
         action=action,
@@ -35,13 +36,14 @@ def toy_episodes(
         simulated_next=next_state if simulated_next is None else simulated_next,
         next_state=next_state,
         reward=none if parts is None else parts,
+        goes_on=1.0 - ended.float(),
         topples_soon=nothing,
         mask=torch.ones_like(nothing) if mask is None else mask,
     )
     return PairedEpisodes(
         target_state=torch.zeros(*state.shape[:2], 29) if target_state is None else target_state,
         reward=nothing if reward is None else reward,
-        terminated=nothing.bool() if terminated is None else terminated,
+        terminated=ended,
         windows=windows,
         reference="toy@data-1.0.0",
         content_hash="0",
@@ -50,4 +52,4 @@ def toy_episodes(
 
 def no_episodes() -> PairedEpisodes:
     empty = torch.zeros(1, 1)
-    return PairedEpisodes(empty, empty, empty.bool(), PairedWindows(*[empty] * 9), "toy@data-1.0.0", "abc")
+    return PairedEpisodes(empty, empty, empty.bool(), PairedWindows(*[empty] * 10), "toy@data-1.0.0", "abc")

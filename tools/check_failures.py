@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from astra_data.grounding.failures import compared_foresight, fit_failures, foresight
+from astra_data.grounding.failures import AHEAD_STEPS, compared_foresight, fit_failures, foresight
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -33,11 +33,15 @@ def main(
     episodes: Annotated[list[int] | None, typer.Option(help="First episodes to fit to, besides all.")] = None,
     grounding: Annotated[list[Path] | None, typer.Option(help="Folders of history groundings.")] = None,
     members: Annotated[int, typer.Option(help="Networks of each failure model.")] = 5,
+    ahead: Annotated[list[str] | None, typer.Option(help='Steps before a failure, such as "1-5".')] = None,
 ) -> None:
     """Print a line for each model and dataset."""
     world, measured = task_named(task), {path.name: PairedEpisodes.load(path) for path in fresh}
-    print("| fitted to | episodes | failures | on | 1-20 | 11-30 | 21-40 | Brier skill |")
-    print("|---|---|---|---|---|---|---|---|")
+    windows = [(int(first), int(last)) for first, _, last in (one.partition("-") for one in ahead or ())]
+    windows = windows or list(AHEAD_STEPS)
+    titles = " | ".join(f"{first}-{last}" for first, last in windows)
+    print(f"| fitted to | episodes | failures | on | {titles} | Brier skill |")
+    print("|---|---|---|---|" + "---|" * (len(windows) + 1))
     for path in pairs:
         whole = PairedEpisodes.load(path)
         for count in [*(episodes or []), len(whole)]:
@@ -47,7 +51,7 @@ def main(
             if model is None:
                 continue
             for name, others in measured.items():
-                found = foresight(model.probability(model.histories(others.windows)[0]), others)
+                found = foresight(model.probability(model.histories(others.windows)[0]), others, windows)
                 print(f"| {path.name} | {count} | {failures} | {name} {_figures(found)}")
     for path in grounding or []:
         made = load_grounding(path / "grounding.safetensors")

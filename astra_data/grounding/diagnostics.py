@@ -27,7 +27,8 @@ def telemetry(
     if weights.reward > 0:
         going_on, failing = model.predict_reward_parts(latent, windows.action)[mask].unbind(-1)
         reward, failed = windows.reward[mask][:, 0], windows.reward[mask][:, 1] != 0
-        figures["r2_reward"] = _r2(going_on[~failed], reward[~failed])
+        goes_on = windows.goes_on[mask].bool()
+        figures["r2_reward"] = _r2(going_on[goes_on], reward[goes_on])
         figures["r2_final_reward"] = _r2(failing, failed * model.failure_cost)
     if weights.latent > 0:
         mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])

@@ -1,5 +1,7 @@
 """Fit the failure model, and measure how well failures are foreseen."""
 
+import copy
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.seeding import derive
+from astra_data.grounding.calibration import calibration, folds
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.failure import FailureModel, FailureShape
@@ -23,24 +26,44 @@ _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
 _WEIGHT_DECAY = 1.0
 _DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
-_BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
 
 
 def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) -> FailureModel | None:
-    """Fit a failure model of `members` networks to whole episodes.
+    """Fit a failure model of `members` networks to whole episodes, and calibrate it by cross-fitting.
 
     Returns:
         None where no step is before a failure, or every one.
     """
     windows = training.windows
-    mask = windows.mask.bool()
-    fails = windows.topples_soon[mask]
-    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
-    if not len(failing) or not len(going_on):
+    fails = windows.topples_soon
+    if not _has_both(training.steps(fails)):
         return None
-    maze, device = task.objective.layout, windows.mask.device
     torch.manual_seed(derive(seed, "failure model"))
+    untrained = _untrained(task, training, members)
+    inputs = untrained.histories(windows)[0]
+    model = _descended(untrained, training.steps(inputs), training.steps(fails))
+    odds, happened = [], []
+    for fold in folds(fails.any(1)):
+        others = training.select((~fold).nonzero().squeeze(1))
+        if not _has_both(others.steps(others.windows.topples_soon)):
+            continue
+        fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.topples_soon))
+        own = training.select(fold.nonzero().squeeze(1))
+        odds.append(fitted.log_odds(own.steps(inputs[fold])).detach())
+        happened.append(own.steps(own.windows.topples_soon))
+    if odds and _has_both(torch.cat(happened)):
+        model.calibrate(*calibration(torch.cat(odds, dim=1), torch.cat(happened)))
+    return model.requires_grad_(False).eval()
+
+
+def _has_both(fails: Tensor) -> bool:
+    return bool(fails.any() and not fails.all())
+
+
+def _untrained(task: Task, training: PairedEpisodes, members: int) -> FailureModel:
+    windows, maze = training.windows, task.objective.layout
     shape = FailureShape(
         state_size=windows.state.shape[-1],
         action_size=windows.action.shape[-1],
@@ -49,21 +72,26 @@ def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) 
         cell_m=maze.fine_m if maze else 1.0,
         members=members,
     )
-    model = FailureModel(shape).to(device)
+    model = FailureModel(shape).to(windows.mask.device)
     if maze is not None:
         model.clearance.copy_(torch.from_numpy(maze.clearance_field))
         model.half_extent.copy_(torch.from_numpy(maze.half_extent))
     model.set_scales(windows)
-    inputs = model.histories(windows)[0][mask]
+    return model
+
+
+def _descended(untrained: FailureModel, inputs: Tensor, fails: Tensor) -> FailureModel:
+    """Return a copy of `untrained`, fitted to inputs (N, I) of steps and whether they fail soon (N,)."""
+    model = copy.deepcopy(untrained)
+    failing, going_on = fails.nonzero().squeeze(1), (fails == 0).nonzero().squeeze(1)
     descent = Descent(model, _DESCENT, weight_decay=_WEIGHT_DECAY)
     few = round(_BATCH * _FAILING_SHARE)
     while not descent.is_over:
         rows = torch.cat([_drawn(failing, few), _drawn(going_on, _BATCH - few)])
         odds = model.log_odds(inputs[rows])
         descent.update(functional.binary_cross_entropy_with_logits(odds, fails[rows].expand_as(odds)))
-    rate = fails.mean()
-    model.log_odds_shift.copy_(rate.logit() - torch.tensor(_FAILING_SHARE).logit())
-    return model.requires_grad_(False).eval()
+    model.log_odds_shift.copy_(fails.mean().logit() - torch.tensor(_FAILING_SHARE).logit())
+    return model.eval()
 
 
 def _drawn(rows: Tensor, count: int) -> Tensor:
@@ -89,12 +117,14 @@ def compared_foresight(
     return {name: foresight(probability, held_out) for name, probability in compared.items()}
 
 
-def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
+def foresight(
+    probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
+) -> dict[str, Any]:
     """Measure probabilities (E, T) of a failure within `RISK_STEPS` on episodes that were not fitted.
 
     Returns:
-        "failures": of the episodes. "auc": by window before the failure, the probability that a step there
-        is ranked above one with no failure within 40 steps; None where there are no such steps.
+        "failures": of the episodes. "auc": by window `ahead` of the failure, the probability that a step
+        there is ranked above one with no failure up to the end of the last; None without such steps.
         "brier_skill": the share of the squared error of always saying the rate that is removed, None where
         there is no such error. "reliability": predicted and observed rate, and number of steps, by predicted
         probability. All but the first None without failures.
@@ -106,15 +136,15 @@ def foresight(probability: Tensor, episodes: PairedEpisodes) -> dict[str, Any]:
     if not count:
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), mask.shape[1] + 1)
-    safe = probability[mask & (left > AHEAD_STEPS[-1][1])].numpy(force=True)
+    safe = probability[mask & (left > ahead[-1][1])].numpy(force=True)
     auc: dict[str, float | None] = {}
-    for first, last in AHEAD_STEPS:
+    for first, last in ahead:
         before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
         pairs = len(before) * len(safe)
         auc[f"{first}-{last}"] = float(mannwhitneyu(before, safe).statistic / pairs) if pairs else None
     predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)
     usual = np.square(happened - happened.mean()).mean()
-    bins = np.digitize(predicted, _BINS[1:-1])
+    bins = np.digitize(predicted, BINS[1:-1])
     return {
         "failures": count,
         "auc": auc,

@@ -187,7 +187,8 @@ def _fitted(
             "correction": training.steps(windows.next_state - windows.simulated_next),
         }
     )
-    model.set_reward_scales(training.steps(windows.reward), config.failure_weight)
+    rewards, goes_on = training.steps(windows.reward), training.steps(windows.goes_on)
+    model.set_reward_scales(rewards, goes_on, config.failure_weight)
     fitting = replace(whole, training=training, seed=seed, progress=progress)
     return model, _optimise(model, weights, fitting, whole.folder / name)
 
@@ -195,8 +196,8 @@ def _fitted(
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     """Subtract the task's own reward on abstract states from the rewards in the windows of `episodes`.
 
-    Where abstract states show that the goal is reached, or out of reach, but the target goes on, the residual
-    is zero: there the simulator ends the episode, and R_pred is not used.
+    Where abstract states show that the goal is reached, or out of reach, but the target goes on, there is no
+    residual: there the simulator ends the episode, and R_pred is not used.
     """
     windows, objective = episodes.windows, task.objective
     before, after, goal = (
@@ -206,15 +207,15 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     own = objective.reward(before, after, goal, torch.zeros_like(decided))
     going_on, failing = windows.reward.unbind(-1)
     own, decided = own.reshape(going_on.shape), decided.reshape(going_on.shape)
-    is_used = windows.mask.bool() & ~decided
+    goes_on = windows.goes_on * ~decided
     residual = torch.stack(
         [
-            torch.where(is_used & ~episodes.terminated, going_on - own, 0.0),
-            torch.where(is_used & (failing != 0), failing - own, failing),
+            torch.where(goes_on.bool(), going_on - own, 0.0),
+            torch.where(~decided & (failing != 0), failing - own, failing),
         ],
         dim=-1,
     )
-    return replace(episodes, windows=replace(windows, reward=residual))
+    return replace(episodes, windows=replace(windows, reward=residual, goes_on=goes_on))
 
 
 def _optimise(

@@ -27,6 +27,9 @@ class GroundedSimulator(EpisodeSimulator):
     With members, each corrects its own share of the rows and predicts their rewards, by its own latents; the
     latents that policies observe are the model's in every row.
 
+    The failure model is shown the target's scatter around the correction, where states are without it: from
+    a smooth walk it expects no fall.
+
     Attributes:
         model: the trained grounding model; only read.
         members: models that were fitted to other draws of the episodes; only read.
@@ -131,6 +134,8 @@ class GroundedSimulator(EpisodeSimulator):
         if self.failures is not None:
             soon, self._remembered = self.failures.step(before, action, landed, self._remembered)
             self._hazard = self.failures.hazard(soon)
+            if self.scatter is None:
+                self._remembered = self.failures.scattered(self._remembered, self.model.residual_factor)
         self._predictions = torch.cat(
             [
                 model.ensemble_predictions(own[rows], action[rows], landed[rows])

@@ -117,6 +117,7 @@ class PairedEpisodes:
                 simulated_next=padded[ABSTRACT_SIMULATED_NEXT_STATE],
                 next_state=padded[ABSTRACT_NEXT_STATE],
                 reward=torch.stack([reward * ~terminated, reward * failed], dim=-1),
+                goes_on=(mask & ~terminated).float(),
                 topples_soon=_topples_soon(failed, mask),
                 mask=mask.float(),
             ),

@@ -4,15 +4,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
+from numpy.typing import NDArray
+
 from astra_data.core.durable import write_file
 from astra_data.core.naming import place
+from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
 from astra_data.reports.artefacts import Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill
 from astra_data.reports.schema import BandMeans, GapMeans
 
+Floats = NDArray[np.float64]
+
 PAGE = "gap.md"
+RELIABILITY = "gap_reliability.png"
 JUDGED_AT = 10
 """Steps ahead, if the episodes are as long: the horizon at which sizes are compared."""
 _SURE = 0.1
@@ -29,6 +36,8 @@ def write_held_out(
     timestep_s: float,
 ) -> Path | None:
     """Write the page of all finished groundings to `root`; return it, None where there is no grounding.
+
+    Beside it is a figure where groundings have failure models.
 
     Args:
         recipe: its name.
@@ -54,6 +63,11 @@ def write_held_out(
         return None
     every = [gap for sizes in found.values() for gap in sizes.values()]
     horizons = [h for h in every[0].horizons if all(h in gap.horizons for gap in every)]
+    rates = _rates(root, groundings, seeds, max(percents, default=None))
+    if rates:
+        from astra_data.reports.figures import png, reliability
+
+        write_file(root / RELIABILITY, png(reliability(rates)))
     page = fill(
         "held_out.md.jinja",
         recipe=recipe,
@@ -62,6 +76,7 @@ def write_held_out(
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
         foresight=_foresight(root, groundings, seeds, percents),
+        reliability=RELIABILITY if rates else None,
         enough=[
             enough(method_title(method), name, sizes, horizons)
             for method, sizes in found.items()
@@ -80,14 +95,43 @@ def _foresight(
     lines = []
     for percent in sorted(percents) or (None,):
         for method in groundings:
-            files = [root / "ground" / method / place(seed, percent) / "metrics.json" for seed in seeds]
-            measured = [read_json(Metrics, file).failures for file in files if file.is_file()]
-            for part in dict.fromkeys(name for one in measured for name in one):
-                found = [one[part] for one in measured if part in one and one[part].auc]
-                if found:
-                    title = f"{method_title(method)}: {part.replace('_', ' ')}"
-                    lines.append([*([f"{percent} %"] if percents else []), title, *_foresight_cells(found)])
+            for part, found in _measured(root, method, seeds, percent).items():
+                title = f"{method_title(method)}: {part.replace('_', ' ')}"
+                lines.append([*([f"{percent} %"] if percents else []), title, *_foresight_cells(found)])
     return lines
+
+
+def _measured(
+    root: Path, method: str, seeds: Sequence[int], percent: int | None
+) -> dict[str, list[Foresight]]:
+    """Return how well each part of a grounding foresees failures, on the seeds where some were held out."""
+    measured: dict[str, list[Foresight]] = {}
+    for seed in seeds:
+        file = root / "ground" / method / place(seed, percent) / "metrics.json"
+        for part, one in read_json(Metrics, file).failures.items() if file.is_file() else ():
+            if one.auc:
+                measured.setdefault(part, []).append(one)
+    return measured
+
+
+def _rates(
+    root: Path, groundings: Sequence[str], seeds: Sequence[int], percent: int | None
+) -> dict[str, dict[str, Floats]]:
+    """Return rates by part that foresees failures and grounding, over all seeds, as a figure takes them."""
+    parts: dict[str, dict[str, Floats]] = {}
+    for method in groundings:
+        for part, found in _measured(root, method, seeds, percent).items():
+            rows = np.array([row for one in found for row in one.reliability or ()])
+            parts.setdefault(part.replace("_", " "), {})[method] = _pooled(rows.reshape(-1, 3))
+    return parts
+
+
+def _pooled(rows: Floats) -> Floats:
+    """Pool rows (N, 3) of predicted and observed rates and numbers of steps by bin: (3, bins)."""
+    bins = np.digitize(rows[:, 0], BINS[1:-1])
+    steps = np.array([rows[bins == one, 2].sum() for one in np.unique(bins)])
+    rates = [rows[bins == one, :2].T @ rows[bins == one, 2] for one in np.unique(bins)]
+    return np.vstack([np.reshape(rates, (-1, 2)).T / steps, steps])
 
 
 def _foresight_cells(found: Sequence[Foresight]) -> list[str]:

@@ -43,7 +43,8 @@ class HistoryModel(Predictor):
                 "correction": (stretch.motion - stretch.simulated)[walked],
             }
         )
-        model.set_reward_scales(torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1))
+        rewards = torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1)
+        model.set_reward_scales(rewards, torch.ones_like(rewards[:, 0]))
         # Sideways and in turn a mean other than zero is an accident of the recordings.
         model.state_mean[1:] = 0.0
         model.goal_mean[1:] = 0.0
@@ -80,6 +81,7 @@ class HistoryModel(Predictor):
             simulated_next=simulated[:, 1:],
             next_state=motion[:, 1:],
             reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
+            goes_on=torch.ones_like(nearer),
             topples_soon=torch.zeros_like(nearer),
             # Where the robot did not walk, the simulator's motion stands in: nothing to learn.
             mask=(motion != simulated)[:, 1:].any(-1).float(),

@@ -73,6 +73,9 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     auc = foresight(said, episodes)["auc"]
     # Ten of the twenty steps of the neighbouring windows are above all calm ones, ten level with them.
     assert auc == {"1-20": pytest.approx(0.75), "11-30": 1.0, "21-40": pytest.approx(0.75)}
+    # Before the last window of others, its steps are calm ones, too: 20 of 110 on the level.
+    near = foresight(said, episodes, [(11, 20)])["auc"]
+    assert near == {"11-20": pytest.approx((130 + 10 / 2) / 140)}
 
 
 def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
@@ -106,3 +109,51 @@ def test_a_window_without_steps_has_no_figure() -> None:
     assert found["1-20"] is not None and found["21-40"] is None
     soon[1], mask[1, 15:] = 1, 0
     assert foresight(torch.rand(2, 100), short)["brier_skill"] is None
+
+
+def by_chance(seed: int) -> PairedEpisodes:
+    """Forty episodes of which eight fail, whatever they look like."""
+    episodes = lagging(40, seed)
+    windows = episodes.windows
+    torch.manual_seed(seed)
+    missed = 0.1 * torch.randn_like(windows.state)
+    soon, mask = torch.zeros(40, 100), torch.ones(40, 100)
+    for episode, end in enumerate(torch.randint(30, 100, (8,)).tolist()):
+        mask[episode, end:], soon[episode, end - RISK_STEPS : end] = 0, 1
+    changed = replace(windows, simulated_next=windows.next_state - missed, topples_soon=soon, mask=mask)
+    return replace(episodes, windows=changed)
+
+
+def test_what_is_only_learned_by_heart_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without cross-fitting, chance failures are foreseen with confidence; with it, as often as they come."""
+    training, fresh = by_chance(0), by_chance(1)
+
+    def skill() -> float:
+        model = fit_failures(TASK, training, 3, seed=0)
+        assert model is not None
+        found = foresight(model.probability(model.histories(fresh.windows)[0]), fresh)
+        return float(found["brier_skill"])
+
+    calibrated = skill()
+    monkeypatch.setattr("astra_data.grounding.failures.folds", lambda fails: [])
+    assert skill() < calibrated - 0.02
+    assert calibrated > -0.03
+
+
+def test_every_step_is_cross_fitted_once_and_what_was_found_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[tuple[Tensor, Tensor]] = []
+
+    def noted(odds: Tensor, fails: Tensor) -> tuple[Tensor, Tensor]:
+        given.append((odds, fails))
+        return torch.tensor(0.0), torch.tensor(-1.0)
+
+    monkeypatch.setattr("astra_data.grounding.failures.calibration", noted)
+    episodes = lagging(10, 0)
+    model = fit_failures(TASK, episodes, 3, seed=0)
+    assert model is not None
+    ((odds, fails),) = given
+    steps = int(episodes.windows.mask.sum())
+    assert odds.shape == (3, steps) and fails.shape == (steps,)
+    assert float(fails.sum()) == float(episodes.windows.topples_soon.sum())
+    said = model.probability(model.histories(episodes.windows)[0])
+    torch.testing.assert_close(said, torch.full_like(said, 1 / (1 + 2.718281828)))

@@ -33,7 +33,8 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
     shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
     model = GroundingModel(shape, "detach")
     model.set_scales({"state": torch.randn(50, 4)})
-    model.set_reward_scales(torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1))
+    reward = torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1)
+    model.set_reward_scales(reward, torch.ones(50))
     assert torch.isfinite(model.failure_weight)
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, HistoryGrounding(model), no_episodes())

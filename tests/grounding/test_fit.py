@@ -36,9 +36,10 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
         reward=going_on + failing,
         terminated=terminated[None],
     )
-    residual = residual_rewards(task, given).windows.reward[0]
-    torch.testing.assert_close(residual[:, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))
-    torch.testing.assert_close(residual[:, 1], torch.tensor([0.0, 0.0, -9.0 - ahead, 0.0, 0.0]))
+    residual = residual_rewards(task, given).windows
+    torch.testing.assert_close(residual.reward[0, :, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))
+    torch.testing.assert_close(residual.reward[0, :, 1], torch.tensor([0.0, 0.0, -9.0 - ahead, 0.0, 0.0]))
+    assert residual.goes_on[0, :4].tolist() == [1.0, 0.0, 0.0, 0.0]
 
 
 def episodes(seed: int, count: int = 4) -> PairedEpisodes:
@@ -153,8 +154,9 @@ def test_the_residual_reward_is_fitted_where_it_is_asked_for(tmp_path: Path) -> 
         (whole, fitting.training),
         (residual, residual_rewards(fitting.task, fitting.training)),
     ):
-        going_on, failing = given.steps(given.windows.reward).unbind(-1)
-        assert float(model.reward_mean) == pytest.approx(float(going_on[failing == 0].mean()), abs=1e-5)
+        going_on, goes_on = given.windows.reward[..., 0], given.windows.goes_on.bool()
+        paid = going_on[goes_on & given.windows.mask.bool()]
+        assert float(model.reward_mean) == pytest.approx(float(paid.mean()), abs=1e-5)
 
 
 def test_a_methods_weights_are_zero_where_it_predicts_nothing() -> None:

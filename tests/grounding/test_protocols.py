@@ -58,6 +58,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
         simulated_next=torch.stack(simulated, dim=1),
         next_state=torch.stack(states[1:], dim=1),
         reward=torch.zeros(COUNT, STEPS, 2),
+        goes_on=torch.ones_like(nothing),
         topples_soon=nothing,
         mask=torch.ones(COUNT, STEPS),
     )

@@ -1,10 +1,17 @@
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.reports.figures import reliability
 from astra_data.reports.held_out import write_held_out
+
+Rates = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 def write(root: Path, percent: int, seed: int, error: float) -> None:
@@ -66,11 +73,41 @@ def test_how_well_failures_are_foreseen_is_told_where_it_was_measured(tmp_path: 
     given = ("r", tmp_path, ("nas",), (0, 1, 2, 3), (100,))
     page = write_held_out(*given, timestep_s=0.05)
     assert page is not None and "Failures foreseen" not in page.read_text()
+    assert not (tmp_path / "gap_reliability.png").exists() and ".png" not in page.read_text()
     write_foresight(tmp_path, 0, 0.8, last=0.65)
     write_foresight(tmp_path, 1, 0.9)  # with episodes too short for the last window
     write_held_out(*given, timestep_s=0.05)
     lines = [
         line for line in page.read_text().splitlines() if "failure model" in line or "topple head" in line
     ]
+    assert "](gap_reliability.png)" in page.read_text()
+    assert (tmp_path / "gap_reliability.png").read_bytes().startswith(b"\x89PNG")
     # Above 0.1, each seed has 60 steps at 0.2 and 20 at 0.6: 0.3 in the mean; 0.085 and 0.425 of them fail.
     assert lines == ["| 100 % | NAS: failure model | 6 | 0.85 | 0.75 | 0.65 | 0.15 | 0.17 of 0.30 |"]
+
+
+def test_the_figure_pools_the_steps_of_all_seeds_by_bin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the whole dataset; a predicted rate of 0.3 is in the bin of 0.2, with twice as many steps."""
+    shown: list[Rates] = []
+
+    def noted(parts: Rates) -> Figure:
+        shown.append(parts)
+        return reliability(parts)
+
+    monkeypatch.setattr("astra_data.reports.figures.reliability", noted)
+    for percent, seed in ((100, 0), (100, 1), (25, 0)):
+        write(tmp_path, percent, seed, 0.1)
+    write_foresight(tmp_path, 0, 1.0)
+    windows = {"1-20": 0.5, "11-30": None, "21-40": None}
+    of = {"failures": 1, "auc": windows, "brier_skill": 0.0, "reliability": [[0.3, 0.7, 120]]}
+    file = tmp_path / "ground/nas/percent_100/seed_1/metrics.json"
+    file.write_text(json.dumps({"failures": {"failure_model": of}}))
+    write_held_out("r", tmp_path, ("nas",), (0, 1), (25, 100), timestep_s=0.05)
+    (parts,) = shown
+    assert [*parts] == ["failure model"] and [*parts["failure model"]] == ["nas"]
+    predicted, observed, steps = parts["failure model"]["nas"]
+    np.testing.assert_allclose(predicted, [0.01, (60 * 0.2 + 120 * 0.3) / 180, 0.6])
+    np.testing.assert_allclose(observed, [0.01, (60 * 0.1 + 120 * 0.7) / 180, 0.5])
+    assert steps.tolist() == [900.0, 180.0, 20.0]

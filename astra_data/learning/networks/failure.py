@@ -120,6 +120,12 @@ class FailureModel(nn.Module):
         probability = self.probability(torch.cat([magnitudes, averages, walls], dim=-1))
         return probability, torch.cat([state, landed, action, averages], dim=-1)
 
+    def scattered(self, memory: Tensor, scatter: Tensor) -> Tensor:
+        """Return a `memory` (B, M) by which the next state seems off by a draw of the factor `scatter` (X, X)."""
+        seen, rest = memory.tensor_split([2 * self.shape.state_size], dim=-1)
+        off = torch.randn_like(seen[:, : self.shape.state_size]) @ scatter.T
+        return torch.cat([seen - off.repeat(1, 2), rest], dim=-1)
+
     def histories(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
         """Return the inputs (E, T, I) of all steps of whole episodes, and the memories (E, T, M) before."""
         state, landed = windows.state, windows.simulated_next
@@ -147,6 +153,14 @@ class FailureModel(nn.Module):
         """
         normal = normalised(inputs, self.input_mean, self.input_std)
         return torch.stack([member(normal).squeeze(-1) for member in self.members])
+
+    @torch.no_grad()
+    def calibrate(self, scale: Tensor, shift: Tensor) -> None:
+        """Scale what each member says, and let `shift` tell how frequent failures are."""
+        for member in self.members:
+            for parameter in list(member.parameters())[-2:]:
+                parameter.mul_(scale)
+        self.log_odds_shift.copy_(shift)
 
     def hazard(self, probability: Tensor) -> Tensor:
         """Return the probability (...) of a failure in the very step, given that within `RISK_STEPS`."""

@@ -117,17 +117,18 @@ class GroundingModel(nn.Module):
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
 
     @torch.no_grad()
-    def set_reward_scales(self, reward: Tensor, failure_weight: float = 1.0) -> None:
+    def set_reward_scales(self, reward: Tensor, goes_on: Tensor, failure_weight: float = 1.0) -> None:
         """Take the scales of `reward` (N, 2), in its two parts (see `PairedWindows`), from training steps.
 
-        The mean and deviation are those of steps that go on. The reward head starts at the rate of failures
-        in the data; their loss is weighted by how rare they are, times `failure_weight`.
+        The mean and deviation are those of steps where `goes_on` (N,) is 1. The reward head starts at the
+        rate of failures in the data; their loss is weighted by how rare they are, times `failure_weight`.
         """
         going_on, failing = reward.unbind(-1)
         failed = failing != 0
-        if not failed.all():
-            self.reward_mean.copy_(going_on[~failed].mean())
-            self.reward_std.copy_(going_on[~failed].std(correction=0).clamp_min(1e-3))
+        if goes_on.any():
+            paid = going_on[goes_on.bool()]
+            self.reward_mean.copy_(paid.mean())
+            self.reward_std.copy_(paid.std(correction=0).clamp_min(1e-3))
         if failed.any():
             rate = failed.float().mean().clamp(max=0.5)
             self.failure_cost.copy_((failing[failed].mean() - self.reward_mean).clamp_max(0.0))
@@ -261,14 +262,14 @@ class GroundingModel(nn.Module):
         """Return the mean of the losses of both parts of the reward.
 
         Predicting the averages gives a loss of about one for the steps that go on, and of its weight for the
-        failures; the latter is zero where the data has none.
+        failures; the latter is zero where the data has none. What a success pays is not R_pred's to learn.
         """
         if self.shape.reward_dropout:
             latent = functional.dropout(latent, self.shape.reward_dropout, self.training)
         going_on, log_odds = self._reward_outputs(latent, windows.action)
         reward, failing = windows.reward.unbind(-1)
         failed = (failing != 0).float()
-        error = (1.0 - failed) * (going_on - (reward - self.reward_mean) / self.reward_std)
+        error = windows.goes_on * (going_on - (reward - self.reward_mean) / self.reward_std)
         surprise = functional.binary_cross_entropy_with_logits(log_odds, failed, reduction="none")
         return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
 

@@ -20,6 +20,7 @@ class PairedWindows:
         topples_soon: (B, T), 1 where the episode fails within `RISK_STEPS`.
         reward: r_i, or the residual reward, in two parts, (B, T, 2): of steps that go on, and of steps that
             end in failure; 0 in the other. Reaching the goal is detected and rewarded by the simulator.
+        goes_on: (B, T), 1 where the step ends nothing: only there the first part of the reward is known.
         mask: (B, T), 1 on real steps.
     """
 
@@ -30,5 +31,6 @@ class PairedWindows:
     simulated_next: Tensor
     next_state: Tensor
     reward: Tensor
+    goes_on: Tensor
     topples_soon: Tensor
     mask: Tensor

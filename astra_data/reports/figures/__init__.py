@@ -5,6 +5,7 @@ scores        score_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
 coverage      coverage: which positions or velocities a dataset holds
 validity      predictive_validity: returns in the simulators against those in the target
+reliability   reliability: whether predicted failures come true
 sizes         data_efficiency: a score over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
 strips        strips: episodes in pictures, a strip per method
@@ -14,6 +15,7 @@ walks         walk_prediction: how well models predict a recorded walk, by horiz
 from astra_data.reports.figures.coverage import coverage
 from astra_data.reports.figures.motion import Panel, dynamics_mismatch, trajectories
 from astra_data.reports.figures.open_loop import OpenLoop, open_loop_error
+from astra_data.reports.figures.reliability import reliability
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.sizes import Visits, data_efficiency
 from astra_data.reports.figures.strips import Strip, strips
@@ -37,6 +39,7 @@ __all__ = [
     "open_loop_error",
     "png",
     "predictive_validity",
+    "reliability",
     "score_bars",
     "strips",
     "trajectories",

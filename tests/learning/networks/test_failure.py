@@ -105,6 +105,8 @@ def test_the_members_probabilities_are_averaged_after_the_shift() -> None:
     odds = torch.stack([one(inputs.clamp(-5, 5)).squeeze(-1) for one in made.members])
     torch.testing.assert_close(made.probability(inputs), (odds - 2.0).sigmoid().mean(0))
     assert float((odds[0] - odds[1]).abs().max()) > 0.01
+    made.calibrate(torch.tensor(0.5), torch.tensor(-3.0))
+    torch.testing.assert_close(made.probability(inputs), (0.5 * odds - 3.0).sigmoid().mean(0))
     assert float(made.hazard(torch.tensor(0.5))) == pytest.approx(0.5 / RISK_STEPS)
 
 

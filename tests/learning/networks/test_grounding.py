@@ -32,9 +32,14 @@ def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
         simulated_next=simulated,
         next_state=state[:, 1:],
         reward=torch.stack([state[:, 1:].norm(dim=-1), torch.zeros(episodes, steps)], dim=-1),
+        goes_on=torch.ones(episodes, steps),
         topples_soon=torch.zeros(episodes, steps),
         mask=torch.ones(episodes, steps),
     )
+
+
+def set_reward_scales(model: GroundingModel, windows: PairedWindows, failure_weight: float = 1.0) -> None:
+    model.set_reward_scales(windows.reward.flatten(0, 1), windows.goes_on.flatten(), failure_weight)
 
 
 TRAINING, HELD_OUT = lagging_world(32, 30, seed=0), lagging_world(64, 30, seed=1)
@@ -52,7 +57,7 @@ def untrained(target: TargetKind = "ema", heads: int = 1) -> GroundingModel:
             "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
         }
     )
-    model.set_reward_scales(TRAINING.reward.flatten(0, 1))
+    set_reward_scales(model, TRAINING)
     return model
 
 
@@ -164,9 +169,10 @@ def test_failing_is_predicted_as_often_as_it_happens_and_never_pays(paid: float,
     torch.manual_seed(0)
     falls = (TRAINING.action[..., 0] > 0) & (torch.rand(TRAINING.mask.shape) < 0.1)
     going_on = (paid - cost) * ~falls
-    windows = replace(TRAINING, reward=torch.stack([going_on, paid * falls], dim=-1))
+    reward = torch.stack([going_on, paid * falls], dim=-1)
+    windows = replace(TRAINING, reward=reward, goes_on=(~falls).float())
     model = untrained()
-    model.set_reward_scales(windows.reward.flatten(0, 1))
+    set_reward_scales(model, windows)
     with torch.no_grad():
         start = model.predict_reward_parts(torch.zeros(1, SIZE), torch.zeros(1, 2))[0, 1]
     assert float(start) == pytest.approx(cost * float(falls.float().mean()), rel=0.5)
@@ -189,13 +195,14 @@ def failing(share: float) -> PairedWindows:
     """Return the training windows where `share` of the steps fail, whatever is done."""
     torch.manual_seed(0)
     fails = -10.0 * (torch.rand(TRAINING.mask.shape) < share)
-    return replace(TRAINING, reward=torch.stack([torch.zeros_like(fails), fails], dim=-1))
+    reward = torch.stack([torch.zeros_like(fails), fails], dim=-1)
+    return replace(TRAINING, reward=reward, goes_on=(fails == 0).float())
 
 
 def test_failures_count_as_much_as_they_are_told_to() -> None:
     model, windows, losses = untrained(), failing(0.02), []
     for weight in (1.0, 0.1):
-        model.set_reward_scales(windows.reward.flatten(0, 1), weight)
+        set_reward_scales(model, windows, weight)
         with torch.no_grad():
             last_weight, last_bias = list(model.reward_head.parameters())[-2:]
             last_weight.zero_()
@@ -212,7 +219,7 @@ def test_without_half_of_the_latent_chance_failures_are_not_learned_by_heart() -
     def learned(dropout: float) -> float:
         model = untrained()
         model.shape = replace(model.shape, reward_dropout=dropout)
-        model.set_reward_scales(windows.reward.flatten(0, 1))
+        set_reward_scales(model, windows)
         optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
         for _ in range(300):
             optimizer.zero_grad()

@@ -33,6 +33,7 @@ def windows() -> PairedWindows:
         simulated_next=draw(4),
         next_state=draw(4),
         reward=torch.stack([draw() * (failing == 0), failing], dim=-1),
+        goes_on=(failing == 0).float(),
         topples_soon=(draw() > 0).float(),
         mask=mask,
     )
@@ -51,7 +52,7 @@ def model(heads: int = 1, target: TargetKind = "ema", dropout: float = 0.0) -> G
         "correction": 0.5 * (given.next_state - given.simulated_next),
     }
     made.set_scales({name: values.flatten(0, 1) for name, values in columns.items()})
-    made.set_reward_scales(given.reward[given.mask.bool()])
+    made.set_reward_scales(given.reward[given.mask.bool()], given.goes_on[given.mask.bool()])
     with torch.no_grad():
         for head in made.corrections:
             list(head.parameters())[-2].normal_(std=0.2)
@@ -95,24 +96,27 @@ def test_the_encoder_sees_state_places_goal_and_previous_action_in_this_order() 
 
 def test_reward_scales_are_those_of_steps_that_go_on() -> None:
     used = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
-    going_on, failing = torch.tensor([1.0, 2.0, 3.0, 6.0, 0.0, 0.0]), torch.tensor([0.0] * 4 + [-10.0, -14.0])
-    used.set_reward_scales(torch.stack([going_on, failing], dim=-1), failure_weight=2.0)
+    going_on, failing = torch.tensor([1.0, 2.0, 3.0, 6.0, 0.0, 99.0]), torch.zeros(6)
+    failing[4], goes_on = -12.0, torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0, 0.0])
+    used.set_reward_scales(torch.stack([going_on, failing], dim=-1), goes_on, failure_weight=2.0)
     assert float(used.reward_mean) == pytest.approx(3.0)
     assert float(used.reward_std) == pytest.approx(3.5**0.5)  # (4 + 1 + 0 + 9) / 4
     assert float(used.failure_cost) == pytest.approx(-12.0 - 3.0)
-    entropy = -(math.log(1 / 3) / 3 + 2 * math.log(2 / 3) / 3)
+    entropy = -(math.log(1 / 6) / 6 + 5 * math.log(5 / 6) / 6)
     assert float(used.failure_weight) == pytest.approx(2.0 / entropy, rel=1e-5)
     bias = list(used.reward_head.parameters())[-1]
-    assert float(bias[1].detach()) == pytest.approx(math.log((1 / 3) / (2 / 3)), rel=1e-5)
+    assert float(bias[1].detach()) == pytest.approx(math.log((1 / 6) / (5 / 6)), rel=1e-5)
 
 
 def test_failures_never_pay_and_are_taken_as_rare() -> None:
     used = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
-    used.set_reward_scales(torch.tensor([[1.0, 0.0], [0.0, 5.0], [0.0, 5.0], [0.0, 5.0]]))
+    goes_on = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    used.set_reward_scales(torch.tensor([[1.0, 0.0], [0.0, 5.0], [0.0, 5.0], [0.0, 5.0]]), goes_on)
     assert float(used.failure_cost) == 0.0
     assert float(used.failure_weight) == pytest.approx(1.0 / math.log(2.0), rel=1e-5)
     before = float(used.reward_mean)
-    used.set_reward_scales(torch.tensor([[0.0, -3.0]]))  # all fail: nothing that goes on to scale by
+    # All fail: nothing that goes on to scale by.
+    used.set_reward_scales(torch.tensor([[0.0, -3.0]]), torch.zeros(1))
     assert (float(used.reward_mean), float(used.failure_cost)) == (before, -4.0)
 
 
@@ -184,6 +188,18 @@ def test_the_loss_of_the_reward_weighs_failures() -> None:
     surprise = -torch.where(fails, probability, 1.0 - probability).log()
     _, parts = used.losses(given, LossWeights(latent=0.0))
     torch.testing.assert_close(parts["reward"], 0.5 * real(of_rest + used.failure_weight * surprise))
+
+
+def test_what_a_success_pays_counts_nowhere() -> None:
+    """The last step of the third episode reaches the goal: neither scales nor losses know its reward."""
+    found = []
+    for paid in (0.0, 50.0):
+        given = windows()
+        given.goes_on[2, -1], given.reward[2, -1, 0] = 0.0, paid
+        used, real_steps = model(), given.mask.bool()
+        used.set_reward_scales(given.reward[real_steps], given.goes_on[real_steps])
+        found.append((used.reward_mean, used.reward_std, used.losses(given, LossWeights())[0]))
+    assert all(map(torch.equal, *found))
 
 
 def test_the_latent_loss_follows_the_slow_encoder() -> None:

@@ -1,0 +1,45 @@
+"""Probabilities that come true: cross-fitting, and Platt's scaling of log-odds."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from astra_data.learning.networks.paired_windows import RISK_STEPS
+
+_MOST_FOLDS = 5
+
+
+def folds(fails: Tensor) -> list[Tensor]:
+    """Split episodes at random, those that fail (E,) and the others alike; return who is in each fold, (E,).
+
+    There are as many folds as failing episodes, at most five; none with a single one.
+    """
+    count = min(_MOST_FOLDS, int(fails.sum()))
+    if count < 2:
+        return []
+    numbers = torch.empty(len(fails), dtype=torch.long, device=fails.device)
+    for rows in (fails.nonzero().squeeze(1), (~fails).nonzero().squeeze(1)):
+        numbers[rows[torch.randperm(len(rows))]] = torch.arange(len(rows), device=rows.device) % count
+    return [numbers == fold for fold in range(count)]
+
+
+def calibration(odds: Tensor, fails: Tensor) -> tuple[Tensor, Tensor]:
+    """Return by how much to scale and shift log-odds (K, N) so that they come true on steps (N,) (Platt).
+
+    The logarithm of the scale has a standard normal prior, and the `RISK_STEPS` before a failure count as one
+    step: where failures are few, little is changed.
+    """
+    odds, fails = odds.double(), fails.double().expand_as(odds)
+    start = [torch.zeros((), device=odds.device), fails.mean().logit() - odds.mean()]
+    scale, shift = (one.double().clone().requires_grad_() for one in start)
+    optimizer = torch.optim.LBFGS([scale, shift], max_iter=100, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        surprise = functional.binary_cross_entropy_with_logits(scale.exp() * odds + shift, fails)
+        total: Tensor = surprise + 0.5 * scale.square() * RISK_STEPS / odds.shape[1]
+        total.backward()
+        return total
+
+    optimizer.step(loss)
+    return scale.detach().exp(), shift.detach()

@@ -1,0 +1,44 @@
+import pytest
+import torch
+
+from astra_data.grounding.calibration import calibration, folds
+
+
+def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
+    """Two members say twice and four times too much of events whose log-odds they know."""
+    torch.manual_seed(0)
+    true = 1.5 * torch.randn(40_000) - 2.0
+    happens = (torch.rand(len(true)) < true.sigmoid()).float()
+    for factor in (2.0, 0.5):
+        scale, shift = calibration((factor * (true + 1.0)).expand(2, -1), happens)
+        assert float(scale) == pytest.approx(1 / factor, rel=0.05)
+        assert float(shift) == pytest.approx(-1.0, abs=0.05)
+
+
+def test_the_scale_of_few_failures_changes_little_and_never_turns_around() -> None:
+    """20 failing steps are one failure: its prior outweighs what they show, and not that of a thousand."""
+    torch.manual_seed(0)
+    odds = torch.randn(1, 400)
+    fails = (torch.arange(400) < 20).float()  # whatever was said
+    few, shift = calibration(odds, fails)
+    many, _ = calibration(odds.repeat(1, 1000), fails.repeat(1000))
+    assert float(few) > 0.6 and 0.0 < float(many) < 0.2
+    said = (few * odds + shift).sigmoid().mean()
+    assert float(said) == pytest.approx(0.05, rel=1e-3)
+    against, _ = calibration(-5.0 * fails[None] + 0.1 * odds, fails)
+    assert float(against) > 0
+
+
+@pytest.mark.parametrize(("failing", "count"), [(1, 0), (2, 2), (4, 4), (13, 5)])
+def test_folds_share_failing_and_other_episodes_alike(failing: int, count: int) -> None:
+    torch.manual_seed(0)
+    fails = torch.arange(40) >= 40 - failing
+    found = folds(fails)
+    assert len(found) == count
+    if found:
+        assert torch.equal(torch.stack(found).sum(0), torch.ones(40, dtype=torch.long))
+        for rows in (fails, ~fails):
+            sizes = [int((fold & rows).sum()) for fold in found]
+            assert max(sizes) - min(sizes) <= 1
+        assert found[0].nonzero().squeeze(1).tolist() != [*range(0, 40, count)]  # at random
+    assert not torch.equal(torch.stack(folds(fails) or [fails]), torch.stack(found or [~fails]))

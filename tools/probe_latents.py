@@ -1,0 +1,105 @@
+"""Does z hold what φ(s) lacks, and does the policy use it? Print Markdown.
+
+    python tools/probe_latents.py runs/antmaze_long --row nas --row astra --seed 0
+    python tools/probe_latents.py runs/antmaze_long --row nas --policies target --episodes 100
+
+The first table has R² on held-out episodes of linear probes from φ(s), from φ(s) with the actions of the last
+steps, and from each row's z, to each entry of the target state that φ drops. The second has the success of
+each row's policy with its own latents, with those of other robots, drawn anew at every step, and with zeros.
+"""
+
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Annotated
+
+import torch
+import typer
+from torch import Tensor
+
+from astra_data.core.naming import base_method, place
+from astra_data.core.seeding import derive
+from astra_data.experiments.plan import grounded_as
+from astra_data.experiments.trained_policy import load_policy, policy_files, settings_of
+from astra_data.grounding.files import load_grounding, load_history_model
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.probes import Probed, dropped_values, picking_split, probe, recent_actions
+from astra_data.training.altered_latents import ALTERATIONS, AlteredLatents, in_target
+from astra_data.training.own_world import in_simulator, own_world, started
+from astra_data.training.policy_file import PolicyFile
+from astra_data.worlds.registry import task_named
+
+
+class Where(StrEnum):
+    """Where policies are run."""
+
+    NOWHERE = "nowhere"
+    TARGET = "target"
+    SIMULATOR = "simulator"
+
+
+def main(
+    run: Path,
+    row: Annotated[list[str], typer.Option(help="Rows whose latents are probed.")],
+    seed: Annotated[int, typer.Option(help="Of the run.")] = 0,
+    steps: Annotated[int, typer.Option(help="Actions beside φ(s), for comparison.")] = 20,
+    policies: Annotated[Where, typer.Option(help="Where to run the rows' policies.")] = Where.NOWHERE,
+    episodes: Annotated[int, typer.Option(help="Of each policy.")] = 100,
+) -> None:
+    """Print the tables of probes and of policies."""
+    _probes(run, row, seed, steps)
+    if policies is not Where.NOWHERE:
+        print(f"\n| success in the {policies} with latents | {' | '.join(ALTERATIONS)} |")
+        print("|---|" + "---|" * len(ALTERATIONS))
+        for name in row:
+            reached = successes(run, name, seed, policies, episodes)
+            print(f"| {name} | " + " | ".join(f"{reached[kind]:.2f}" for kind in ALTERATIONS) + " |")
+
+
+@torch.no_grad()
+def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
+    settings = settings_of(run)
+    column = task_named(settings["task"]).state
+    paired = PairedEpisodes.load(run / "pair" / place(seed))
+    training, held_out = paired.split(settings["ground"]["held_out_share"], seed)
+    parts = (*picking_split(training, seed), held_out)
+    values = [dropped_values(column, part) for part in parts]
+    inputs: dict[str, list[Tensor]] = {
+        "φ(s)": [part.windows.state for part in parts],
+        f"φ(s) and {steps} actions": [recent_actions(part, steps) for part in parts],
+    }
+    for name in rows:
+        file = run / "ground" / grounded_as(base_method(name)) / place(seed) / "grounding.safetensors"
+        model = load_history_model(file)
+        inputs[f"z of {name}"] = [model.encode(part.windows)[0] for part in parts]
+    found = {name: probe(*map(Probed.of, parts, given, values)) for name, given in inputs.items()}
+    print("| R² of | " + " | ".join(found) + " |\n|---|" + "---|" * len(found))
+    for index, quantity in enumerate(values[0]):
+        print(f"| {quantity} | " + " | ".join(f"{r2[index]:.2f}" for r2 in found.values()) + " |")
+    print("| mean | " + " | ".join(f"{r2.nanmean():.2f}" for r2 in found.values()) + " |")
+
+
+def successes(run: Path, row: str, seed: int, where: Where, episodes: int) -> dict[str, float]:
+    """Return the success of a row's policy by what its latents are altered to."""
+    deployed = load_policy(run, row, seed=seed)
+    reached = {}
+    for kind, alter in ALTERATIONS.items():
+        altered = AlteredLatents.of(deployed, alter)
+        if where is Where.TARGET:
+            outcome = in_target(altered, episodes, derive(seed, "evaluation"))
+        else:
+            files = policy_files(run, row, seed=seed)
+            trained, grounding = PolicyFile.load(files["train"]), load_grounding(files["ground"])
+            if trained.simulation is None:
+                raise typer.BadParameter(f"{row} was not trained in a simulator")
+            world = own_world(deployed.task, trained.simulation, grounding, episodes)
+            begin = partial(started, altered, altered.act_in_simulator)
+            horizon = deployed.task.objective.horizon
+            outcome, _ = in_simulator(world, begin, horizon, derive(seed, "simulated evaluation"))
+        reached[kind] = fmean(outcome.success)
+    return reached
+
+
+if __name__ == "__main__":
+    typer.run(main)
