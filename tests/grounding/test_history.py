@@ -331,6 +331,30 @@ def test_a_failure_model_is_asked_before_each_correction_and_replaces_the_other_
     assert not torch.allclose(one.topple_risk(), plain.topple_risk())
 
 
+def test_a_failure_model_is_shown_scatter_where_states_have_none() -> None:
+    used, failures, played = model(), failure_model(), actions(2)
+    risks = {}
+    for factor in (0.0, 0.5):
+        for scatter in (None, torch.zeros(4, 4)):
+            used.residual_factor.copy_(factor * torch.eye(4))
+            inner = PointMass(U_MAZE, 3, timestep_s=0.05)
+            one = GroundedSimulator(inner, used, failures=failures, scatter=scatter)
+            one.start(HERE.expand(3, 4), ROWS, GOAL)
+            torch.manual_seed(7)
+            states = [one.step(action) for action in played]
+            risks[factor, scatter is None] = one.topple_risk()
+    assert torch.equal(risks[0.0, True], risks[0.5, False])  # scattered states are seen as they are
+    raw = PointMass(U_MAZE, 3, timestep_s=0.05)
+    memory = failures.initial_memory(HERE.expand(3, 4), torch.zeros(3, 2))
+    for state, action in zip((HERE.expand(3, 4), states[0]), played, strict=True):
+        raw.reset_to(state)
+        soon, memory = failures.step(state, action, raw.step(action), memory)
+        torch.manual_seed(7)
+        memory = failures.scattered(memory, 0.5 * torch.eye(4))
+    torch.testing.assert_close(risks[0.5, True], failures.hazard(soon))
+    assert not torch.allclose(risks[0.5, True], risks[0.0, True])
+
+
 def test_a_failure_models_memory_is_kept_forgotten_at_a_start_and_taken_from_histories() -> None:
     used, failures = model(), failure_model()
     one, played = foreseeing(used, failures), actions(6)

@@ -121,7 +121,7 @@ class FailureModel(nn.Module):
         return probability, torch.cat([state, landed, action, averages], dim=-1)
 
     def scattered(self, memory: Tensor, scatter: Tensor) -> Tensor:
-        """Return a `memory` (B, M) by which the next state seems off by a draw of the factor `scatter` (X, X)."""
+        """Return a `memory` (B, M) by which the next state seems off by a draw of `scatter`, (X, X)."""
         seen, rest = memory.tensor_split([2 * self.shape.state_size], dim=-1)
         off = torch.randn_like(seen[:, : self.shape.state_size]) @ scatter.T
         return torch.cat([seen - off.repeat(1, 2), rest], dim=-1)

@@ -118,3 +118,16 @@ def test_scales_are_those_of_real_steps() -> None:
     normal = (made.histories(of)[0] - made.input_mean) / made.input_std
     assert float(normal.flatten(0, 1).mean(0).abs().max()) < 1e-4
     torch.testing.assert_close(normal.flatten(0, 1).std(0), torch.ones(20), atol=1e-3, rtol=0)
+
+
+def test_the_scatter_shown_is_in_what_was_moved_and_missed_and_nowhere_else() -> None:
+    made, count = model(), 20_000
+    state, action = torch.rand(count, 4), torch.rand(count, 2)
+    _, memory = made.step(state, action, state + 0.1, made.initial_memory(state, action))
+    factor = torch.tensor([[1.0, 0, 0, 0], [2.0, 1.0, 0, 0], [0, 0, 3.0, 0], [0, 0, 0, 0]])
+    torch.manual_seed(5)
+    shown = made.scattered(memory, factor)
+    off = memory[:, :4] - shown[:, :4]
+    torch.testing.assert_close(memory[:, 4:8] - shown[:, 4:8], off, atol=1e-5, rtol=0)
+    assert torch.equal(memory[:, 8:], shown[:, 8:])
+    torch.testing.assert_close(off.T.cov(), factor @ factor.T, atol=0.2, rtol=0.05)
