@@ -1,7 +1,7 @@
 """Select: choose among a recipe's policies without the target, by simulators of other episodes.
 
-A judge is the grounding of another seed, which has episodes of its own. Its states are scattered as the
-target's are around it, and where it has a failure model, that ends episodes.
+A judge is the grounding of another seed, which has episodes of its own. Where it has a failure model, that
+ends episodes; otherwise its states are scattered as the target's are around it.
 """
 
 import json

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,16 @@ def policy(folder: Path, judge: Judge) -> DeployedPolicy:
     return deploy(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
 
 
-def test_a_judge_is_the_scattered_simulator_that_ends_episodes_by_its_failure_model(
-    judge: Judge, policy: DeployedPolicy, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("foresees", [True, False])
+def test_a_judge_ends_episodes_by_its_failure_model_or_else_scatters_states(
+    foresees: bool,
+    judge: Judge,
+    policy: DeployedPolicy,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = []
+    whole: Any = judge.grounding
+    judge = replace(judge, grounding=whole.reduced(members=True, failures=foresees))
 
     def seen(world: SimulatorEnv, begin: object, horizon: int, seed: int) -> object:
         made.append((world, horizon, seed))
@@ -47,11 +54,14 @@ def test_a_judge_is_the_scattered_simulator_that_ends_episodes_by_its_failure_mo
     world, horizon, seed = made[0]
     assert horizon == TASK.objective.horizon and seed == 7 and world.num_envs == 5
     grounding: Any = judge.grounding
-    assert isinstance(grounding, HistoryGrounding) and grounding.failures is not None
-    assert world.topple  # episodes end where the failure model says
+    assert isinstance(grounding, HistoryGrounding) and (grounding.failures is not None) == foresees
+    assert world.topple == foresees  # episodes end where the failure model says
     assert grounding.model.residual_factor.abs().sum() > 0
     simulator: Any = world.simulator
-    assert torch.equal(simulator.scatter, grounding.model.residual_factor)
+    if foresees:
+        assert simulator.scatter is None
+    else:
+        assert torch.equal(simulator.scatter, grounding.model.residual_factor)
 
 
 def test_success_is_the_share_of_the_episodes(
