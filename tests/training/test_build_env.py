@@ -68,6 +68,13 @@ def test_without_switches_it_is_the_plain_simulator(
         assert torch.equal(torch.get_rng_state(), drawn)
 
 
+def test_failures_are_foreseen_where_rewards_or_ends_depend_on_them() -> None:
+    assert [EnvConfig(reward=reward).foresees for reward in (None, "abstract", "predicted", "blend")] == [
+        *(False, False, True, True)
+    ]
+    assert EnvConfig(topple=True).foresees
+
+
 def test_rows_may_differ_by_their_members(episodes: PairedEpisodes) -> None:
     torch.manual_seed(0)
     model, *members = (GroundingModel(GroundingShape(4, 2, 2, latent_size=8)) for _ in range(3))
@@ -79,6 +86,7 @@ def test_rows_may_differ_by_their_members(episodes: PairedEpisodes) -> None:
         world = training_env(
             TASK, config, env_parts(TASK, config, episodes, used), used, num_envs=16, device="cpu"
         )
+        world.reset()  # half of them from recorded moments, with what the simulator remembers of them
         start = torch.cat([HERE, torch.zeros(2)]).expand(16, 4)
         world.simulator.start(start, torch.arange(16), torch.zeros(16, 2))
         with torch.no_grad():
