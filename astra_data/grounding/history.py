@@ -129,7 +129,9 @@ class GroundedSimulator(EpisodeSimulator):
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the corrected states (B, X)."""
         before = self.state
-        _, own, _ = self._last = self.latent, self._own_latent, action
+        latent = self.latent
+        own = latent if self._own_hidden is None else self._own_latent
+        self._last = latent, own, action
         landed = self._landed = self.simulator.step(action)
         if self.failures is not None:
             soon, self._remembered = self.failures.step(before, action, landed, self._remembered)
