@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from astra_data.core.seeding import derive
 from astra_data.grounding.calibration import calibration, folds
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.failure import FailureModel, FailureShape
@@ -21,6 +22,8 @@ from astra_data.worlds.task import Task
 
 AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
 """Windows before a failure, in steps, in which it is to be foreseen."""
+_SETTLING = 2 * RISK_STEPS
+"""Steps at the beginning of a replay that are left out."""
 _BATCH = 1024
 _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
@@ -30,24 +33,28 @@ BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
 
 
-def fit_failures(task: Task, training: PairedEpisodes, members: int, seed: int) -> FailureModel | None:
-    """Fit a failure model of `members` networks to whole episodes, and calibrate it by cross-fitting.
+def tells_failures(episodes: PairedEpisodes) -> bool:
+    """Whether a failure model can be fitted: some steps are before a failure, and not every one."""
+    return _has_both(episodes.steps(episodes.windows.topples_soon))
 
-    Returns:
-        None where no step is before a failure, or every one.
+
+def fit_failures(
+    task: Task, grounding: GroundingModel, training: PairedEpisodes, members: int, seed: int
+) -> FailureModel:
+    """Fit a failure model of `members` networks to replays of whole episodes; calibrate it by cross-fitting.
+
+    The episodes are such that `tells_failures`.
     """
-    windows = training.windows
-    fails = windows.topples_soon
-    if not _has_both(training.steps(fails)):
-        return None
+    fails = training.windows.topples_soon
     torch.manual_seed(derive(seed, "failure model"))
     untrained = _untrained(task, training, members)
-    inputs = untrained.histories(windows)[0]
+    inputs = replayed_inputs(task, grounding, untrained, training)
+    untrained.set_input_scales(training.steps(inputs))
     model = _descended(untrained, training.steps(inputs), training.steps(fails))
     odds, happened = [], []
     for fold in folds(fails.any(1)):
         others = training.select((~fold).nonzero().squeeze(1))
-        if not _has_both(others.steps(others.windows.topples_soon)):
+        if not tells_failures(others):
             continue
         fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.topples_soon))
         own = training.select(fold.nonzero().squeeze(1))
@@ -76,7 +83,7 @@ def _untrained(task: Task, training: PairedEpisodes, members: int) -> FailureMod
     if maze is not None:
         model.clearance.copy_(torch.from_numpy(maze.clearance_field))
         model.half_extent.copy_(torch.from_numpy(maze.half_extent))
-    model.set_scales(windows)
+    model.set_move_scales(windows)
     return model
 
 
@@ -99,10 +106,53 @@ def _drawn(rows: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
+def replayed_inputs(
+    task: Task, grounding: GroundingModel, failures: FailureModel, episodes: PairedEpisodes
+) -> Tensor:
+    """Return what a failure model sees of each step, (E, T, I), where recorded commands are simulated.
+
+    The simulator moves more smoothly than the target, so that a failure announces itself less. Replays begin
+    at every `RISK_STEPS`-th recorded moment. The first `_SETTLING` steps of each are left out, but for those
+    that begin an episode: from then on all that is seen is simulated.
+    """
+    windows, grounded = episodes.windows, HistoryGrounding(grounding)
+    steps = windows.mask.shape[1]
+    episode, number = windows.mask[:, ::RISK_STEPS].nonzero(as_tuple=True)
+    first = number * RISK_STEPS
+    simulator = grounded.corrected(task.simulator(len(first), str(first.device)), None)
+    state, previous_action = windows.state[episode, first], windows.previous_action[episode, first]
+    simulator.start(
+        state,
+        torch.arange(len(first), device=first.device),
+        windows.goal[episode, first],
+        hidden=grounded.hidden_before(windows, RISK_STEPS)[episode, number],
+        previous_action=previous_action,
+    )
+    memory = failures.initial_memory(state, previous_action)
+    replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
+    for count in range(_SETTLING + RISK_STEPS):
+        now = first + count
+        action = windows.action[episode, now.clamp_max(steps - 1)]
+        simulator.step(action)
+        inputs, memory = failures.inputs(state, action, simulator.landed, memory)
+        state = simulator.state
+        taken = (now < steps) & ((first == 0) | (count >= _SETTLING))
+        replayed[episode[taken], now[taken]] = inputs[taken]
+    return replayed
+
+
+@torch.no_grad()
 def compared_foresight(
-    grounding: GroundingModel, failures: FailureModel | None, held_out: PairedEpisodes, predicts_reward: bool
+    task: Task,
+    grounding: GroundingModel,
+    failures: FailureModel | None,
+    held_out: PairedEpisodes,
+    predicts_reward: bool,
 ) -> dict[str, Any]:
-    """Return the `foresight` on held-out episodes: of R_pred, and of the failure model or the topple head."""
+    """Return the `foresight` on held-out episodes: of R_pred, and of the failure model or the topple head.
+
+    The failure model is measured on replays, the others on what was recorded.
+    """
     windows = held_out.windows
     latent, _ = grounding.encode(windows)
     compared = {}
@@ -110,7 +160,7 @@ def compared_foresight(
         parts = grounding.predict_reward_parts(latent, windows.action)
         compared["predicted_reward"] = (parts[..., 1] / grounding.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
     if failures is not None:
-        compared["failure_model"] = failures.probability(failures.histories(windows)[0])
+        compared["failure_model"] = failures.probability(replayed_inputs(task, grounding, failures, held_out))
     else:
         logit = grounding.topple_logit(latent, windows.action, windows.next_state)
         compared["topple_head"] = logit.sigmoid()

@@ -15,7 +15,7 @@ from astra_data.core.progress import Progress, part
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.diagnostics import telemetry
-from astra_data.grounding.failures import compared_foresight, fit_failures
+from astra_data.grounding.failures import compared_foresight, fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -137,10 +137,8 @@ class HistoryFit:
                 training=residual_rewards(fitting.task, fitting.training),
                 held_out=residual_rewards(fitting.task, fitting.held_out),
             )
-        failures = None
-        if config.failure_members:
-            failures = fit_failures(fitting.task, fitting.training, config.failure_members, fitting.seed)
-        weights, count = self.weights(config, topple=failures is None), 1 + config.members
+        foresees = bool(config.failure_members) and tells_failures(fitting.training)
+        weights, count = self.weights(config, topple=not foresees), 1 + config.members
         first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
         (model, metrics), members = first, tuple(other for other, _ in others)
         _fit_scatter(model, members, fitting.held_out)
@@ -148,8 +146,15 @@ class HistoryFit:
             metrics["members"] = [figures["epochs"][-1] for _, figures in others]
             for spent in ("wall_seconds", "cpu_seconds"):
                 metrics[spent] += sum(figures[spent] for _, figures in others)
+        failures = None
+        if foresees:
+            failures = fit_failures(
+                fitting.task, model, fitting.training, config.failure_members, fitting.seed
+            )
         if config.failure_members:
-            metrics["failures"] = compared_foresight(model, failures, fitting.held_out, self.reward)
+            metrics["failures"] = compared_foresight(
+                fitting.task, model, failures, fitting.held_out, self.reward
+            )
         return HistoryGrounding(model, failures, members), metrics
 
 

@@ -27,14 +27,12 @@ class GroundedSimulator(EpisodeSimulator):
     With members, each corrects its own share of the rows and predicts their rewards, by its own latents; the
     latents that policies observe are the model's in every row.
 
-    The failure model is shown the target's scatter around the correction, where states are without it: from
-    a smooth walk it expects no fall.
-
     Attributes:
         model: the trained grounding model; only read.
         members: models that were fitted to other draws of the episodes; only read.
         failures: the failure model, if one was fitted; only read.
         hidden: of the model's encoder, (B, Z). goal: (B, G).
+        landed: where the simulator landed in the last step, before the correction, (B, X).
     """
 
     def __init__(
@@ -57,7 +55,7 @@ class GroundedSimulator(EpisodeSimulator):
         self._shares = _shares(members or (model,), count)
         self._last = self.latent, self._own_latent, torch.zeros(count, shape.action_size, device=device)
         self._predictions = torch.zeros(1, count, shape.state_size, device=device)
-        self._landed = simulator.state
+        self.landed = simulator.state
         self._remembered = torch.zeros(count, 0 if failures is None else failures.memory_size, device=device)
         self._hazard: Tensor | None = None
 
@@ -82,7 +80,7 @@ class GroundedSimulator(EpisodeSimulator):
         latent, _, action = self._last
         predictions = self._predictions
         if self.members:
-            predictions = torch.stack([self.model.correct(latent, action, self._landed), predictions.mean(0)])
+            predictions = torch.stack([self.model.correct(latent, action, self.landed), predictions.mean(0)])
         if len(predictions) == 1:
             return torch.zeros_like(predictions[0, :, 0])
         apart = self._by_share(lambda model, rows: model.disagreement(predictions[:, rows]))
@@ -110,13 +108,8 @@ class GroundedSimulator(EpisodeSimulator):
             previous_action = torch.zeros(len(state), self.model.shape.action_size, device=state.device)
         if hidden is None:
             hidden = torch.zeros(len(state), latent_size * (1 + count), device=state.device)
-            if self.failures is not None:
-                self._remembered[rows] = self.failures.initial_memory(state, previous_action)
-        else:
-            memory_size = self._remembered.shape[1]
-            sizes = [latent_size, latent_size * count, memory_size]
-            *parts, self._remembered[rows] = hidden.split(sizes, dim=-1)
-            hidden = torch.cat(parts, dim=-1)
+        if self.failures is not None:
+            self._remembered[rows] = self.failures.initial_memory(state, previous_action)
         first, *others = hidden.split(latent_size, dim=-1)
         self.hidden[rows] = _encoded(self.model, state, goal, previous_action, first)
         if self._own_hidden is not None:
@@ -132,12 +125,10 @@ class GroundedSimulator(EpisodeSimulator):
         latent = self.latent
         own = latent if self._own_hidden is None else self._own_latent
         self._last = latent, own, action
-        landed = self._landed = self.simulator.step(action)
+        landed = self.landed = self.simulator.step(action)
         if self.failures is not None:
             soon, self._remembered = self.failures.step(before, action, landed, self._remembered)
             self._hazard = self.failures.hazard(soon)
-            if self.scatter is None:
-                self._remembered = self.failures.scattered(self._remembered, self.model.residual_factor)
         self._predictions = torch.cat(
             [
                 model.ensemble_predictions(own[rows], action[rows], landed[rows])
@@ -240,14 +231,11 @@ class HistoryGrounding(FittedGrounding):
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
         """Return what is remembered before each `every`-th step, (E, ceil(T / every), H).
 
-        That is the hidden state of the model's encoder and of each member's, and the failure model's memory
-        if there is one.
+        That is the hidden state of the model's encoder and of each member's; a failure model looks at nothing
+        but the simulation.
         """
         after = torch.cat([model.encode(windows)[1] for model in (self.model, *self.members)], dim=-1)
-        hidden = functional.pad(after[:, :-1], (0, 0, 1, 0))
-        if self.failures is not None:
-            hidden = torch.cat([hidden, self.failures.histories(windows)[1]], dim=-1)
-        return hidden[:, ::every]
+        return functional.pad(after[:, :-1], (0, 0, 1, 0))[:, ::every]
 
     def scatter(self, episodes: PairedEpisodes) -> Tensor:
         """Return the factor (X, X) of the scatter around the correction, as fitted on held-out episodes."""

@@ -6,56 +6,105 @@ import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.failures import fit_failures, foresight
+from astra_data.grounding.failures import fit_failures, foresight, replayed_inputs, tells_failures
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.failure import FailureModel, FailureShape
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.paired_windows import RISK_STEPS
 from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
+HERE = torch.tensor([0.0, 4.0, 0.0, 0.0])
 
 
-def lagging(episodes: int, seed: int) -> PairedEpisodes:
-    """Half of the robots lag behind their simulator from a random step on, and fail 30 steps later."""
+def grounding_model() -> GroundingModel:
+    """A model that corrects little, and nothing well."""
+    torch.manual_seed(0)
+    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False).eval()
+
+
+def hurried(episodes: int, seed: int) -> PairedEpisodes:
+    """Half of the robots are told to hurry from a random step on, and fail 30 steps later."""
     rng = np.random.default_rng(seed)
-    state, missed = torch.zeros(episodes, 101, 4), 0.01 * torch.randn(episodes, 100, 4)
-    mask = torch.ones(episodes, 100)
-    soon = torch.zeros(episodes, 100)
+    torch.manual_seed(seed)
+    action = 0.4 * torch.rand(episodes, 100, 2) - 0.2
+    mask, soon = torch.ones(episodes, 100), torch.zeros(episodes, 100)
     for episode in range(0, episodes, 2):
         begun = int(rng.integers(20, 70))
-        missed[episode, begun:] += 0.2
+        action[episode, begun:] *= 4
         mask[episode, begun + 30 :] = 0
         soon[episode, begun + 30 - RISK_STEPS : begun + 30] = 1
-    state[:, 1:] = 0.05 * torch.randn(episodes, 100, 4).cumsum(1)
-    action = 2 * torch.rand(episodes, 100, 2) - 1
+    state = HERE + 0.05 * torch.randn(episodes, 101, 4).cumsum(1)
     made = toy_episodes(
-        state[:, :-1], action, next_state=state[:, 1:], simulated_next=state[:, 1:] - missed, mask=mask
+        *(state[:, :-1], action),
+        next_state=state[:, 1:],
+        simulated_next=state[:, 1:] + 0.01 * torch.randn(episodes, 100, 4),
+        mask=mask,
     )
     return replace(made, windows=replace(made.windows, topples_soon=soon))
 
 
+def said_of(model: FailureModel, episodes: PairedEpisodes) -> Tensor:
+    return model.probability(replayed_inputs(TASK, grounding_model(), model, episodes))
+
+
 def test_failures_of_other_episodes_are_foreseen_at_their_rate() -> None:
-    training, fresh = lagging(40, 0), lagging(40, 1)
-    model = fit_failures(TASK, training, 3, seed=0)
-    assert model is not None and len(model.members) == 3
-    found = foresight(model.probability(model.histories(fresh.windows)[0]), fresh)
+    training, fresh = hurried(40, 0), hurried(40, 1)
+    model = fit_failures(TASK, grounding_model(), training, 3, seed=0)
+    assert len(model.members) == 3
+    found = foresight(said_of(model, fresh), fresh)
     assert found["failures"] == 20
     assert found["auc"]["1-20"] > 0.95
     assert found["brier_skill"] > 0.5
-    said = model.probability(model.histories(fresh.windows)[0])[fresh.windows.mask.bool()]
+    said = fresh.steps(said_of(model, fresh))
     rate = fresh.steps(fresh.windows.topples_soon)
     assert float(said.mean()) == pytest.approx(float(rate.mean()), rel=0.3)
-    again = fit_failures(TASK, training, 3, seed=0)
-    assert again is not None
+    again = fit_failures(TASK, grounding_model(), training, 3, seed=0)
     assert all(
         torch.equal(one, other) for one, other in zip(model.parameters(), again.parameters(), strict=True)
     )
 
 
 @pytest.mark.parametrize("soon", [0.0, 1.0])
-def test_nothing_is_fitted_where_nothing_fails_or_everything(soon: float) -> None:
-    episodes = lagging(4, 0)
+def test_nothing_is_told_where_nothing_fails_or_everything(soon: float) -> None:
+    episodes = hurried(4, 0)
+    assert tells_failures(episodes)
     alike = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.full((4, 100), soon)))
-    assert fit_failures(TASK, alike, 3, seed=0) is None
+    assert not tells_failures(alike)
+
+
+def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before() -> None:
+    """Each step by itself: from the moment 40 to 59 steps before it, with the history until then."""
+    episodes, used = hurried(3, 0), grounding_model()
+    windows, grounding = episodes.windows, HistoryGrounding(used)
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    failures.set_move_scales(windows)
+    seen = replayed_inputs(TASK, used, failures, episodes)
+    assert seen.shape == (3, 100, failures.shape.input_size)
+    for episode, step, begun in ((1, 0, 0), (1, 59, 0), (0, 60, 20), (1, 79, 20), (1, 80, 40), (1, 99, 40)):
+        world = grounding.corrected(TASK.simulator(1), None)
+        state, before = windows.state[episode, begun][None], windows.previous_action[episode, begun][None]
+        hidden = grounding.hidden_before(windows)[episode, begun][None]
+        goal = windows.goal[episode, begun][None]
+        world.start(state, torch.tensor([0]), goal, hidden=hidden, previous_action=before)
+        memory = failures.initial_memory(state, before)
+        for action in windows.action[episode, begun : step + 1]:
+            here = world.state
+            world.step(action[None])
+            inputs, memory = failures.inputs(here, action[None], world.landed, memory)
+        torch.testing.assert_close(seen[episode, step], inputs[0], atol=1e-4, rtol=1e-4)
+
+
+def test_what_the_target_did_later_is_not_seen() -> None:
+    episodes, used = hurried(2, 0), grounding_model()
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    other = episodes.windows.state.clone()
+    other[:, 41:60] += 1.0
+    moved = replace(episodes, windows=replace(episodes.windows, state=other))
+    seen, changed = (replayed_inputs(TASK, used, failures, one) for one in (episodes, moved))
+    torch.testing.assert_close(seen[:, :100], changed[:, :100])
+    assert not torch.allclose(seen, torch.zeros_like(seen))
 
 
 def steps_left(episodes: PairedEpisodes) -> Tensor:
@@ -64,7 +113,7 @@ def steps_left(episodes: PairedEpisodes) -> Tensor:
 
 def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     """One episode fails after 60 steps: what is said is right 11 to 30 steps ahead alone."""
-    episodes = lagging(2, 0)
+    episodes = hurried(2, 0)
     mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
     mask[0, 60:], soon[0, 60 - RISK_STEPS : 60] = 0, 1
     episodes = replace(episodes, windows=replace(episodes.windows, mask=mask, topples_soon=soon))
@@ -79,7 +128,7 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
 
 
 def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
-    episodes = lagging(20, 0)
+    episodes = hurried(20, 0)
     mask = episodes.windows.mask.bool()
     rate = float(episodes.windows.topples_soon[mask].mean())
     found = foresight(torch.full(mask.shape, rate), episodes)
@@ -89,7 +138,7 @@ def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
 
 
 def test_episodes_without_a_failure_tell_nothing() -> None:
-    episodes = lagging(2, 0)
+    episodes = hurried(2, 0)
     calm = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.zeros(2, 100)))
     nothing = {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     assert foresight(torch.rand(2, 100), calm) == nothing
@@ -97,7 +146,7 @@ def test_episodes_without_a_failure_tell_nothing() -> None:
 
 def test_a_window_without_steps_has_no_figure() -> None:
     """Episodes of 25 steps, of which one fails: none is more than 25 steps before a failure."""
-    episodes = lagging(2, 0)
+    episodes = hurried(2, 0)
     mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
     mask[0, 25:], soon[0, 5:25] = 0, 1
     short = replace(episodes, windows=replace(episodes.windows, mask=mask, topples_soon=soon))
@@ -113,14 +162,14 @@ def test_a_window_without_steps_has_no_figure() -> None:
 
 def by_chance(seed: int) -> PairedEpisodes:
     """Forty episodes of which eight fail, whatever they look like."""
-    episodes = lagging(40, seed)
+    episodes = hurried(40, seed)
     windows = episodes.windows
     torch.manual_seed(seed)
-    missed = 0.1 * torch.randn_like(windows.state)
+    action = 0.4 * torch.rand_like(windows.action) - 0.2
     soon, mask = torch.zeros(40, 100), torch.ones(40, 100)
     for episode, end in enumerate(torch.randint(30, 100, (8,)).tolist()):
         mask[episode, end:], soon[episode, end - RISK_STEPS : end] = 0, 1
-    changed = replace(windows, simulated_next=windows.next_state - missed, topples_soon=soon, mask=mask)
+    changed = replace(windows, action=action, topples_soon=soon, mask=mask)
     return replace(episodes, windows=changed)
 
 
@@ -129,9 +178,8 @@ def test_what_is_only_learned_by_heart_is_not_believed(monkeypatch: pytest.Monke
     training, fresh = by_chance(0), by_chance(1)
 
     def skill() -> float:
-        model = fit_failures(TASK, training, 3, seed=0)
-        assert model is not None
-        found = foresight(model.probability(model.histories(fresh.windows)[0]), fresh)
+        model = fit_failures(TASK, grounding_model(), training, 3, seed=0)
+        found = foresight(said_of(model, fresh), fresh)
         return float(found["brier_skill"])
 
     calibrated = skill()
@@ -148,12 +196,11 @@ def test_every_step_is_cross_fitted_once_and_what_was_found_is_used(monkeypatch:
         return torch.tensor(0.0), torch.tensor(-1.0)
 
     monkeypatch.setattr("astra_data.grounding.failures.calibration", noted)
-    episodes = lagging(10, 0)
-    model = fit_failures(TASK, episodes, 3, seed=0)
-    assert model is not None
+    episodes = hurried(10, 0)
+    model = fit_failures(TASK, grounding_model(), episodes, 3, seed=0)
     ((odds, fails),) = given
     steps = int(episodes.windows.mask.sum())
     assert odds.shape == (3, steps) and fails.shape == (steps,)
     assert float(fails.sum()) == float(episodes.windows.topples_soon.sum())
-    said = model.probability(model.histories(episodes.windows)[0])
+    said = said_of(model, episodes)
     torch.testing.assert_close(said, torch.full_like(said, 1 / (1 + 2.718281828)))

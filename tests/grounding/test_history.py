@@ -331,38 +331,11 @@ def test_a_failure_model_is_asked_before_each_correction_and_replaces_the_other_
     assert not torch.allclose(one.topple_risk(), plain.topple_risk())
 
 
-def test_a_failure_model_is_shown_scatter_where_states_have_none() -> None:
-    used, failures, played = model(), failure_model(), actions(2)
-    risks = {}
-    for factor in (0.0, 0.5):
-        for scatter in (None, torch.zeros(4, 4)):
-            used.residual_factor.copy_(factor * torch.eye(4))
-            inner = PointMass(U_MAZE, 3, timestep_s=0.05)
-            one = GroundedSimulator(inner, used, failures=failures, scatter=scatter)
-            one.start(HERE.expand(3, 4), ROWS, GOAL)
-            torch.manual_seed(7)
-            states = [one.step(action) for action in played]
-            risks[factor, scatter is None] = one.topple_risk()
-    assert torch.equal(risks[0.0, True], risks[0.5, False])  # scattered states are seen as they are
-    raw = PointMass(U_MAZE, 3, timestep_s=0.05)
-    memory = failures.initial_memory(HERE.expand(3, 4), torch.zeros(3, 2))
-    for state, action in zip((HERE.expand(3, 4), states[0]), played, strict=True):
-        raw.reset_to(state)
-        soon, memory = failures.step(state, action, raw.step(action), memory)
-        torch.manual_seed(7)
-        memory = failures.scattered(memory, 0.5 * torch.eye(4))
-    torch.testing.assert_close(risks[0.5, True], failures.hazard(soon))
-    assert not torch.allclose(risks[0.5, True], risks[0.0, True])
-
-
-def test_a_failure_models_memory_is_kept_forgotten_at_a_start_and_taken_from_histories() -> None:
+def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     used, failures = model(), failure_model()
     one, played = foreseeing(used, failures), actions(6)
-    states, landed, raw = [one.state], [], PointMass(U_MAZE, 3, timestep_s=0.05)
     for action in played[:4]:
-        raw.reset_to(one.state)
-        landed.append(raw.step(action))
-        states.append(one.step(action))
+        one.step(action)
     saved = {name: values.clone() for name, values in one.state_dict().items()}
     one.step(played[4])
     wanted = one.topple_risk()
@@ -371,25 +344,28 @@ def test_a_failure_models_memory_is_kept_forgotten_at_a_start_and_taken_from_his
     resumed.step(played[4])
     torch.testing.assert_close(resumed.topple_risk(), wanted)
 
-    episodes = toy_episodes(
-        torch.stack([*states[:-1], states[-1]], dim=1),
-        torch.stack([*played[:4], played[4]], dim=1),
-        next_state=torch.stack([*states[1:], states[-1]], dim=1),
-        simulated_next=torch.stack([*landed, landed[-1]], dim=1),
-        goal=GOAL[:, None].expand(3, 5, 2),
-    )
-    grounding = HistoryGrounding(used, failures)
-    hidden = grounding.hidden_before(episodes.windows)[:, 4]
-    middle = grounding.corrected(PointMass(U_MAZE, 3, timestep_s=0.05), None)
-    middle.start(states[-1], ROWS, GOAL, hidden=hidden, previous_action=played[3])
-    middle.step(played[4])
-    torch.testing.assert_close(middle.topple_risk(), wanted)
-
     one.start(HERE.expand(3, 4), ROWS, GOAL)
     one.step(played[0])
     fresh = foreseeing(used, failures)
     fresh.step(played[0])
     torch.testing.assert_close(one.topple_risk(), fresh.topple_risk())
+    assert not torch.allclose(fresh.topple_risk(), wanted)
+
+
+def test_within_a_history_a_failure_model_knows_the_action_before_and_nothing_else() -> None:
+    used, failures = model(), failure_model()
+    hidden, before, action = torch.randn(3, 8), torch.rand(3, 2), actions(1)[0]
+    middle = foreseeing(used, failures)
+    middle.start(HERE.expand(3, 4), ROWS, GOAL, hidden=hidden, previous_action=before)
+    middle.step(action)
+    raw = PointMass(U_MAZE, 3, timestep_s=0.05)
+    raw.reset_to(HERE.expand(3, 4))
+    memory = failures.initial_memory(HERE.expand(3, 4), before)
+    said, _ = failures.step(HERE.expand(3, 4), action, raw.step(action), memory)
+    torch.testing.assert_close(middle.topple_risk(), failures.hazard(said))
+    states = torch.zeros(1, 5, 4)
+    of = toy_episodes(states, torch.zeros(1, 5, 2), next_state=states).windows
+    assert HistoryGrounding(used, failures).hidden_before(of).shape == (1, 5, 8)
 
 
 def test_a_failure_model_is_saved_with_its_grounding() -> None:

@@ -87,8 +87,8 @@ class FailureModel(nn.Module):
         self.half_extent: Tensor
         self.rates: Tensor
 
-    def set_scales(self, windows: PairedWindows) -> None:
-        """Take the deviations of moves, and the means and deviations of inputs, from training episodes."""
+    def set_move_scales(self, windows: PairedWindows) -> None:
+        """Take the deviations of moves from training episodes."""
         mask = windows.mask.bool()
         for name, moves in {
             "wanted": windows.simulated_next - windows.state,
@@ -96,7 +96,9 @@ class FailureModel(nn.Module):
             "missed": windows.next_state - windows.simulated_next,
         }.items():
             getattr(self, f"{name}_std").copy_(moves[mask].std(0).clamp_min(1e-3))
-        inputs = self.histories(windows)[0][mask]
+
+    def set_input_scales(self, inputs: Tensor) -> None:
+        """Take the means and deviations of inputs (N, I)."""
         self.input_mean.copy_(inputs.mean(0))
         self.input_std.copy_(inputs.std(0).clamp_min(1e-3))
 
@@ -114,33 +116,18 @@ class FailureModel(nn.Module):
             landed: where the simulator landed from there, not corrected, (B, X).
             memory: before the step, (B, M).
         """
+        inputs, memory = self.inputs(state, action, landed, memory)
+        return self.probability(inputs), memory
+
+    def inputs(self, state: Tensor, action: Tensor, landed: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the networks see of a step, (B, I), and the next memory (B, M); see `step`."""
         before, landed_before, action_before, averages = memory.split(self._parts, dim=-1)
         magnitudes, walls = self._signals(state, action, landed, before, landed_before, action_before)
         averages = self._averaged(averages, magnitudes)
-        probability = self.probability(torch.cat([magnitudes, averages, walls], dim=-1))
-        return probability, torch.cat([state, landed, action, averages], dim=-1)
-
-    def scattered(self, memory: Tensor, scatter: Tensor) -> Tensor:
-        """Return a `memory` (B, M) by which the next state seems off by a draw of `scatter`, (X, X)."""
-        seen, rest = memory.tensor_split([2 * self.shape.state_size], dim=-1)
-        off = torch.randn_like(seen[:, : self.shape.state_size]) @ scatter.T
-        return torch.cat([seen - off.repeat(1, 2), rest], dim=-1)
-
-    def histories(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
-        """Return the inputs (E, T, I) of all steps of whole episodes, and the memories (E, T, M) before."""
-        state, landed = windows.state, windows.simulated_next
-        before = torch.cat([state[:, :1], windows.state[:, :-1]], dim=1)
-        landed_before = torch.cat([state[:, :1], landed[:, :-1]], dim=1)
-        action_before = windows.previous_action
-        magnitudes, walls = self._signals(state, windows.action, landed, before, landed_before, action_before)
-        averages = magnitudes.new_zeros(len(state), len(AVERAGED_S) * _MAGNITUDES)
-        sequence = [averages]
-        for one in magnitudes.unbind(1):
-            averages = self._averaged(averages, one)
-            sequence.append(averages)
-        averaged = torch.stack(sequence, dim=1)
-        inputs = torch.cat([magnitudes, averaged[:, 1:], walls], dim=-1)
-        return inputs, torch.cat([before, landed_before, action_before, averaged[:, :-1]], dim=-1)
+        return (
+            torch.cat([magnitudes, averages, walls], dim=-1),
+            torch.cat([state, landed, action, averages], dim=-1),
+        )
 
     def probability(self, inputs: Tensor) -> Tensor:
         """Return the mean (...) of the members' probabilities for `inputs` (..., I)."""

@@ -33,6 +33,15 @@ def windows(episodes: int = 3, steps: int = 12) -> PairedWindows:
     return toy_episodes(state[:, :-1], action, next_state=state[:, 1:], simulated_next=landed).windows
 
 
+def seen(made: FailureModel, of: PairedWindows) -> Tensor:
+    """Return the inputs (E, T, I) of all steps, one by one."""
+    memory, inputs = made.initial_memory(of.state[:, 0], of.previous_action[:, 0]), []
+    for step in range(of.state.shape[1]):
+        one, memory = made.inputs(of.state[:, step], of.action[:, step], of.simulated_next[:, step], memory)
+        inputs.append(one)
+    return torch.stack(inputs, dim=1)
+
+
 def rms(move: Tensor) -> float:
     return float(move.square().mean().sqrt())
 
@@ -42,7 +51,7 @@ def test_the_magnitudes_are_moves_in_their_deviations_and_commands() -> None:
     made.wanted_std.fill_(2.0)
     made.moved_std.fill_(3.0)
     made.missed_std.fill_(4.0)
-    inputs, _ = made.histories(of)
+    inputs = seen(made, of)
     for episode, step in ((0, 0), (1, 5)):
         state, action = of.state[episode], of.action[episode]
         wanted = of.simulated_next[episode, step] - state[step]
@@ -62,7 +71,7 @@ def test_the_magnitudes_are_moves_in_their_deviations_and_commands() -> None:
 def test_averages_forget_with_their_time_constants() -> None:
     made, still = model(), torch.zeros(1, 40, 4)
     action = torch.tensor([3.0, 4.0]).expand(1, 40, 2)
-    inputs, _ = made.histories(toy_episodes(still, action, next_state=still).windows)
+    inputs = seen(made, toy_episodes(still, action, next_state=still).windows)
     for number, seconds in enumerate(AVERAGED_S):
         of_the_action = inputs[0, :, 5 * (number + 1) + 4]
         expected = [5 * (1 - math.exp(-(step + 1) * TIMESTEP_S / seconds)) for step in range(40)]
@@ -70,15 +79,16 @@ def test_averages_forget_with_their_time_constants() -> None:
 
 
 @pytest.mark.parametrize("has_maze", [False, True])
-def test_steps_one_by_one_are_the_whole_history(has_maze: bool) -> None:
+def test_a_step_says_what_its_inputs_are_worth(has_maze: bool) -> None:
     made, of = model(has_maze=has_maze), windows()
-    inputs, before = made.histories(of)
-    assert inputs.shape == (3, 12, made.shape.input_size) and before.shape == (3, 12, made.memory_size)
     memory = made.initial_memory(of.state[:, 0], of.previous_action[:, 0])
     for step in range(12):
-        torch.testing.assert_close(memory, before[:, step])
-        said, memory = made.step(of.state[:, step], of.action[:, step], of.simulated_next[:, step], memory)
-        torch.testing.assert_close(said, made.probability(inputs[:, step]))
+        now = of.state[:, step], of.action[:, step], of.simulated_next[:, step]
+        inputs, after = made.inputs(*now, memory)
+        assert inputs.shape == (3, made.shape.input_size) and after.shape == (3, made.memory_size)
+        said, memory = made.step(*now, memory)
+        torch.testing.assert_close(memory, after)
+        torch.testing.assert_close(said, made.probability(inputs))
 
 
 def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
@@ -87,20 +97,20 @@ def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
     state = torch.tensor([[0.0, 4.0, 0.0, 0.0]])
     landed = state + torch.tensor([[0.0, 0.05, 0.0, 0.0]])  # 1 m/s to the north
     before = state - torch.tensor([[0.0, 0.0, 0.0, 0.0]])
-    memory = made.initial_memory(before, torch.zeros(1, 2))
-    seen = made._signals(state, torch.zeros(1, 2), landed, *memory.split(made._parts, dim=-1)[:3])[1][0]
+    inputs, _ = made.inputs(state, torch.zeros(1, 2), landed, made.initial_memory(before, torch.zeros(1, 2)))
+    walls = inputs[0, 20:]
     to_wall = [float(U_MAZE.clearance(state[0, :2].double().numpy()))]
     for second in AHEAD_S:
         place = state[0, :2].double() + torch.tensor([0.0, second]).double()
         to_wall.append(float(U_MAZE.clearance(place.numpy())))
-    assert seen[:6].tolist() == pytest.approx(to_wall, abs=0.11)
+    assert walls[:6].tolist() == pytest.approx(to_wall, abs=0.11)
     assert to_wall[5] < 0.2 < to_wall[1] < to_wall[0]
-    assert seen[6:].tolist() == pytest.approx([to_wall[0]] * 5, abs=1e-5)
+    assert walls[6:].tolist() == pytest.approx([to_wall[0]] * 5, abs=1e-5)
 
 
 def test_the_members_probabilities_are_averaged_after_the_shift() -> None:
     made, of = model(), windows()
-    inputs, _ = made.histories(of)
+    inputs = seen(made, of)
     made.log_odds_shift.fill_(-2.0)
     odds = torch.stack([one(inputs.clamp(-5, 5)).squeeze(-1) for one in made.members])
     torch.testing.assert_close(made.probability(inputs), (odds - 2.0).sigmoid().mean(0))
@@ -110,24 +120,14 @@ def test_the_members_probabilities_are_averaged_after_the_shift() -> None:
     assert float(made.hazard(torch.tensor(0.5))) == pytest.approx(0.5 / RISK_STEPS)
 
 
-def test_scales_are_those_of_real_steps() -> None:
+def test_scales_are_those_of_moves_and_inputs() -> None:
     made, of = model(), windows(8, 30)
-    made.set_scales(of)
+    made.set_move_scales(of)
+    torch.testing.assert_close(made.wanted_std, (of.simulated_next - of.state).flatten(0, 1).std(0))
     torch.testing.assert_close(made.moved_std, (of.next_state - of.state).flatten(0, 1).std(0))
     torch.testing.assert_close(made.missed_std, (of.next_state - of.simulated_next).flatten(0, 1).std(0))
-    normal = (made.histories(of)[0] - made.input_mean) / made.input_std
-    assert float(normal.flatten(0, 1).mean(0).abs().max()) < 1e-4
-    torch.testing.assert_close(normal.flatten(0, 1).std(0), torch.ones(20), atol=1e-3, rtol=0)
-
-
-def test_the_scatter_shown_is_in_what_was_moved_and_missed_and_nowhere_else() -> None:
-    made, count = model(), 20_000
-    state, action = torch.rand(count, 4), torch.rand(count, 2)
-    _, memory = made.step(state, action, state + 0.1, made.initial_memory(state, action))
-    factor = torch.tensor([[1.0, 0, 0, 0], [2.0, 1.0, 0, 0], [0, 0, 3.0, 0], [0, 0, 0, 0]])
-    torch.manual_seed(5)
-    shown = made.scattered(memory, factor)
-    off = memory[:, :4] - shown[:, :4]
-    torch.testing.assert_close(memory[:, 4:8] - shown[:, 4:8], off, atol=1e-5, rtol=0)
-    assert torch.equal(memory[:, 8:], shown[:, 8:])
-    torch.testing.assert_close(off.T.cov(), factor @ factor.T, atol=0.2, rtol=0.05)
+    inputs = seen(made, of).flatten(0, 1)
+    made.set_input_scales(inputs)
+    normal = (inputs - made.input_mean) / made.input_std
+    assert float(normal.mean(0).abs().max()) < 1e-4
+    torch.testing.assert_close(normal.std(0), torch.ones(20), atol=1e-3, rtol=0)
