@@ -162,6 +162,12 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         _put(partial, out, old)
 
 
+def remove_checkpoints(folder: Path) -> None:
+    """Remove what trainings in `folder` would have been resumed from; they are over."""
+    for checkpoint in folder.glob("*checkpoint.safetensors"):
+        checkpoint.unlink()
+
+
 def _put(partial: Path, out: Path, old: Path) -> None:
     """Rename `partial` to `out`; an older `out` is `old` in between, and comes back after an error."""
     if out.exists():

@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.checkpoint import finished_folder
+from astra_data.core.checkpoint import finished_folder, remove_checkpoints
 from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.manifest import write_manifest
@@ -88,8 +88,7 @@ def align(
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
     with finished_folder(out, config=settings_text) as folder:
-        checkpoint = folder / "checkpoint.safetensors"
-        descent = Descent(encoder, config, checkpoint=checkpoint)
+        descent = Descent(encoder, config, checkpoint=folder / "checkpoint.safetensors")
         while not descent.is_over:
             torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
             windows, state = training.draw_windows(config.batch_windows, config.window)
@@ -109,7 +108,7 @@ def align(
             **_agreement(model, encoder, held_out, bandwidths),
         }
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
-        checkpoint.unlink(missing_ok=True)
+        remove_checkpoints(folder)
         write_manifest(folder, {"dataset": episodes.content_hash, "grounding": grounding_digest})
 
 

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from astra_data.core.checkpoint import finished_folder
+from astra_data.core.checkpoint import finished_folder, remove_checkpoints
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
@@ -72,6 +72,5 @@ def ground(
         save_grounding(folder / "grounding.safetensors", grounding, episodes)
         (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
-        for checkpoint in folder.glob("*checkpoint.safetensors"):
-            checkpoint.unlink()
+        remove_checkpoints(folder)
         write_manifest(folder, {"dataset": episodes.content_hash})

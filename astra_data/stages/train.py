@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from astra_data.core.checkpoint import finished_folder
+from astra_data.core.checkpoint import finished_folder, remove_checkpoints
 from astra_data.core.config import Config, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
@@ -112,7 +112,6 @@ def train(
             policy, curve = base.learn(training)
         policy.save(folder / POLICY)
         (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
-        for checkpoint in folder.glob("*checkpoint.safetensors"):
-            checkpoint.unlink()
+        remove_checkpoints(folder)
         read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
         write_manifest(folder, read)

@@ -134,3 +134,10 @@ def test_what_does_not_fit_the_learner_is_told_in_a_line(tables: dict[str, Any],
     with pytest.raises(RecipeError, match=f"^r.toml: .*{re.escape(message)}") as caught:
         read(**tables)
     assert "\n" not in str(caught.value)
+
+
+def test_disagreement_is_that_of_heads_or_of_members() -> None:
+    penalty = {"disagreement_penalty": 1.0}
+    by_heads = read(ground={"correction_heads": 2}, plus=penalty)
+    by_members = read(ground={"members": 2}, plus=penalty | {"keep_member": True})
+    assert by_heads.plus.disagreement_penalty == by_members.plus.disagreement_penalty == 1.0

@@ -12,6 +12,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding import fit as stage
 from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.files import load_grounding, load_history_model
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.networks.grounding import LossWeights
@@ -52,6 +53,19 @@ def stop_after(updates: int) -> Progress:
             raise Stopped
 
     return progress
+
+
+def test_members_leave_no_checkpoints(task: str, paired: Path, tmp_path: Path) -> None:
+    config, kept = GROUND.model_copy(update={"updates": 1, "members": 2}), set()
+
+    def progress(fraction: float, note: str) -> None:
+        kept.update(file.name for file in tmp_path.rglob("*checkpoint.safetensors"))
+
+    ground(task, "nas", config, dataset=paired, out=tmp_path / "nas", progress=progress)
+    assert {"checkpoint.safetensors", "member_1_checkpoint.safetensors"} <= kept
+    assert not [*tmp_path.rglob("*checkpoint.safetensors")]
+    made = load_grounding(tmp_path / "nas" / "grounding.safetensors")
+    assert isinstance(made, HistoryGrounding) and len(made.members) == 2
 
 
 def test_the_artefact_is_complete(task: str, grounded: Path) -> None:
