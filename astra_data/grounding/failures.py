@@ -22,8 +22,7 @@ from astra_data.worlds.task import Task
 
 AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
 """Windows before a failure, in steps, in which it is to be foreseen."""
-_SETTLING = 2 * RISK_STEPS
-"""Steps at the beginning of a replay that are left out."""
+_REPLAYED = 3 * RISK_STEPS
 _BATCH = 1024
 _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
@@ -111,9 +110,9 @@ def replayed_inputs(
 ) -> Tensor:
     """Return what a failure model sees of each step, (E, T, I), where recorded commands are simulated.
 
-    The simulator moves more smoothly than the target, so that a failure announces itself less. Replays begin
-    at every `RISK_STEPS`-th recorded moment. The first `_SETTLING` steps of each are left out, but for those
-    that begin an episode: from then on all that is seen is simulated.
+    The simulator moves more smoothly than the target, so that a failure announces itself less. Replays of
+    `_REPLAYED` steps begin at every `RISK_STEPS`-th recorded moment. What is seen of a step is from the one
+    that began longest before it: nearly all that the averages remember is simulated then.
     """
     windows, grounded = episodes.windows, HistoryGrounding(grounding)
     steps = windows.mask.shape[1]
@@ -130,14 +129,14 @@ def replayed_inputs(
     )
     memory = failures.initial_memory(state, previous_action)
     replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
-    for count in range(_SETTLING + RISK_STEPS):
+    for count in range(_REPLAYED):
         now = first + count
         action = windows.action[episode, now.clamp_max(steps - 1)]
         simulator.step(action)
         inputs, memory = failures.inputs(state, action, simulator.landed, memory)
         state = simulator.state
-        taken = (now < steps) & ((first == 0) | (count >= _SETTLING))
-        replayed[episode[taken], now[taken]] = inputs[taken]
+        real = now < steps
+        replayed[episode[real], now[real]] = inputs[real]  # of replays that began later, seen before
     return replayed
 
 
