@@ -14,12 +14,16 @@ from astra_data.core.config import Config, Count, NotNegative, Positive, Share
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting, Taken
 from astra_data.learning.learner import Learner, Resumable
-from astra_data.learning.networks.actor_critic import ActorCritic
+from astra_data.learning.networks.actor_critic import ActorCritic, bounded
 from astra_data.learning.return_scale import ReturnScale
 from astra_data.worlds.batched import BatchedEnv
 
 if TYPE_CHECKING:
     from torchrl.objectives import ClipPPOLoss
+
+
+_PULL = 0.05
+"""Weight in the loss of the square by which means that are clipped are beyond ±1."""
 
 
 class PpoConfig(Config):
@@ -54,6 +58,8 @@ class PpoConfig(Config):
     critic_gain: Positive = 1.0
     """Of the critic's last layer at the start. With 1, its values are larger than returns that are small, and
     the first advantages tell of the untrained critic rather than of the rewards."""
+    clipped_mean: bool = False
+    """Clip the mean of the actions to ±1, in place of a tanh, which is flat where it pushes at full speed."""
     most_kl: Positive | None = None
     """Largest KL divergence of a minibatch's policy from the one that collected it, after which an iteration
     learns no more from its rollout; by default all passes are made."""
@@ -181,6 +187,9 @@ class Ppo(Learner):
                 if config.most_kl is not None and losses["kl_approx"].abs() > config.most_kl:
                     return
                 total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+                if policy.shape.clips_mean:
+                    beyond = (policy.actor(features).abs() - 1.0).clamp_min(0.0)
+                    total = total + _PULL * beyond.square().mean()
                 self._optimizer.zero_grad()
                 total.backward()
                 nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
@@ -215,7 +224,8 @@ class _Policy(nn.Module):
     def __init__(self, policy: ActorCritic) -> None:
         super().__init__()
         self.actor, self.log_std = policy.actor, policy.log_std
+        self._clips = policy.shape.clips_mean
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        mean = torch.tanh(self.actor(features))
+        mean = bounded(self.actor(features), self._clips)
         return mean, self.log_std.exp().expand_as(mean)

@@ -40,6 +40,7 @@ class TeacherThenStudent(InSimulator):
             action_size=env.action_size,
             memory_size=config.memory_size,
             hidden_sizes=config.hidden_sizes,
+            clips_mean=config.clipped_mean,
             extrinsics_size=settings.extrinsics_size,
             history_length=settings.history_length,
         )

@@ -76,7 +76,7 @@ class PpoTrainConfig(TrainConfig, PpoConfig):
         recorded: Recorded | None,
     ) -> Ppo:
         """Build the learner and a new policy of `shape`; nothing `recorded` is imitated."""
-        policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(device)
+        policy = ActorCritic(ActorCriticShape(**asdict(shape), clips_mean=self.clipped_mean)).to(device)
         return Ppo(env, policy, self, horizon=horizon, seed=seed)
 
 

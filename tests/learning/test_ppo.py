@@ -21,6 +21,7 @@ def ppo(
     *,
     horizon: int,
     memory: int = 0,
+    clips: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> Ppo:
     config = PpoConfig(
@@ -28,7 +29,7 @@ def ppo(
         **{"rollout_steps": 16, "learning_rate": 3e-3, "reward_scale": 1.0, **settings},
     )
     torch.manual_seed(0)
-    shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,))
+    shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,), clips_mean=clips)
     return Ppo(env, ActorCritic(shape), config, horizon=horizon, seed=1)
 
 
@@ -265,3 +266,35 @@ def test_an_iteration_ends_once_the_policy_has_moved_too_far(most_kl: float | No
     learner._optimizer.register_step_post_hook(lambda *_: made.append(None))
     learner.iterate()
     assert len(made) == updates
+
+
+@pytest.mark.parametrize(
+    ("pull", "begin", "least", "most"), [(0.0, 3.0, 2.7, 3.3), (5.0, 3.0, 0.9, 2.5), (5.0, 0.5, 0.3, 0.7)]
+)
+def test_a_clipped_mean_is_pulled_back_to_its_bound_and_no_farther(
+    pull: float, begin: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every action is worth the same, so that nothing but the pull moves the mean."""
+    monkeypatch.setattr("astra_data.learning.ppo._PULL", pull)
+    settings = {"entropy_weight": 0.0, "clip": 1e-6, "learning_rate": 0.02}
+    learner = ppo(ConstantReward(16, 1.0), 60, horizon=10**6, clips=True, **settings)
+    last = learner.policy.actor[-1]
+    assert isinstance(last, torch.nn.Linear)
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(-begin)
+    train(learner)
+    seen = learner.policy.actor(torch.zeros(1, learner.policy.shape.feature_size))[0]
+    assert least < -float(seen[0].detach()) < most
+
+
+def test_a_clipped_mean_learns_to_turn_back_from_its_bound() -> None:
+    """Begun far beyond the bound, the way back to zero is as short as any: a tanh would be flat."""
+    reached = {}
+    for clips in (False, True):
+        learner = ppo(GoToZero(32), 40, horizon=7, clips=clips)
+        with torch.no_grad():
+            learner.policy.actor[-1].bias.fill_(6.0)
+        train(learner)
+        reached[clips] = distance_after(learner.policy, 7)
+    assert reached[True] < 0.3 < reached[False]

@@ -11,13 +11,30 @@ from astra_data.learning.networks.policy import Policy, PolicyShape
 
 @dataclass(frozen=True)
 class ActorCriticShape(PolicyShape):
-    """Sizes of actor and critic, and the logarithm of the initial standard deviation of actions."""
+    """Sizes of actor and critic, and their actions.
+
+    Attributes:
+        initial_log_std: logarithm of the initial standard deviation.
+        clips_mean: whether the mean is clipped, in place of a tanh; see `bounded`.
+    """
 
     initial_log_std: float = -0.5
+    clips_mean: bool = False
+
+
+def bounded(output: Tensor, clips: bool) -> Tensor:
+    """Return the mean actions (..., A), within ±1, of an actor's `output`: its tanh, or with `clips` clipped.
+
+    What is clipped keeps the gradient of what is not. A tanh is flat far out: once a policy pushes against a
+    wall at full speed, it hardly learns to turn.
+    """
+    return output + (output.clamp(-1.0, 1.0) - output).detach() if clips else torch.tanh(output)
 
 
 class ActorCritic(Policy):
-    """Tanh-bounded Gaussian mean with a state-independent deviation, and a value."""
+    """Bounded Gaussian mean with a state-independent deviation, and a value."""
+
+    shape: ActorCriticShape
 
     def __init__(self, shape: ActorCriticShape) -> None:
         super().__init__(shape)
@@ -40,7 +57,7 @@ class ActorCritic(Policy):
 
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (..., A) of the action for `features` (..., F)."""
-        mean = torch.tanh(self.actor(features))
+        mean = bounded(self.actor(features), self.shape.clips_mean)
         return mean, self.log_std.exp().expand_as(mean)
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -1,6 +1,6 @@
 import torch
 
-from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape, bounded
 
 
 def test_remembering_step_by_step_is_remembering_the_sequence() -> None:
@@ -40,3 +40,15 @@ def test_means_are_bounded_and_the_deviation_is_as_asked() -> None:
     assert mean.abs().max() <= 1.0
     torch.testing.assert_close(std, torch.full((50, 2), -1.0).exp())
     assert policy.value(torch.randn(5, 3)).shape == (5,)
+
+
+def test_a_clipped_mean_keeps_the_gradient_of_what_is_not() -> None:
+    output = torch.tensor([-7.0, -0.4, 0.9, 3.0], requires_grad=True)
+    mean = bounded(output, clips=True)
+    torch.testing.assert_close(mean, torch.tensor([-1.0, -0.4, 0.9, 1.0]))
+    mean.sum().backward()
+    assert output.grad is not None and torch.equal(output.grad, torch.ones(4))
+    torch.testing.assert_close(bounded(output, clips=False), output.tanh())
+    shape = ActorCriticShape(observation_size=3, action_size=2, clips_mean=True)
+    policy, seen = ActorCritic(shape), 1e3 * torch.randn(50, 3)
+    torch.testing.assert_close(policy.policy(seen)[0], policy.actor(seen).clamp(-1.0, 1.0))
