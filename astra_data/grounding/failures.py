@@ -13,6 +13,7 @@ from torch.nn import functional
 from astra_data.core.seeding import derive
 from astra_data.grounding.calibration import calibration, folds
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.failure import FailureModel, FailureShape
@@ -23,6 +24,7 @@ from astra_data.worlds.task import Task
 AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
 """Windows before a failure, in steps, in which it is to be foreseen."""
 _REPLAYED = 3 * RISK_STEPS
+"""Steps of a replay: the last of them come after as long as the averages of a failure model remember."""
 _BATCH = 1024
 _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
@@ -48,8 +50,9 @@ def fit_failures(
     torch.manual_seed(derive(seed, "failure model"))
     untrained = _untrained(task, training, members)
     inputs = replayed_inputs(task, grounding, untrained, training)
-    untrained.set_input_scales(training.steps(inputs))
-    model = _descended(untrained, training.steps(inputs), training.steps(fails))
+    seen = training.steps(inputs)
+    untrained.set_input_scales(seen)
+    model = _descended(untrained, seen, training.steps(fails))
     odds, happened = [], []
     for fold in folds(fails.any(1)):
         others = training.select((~fold).nonzero().squeeze(1))
@@ -115,28 +118,22 @@ def replayed_inputs(
     that began longest before it: nearly all that the averages remember is simulated then.
     """
     windows, grounded = episodes.windows, HistoryGrounding(grounding)
-    steps = windows.mask.shape[1]
-    episode, number = windows.mask[:, ::RISK_STEPS].nonzero(as_tuple=True)
-    first = number * RISK_STEPS
-    simulator = grounded.corrected(task.simulator(len(first), str(first.device)), None)
-    state, previous_action = windows.state[episode, first], windows.previous_action[episode, first]
-    simulator.start(
-        state,
-        torch.arange(len(first), device=first.device),
-        windows.goal[episode, first],
-        hidden=grounded.hidden_before(windows, RISK_STEPS)[episode, number],
-        previous_action=previous_action,
-    )
-    memory = failures.initial_memory(state, previous_action)
+    moments = Moments.every(windows, RISK_STEPS)
+    simulator = grounded.corrected(task.simulator(len(moments), str(windows.mask.device)), None)
+    hidden = grounded.hidden_before(windows, RISK_STEPS)
+    moments.start(simulator, hidden[moments.episode, moments.first // RISK_STEPS])
+    state = moments.state
+    memory = failures.initial_memory(state, moments.previous_action)
     replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
     for count in range(_REPLAYED):
-        now = first + count
-        action = windows.action[episode, now.clamp_max(steps - 1)]
+        now = moments.after(count)
+        action = windows.action[moments.episode, now]
         simulator.step(action)
         inputs, memory = failures.inputs(state, action, simulator.landed, memory)
         state = simulator.state
-        real = now < steps
-        replayed[episode[real], now[real]] = inputs[real]  # of replays that began later, seen before
+        real = now == moments.first + count
+        # A replay that began earlier comes to a step later, and replaces what was seen of it.
+        replayed[moments.episode[real], now[real]] = inputs[real]
     return replayed
 
 

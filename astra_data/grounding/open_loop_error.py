@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.seeding import derive, generator
+from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
@@ -32,28 +33,17 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     """
     torch.manual_seed(derive(seed, "gap noise"))
     windows, lengths = episodes.windows, episodes.lengths
-    pairs = [
-        (episode, step)
-        for episode, length in enumerate(lengths.tolist())
-        for step in range(0, length, _START_EVERY)
-    ]
-    episode, start = torch.tensor(pairs, device=lengths.device).T
-    rows, device = torch.arange(len(pairs), device=lengths.device), str(windows.state.device)
+    moments, device = Moments.every(windows, _START_EVERY), str(windows.state.device)
+    episode, start = moments.episode, moments.first
     horizons = [horizon for horizon in HORIZONS if horizon <= int(lengths.max())]
     simulators = {}
     for name, one in {"raw": NO_GROUNDING, "grounded": grounding.for_replay()}.items():
-        simulators[name] = one.simulator(task, len(pairs), device)
+        simulators[name] = one.simulator(task, len(moments), device)
         before = one.hidden_before(windows)
-        simulators[name].start(
-            windows.state[episode, start],
-            rows,
-            windows.goal[episode, start],
-            hidden=None if before is None else before[episode, start],
-            previous_action=windows.previous_action[episode, start],
-        )
+        moments.start(simulators[name], None if before is None else before[episode, start])
     errors: dict[str, dict[int, Tensor]] = {name: {} for name in simulators}
     for step in range(horizons[-1]):
-        now = (start + step).clamp_max(windows.mask.shape[1] - 1)
+        now = moments.after(step)
         action = windows.action[episode, now]
         states = {name: simulator.step(action) for name, simulator in simulators.items()}
         if step + 1 in horizons:
@@ -62,7 +52,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
                 apart[start + step >= lengths[episode]] = torch.nan
                 errors[name][step + 1] = apart
     rng = generator(seed, "gap bootstrap")
-    report: dict[str, Any] = {"horizons": horizons, "replays": len(pairs)}
+    report: dict[str, Any] = {"horizons": horizons, "replays": len(moments)}
     for name, by_horizon in errors.items():
         report[name] = {}
         for index, quantity in enumerate(task.quantities):

@@ -276,7 +276,7 @@ def test_a_clipped_mean_is_pulled_back_to_its_bound_and_no_farther(
 ) -> None:
     """Every action is worth the same, so that nothing but the pull moves the mean."""
     monkeypatch.setattr("astra_data.learning.ppo._PULL", pull)
-    settings = {"entropy_weight": 0.0, "clip": 1e-6, "learning_rate": 0.02}
+    settings: dict[str, Any] = {"entropy_weight": 0.0, "clip": 1e-6, "learning_rate": 0.02}
     learner = ppo(ConstantReward(16, 1.0), 60, horizon=10**6, clips=True, **settings)
     last = learner.policy.actor[-1]
     assert isinstance(last, torch.nn.Linear)
@@ -293,8 +293,10 @@ def test_a_clipped_mean_learns_to_turn_back_from_its_bound() -> None:
     reached = {}
     for clips in (False, True):
         learner = ppo(GoToZero(32), 40, horizon=7, clips=clips)
+        last = learner.policy.actor[-1]
+        assert isinstance(last, torch.nn.Linear)
         with torch.no_grad():
-            learner.policy.actor[-1].bias.fill_(6.0)
+            last.bias.fill_(6.0)
         train(learner)
         reached[clips] = distance_after(learner.policy, 7)
     assert reached[True] < 0.3 < reached[False]

@@ -56,7 +56,8 @@ def stop_after(updates: int) -> Progress:
 
 
 def test_members_leave_no_checkpoints(task: str, paired: Path, tmp_path: Path) -> None:
-    config, kept = GROUND.model_copy(update={"updates": 1, "members": 2}), set()
+    config = GROUND.model_copy(update={"updates": 1, "members": 2})
+    kept: set[str] = set()
 
     def progress(fraction: float, note: str) -> None:
         kept.update(file.name for file in tmp_path.rglob("*checkpoint.safetensors"))
