@@ -64,8 +64,10 @@ class PpoConfig(Config):
     """Largest KL divergence of a minibatch's policy from the one that collected it, after which an iteration
     learns no more from its rollout; by default all passes are made."""
     final_std: Positive | None = None
-    """Largest deviation of the actions at the end, to which it falls linearly, so that the policy is trained
-    as it is tested; by default the policy keeps what it has learned."""
+    """Largest deviation of the actions at the end, to which it falls by equal factors, so that the policy is
+    trained as it is tested; by default the policy keeps what it has learned."""
+    std_fade: Share = 1.0
+    """Share of the training over which the deviation falls to `final_std`."""
 
 
 class Ppo(Learner):
@@ -112,10 +114,12 @@ class Ppo(Learner):
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * self.share_left
         self._learn(self._collect())
-        if (least := self.config.final_std) is not None:
-            largest = least + max(self._first_std - least, 0.0) * self.share_left
+        if (final := self.config.final_std) is not None:
+            faded = min(1.0, (1.0 - self.share_left) / self.config.std_fade) if self.config.std_fade else 1.0
             with torch.no_grad():
-                self.policy.log_std.clamp_(max=math.log(largest))
+                self.policy.log_std.clamp_(
+                    max=math.log(self._first_std) + faded * math.log(final / self._first_std)
+                )
         return {"std": float(self.policy.log_std.detach().exp().mean())}
 
     @torch.no_grad()

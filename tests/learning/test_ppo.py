@@ -251,10 +251,13 @@ def test_returns_may_be_normalized() -> None:
     torch.testing.assert_close(reward, torch.full_like(reward, 1 / deviation), rtol=0.02, atol=0)
 
 
-def test_the_actions_scatter_may_fall_to_what_is_tested() -> None:
-    learner = ppo(GoToZero(8), 4, horizon=7, final_std=0.1, entropy_weight=1.0)
+@pytest.mark.parametrize(
+    ("fade", "shares"), [(1.0, [0.0, 0.25, 0.5, 0.75]), (0.5, [0.0, 0.5, 1.0, 1.0]), (0.0, [1.0] * 4)]
+)
+def test_the_actions_scatter_may_fall_to_what_is_tested(fade: float, shares: list[float]) -> None:
+    learner = ppo(GoToZero(8), 4, horizon=7, final_std=0.1, std_fade=fade, entropy_weight=1.0)
     first = math.exp(-0.5)
-    expected = [0.1 + (first - 0.1) * left for left in (1.0, 0.75, 0.5, 0.25)]
+    expected = [first ** (1 - share) * 0.1**share for share in shares]
     assert [point["std"] for point in train(learner)] == pytest.approx(expected, rel=1e-4)
 
 
