@@ -6,39 +6,30 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-import torch
-from pydantic import model_validator
-from torch import Tensor
+from pydantic import Field, model_validator
 
-from astra_data.core.config import AtOnce, Config, Count, NotNegative
+from astra_data.core.config import AtOnce, Config, Count, NotNegative, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import as_column
 from astra_data.core.progress import Progress, part
 from astra_data.core.provenance import machine
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    GOAL,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-    Episode,
-)
+from astra_data.dataset.columns import OUTCOME_COLUMNS
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.behaviors import Behavior, PolicyBehavior, RandomCommands, StressCommands, WallWatch
+from astra_data.stages.recording import record
+from astra_data.training.behaviors import (
+    Behavior,
+    MixedBehavior,
+    PolicyBehavior,
+    RandomCommands,
+    StressCommands,
+    WallWatch,
+)
 from astra_data.training.policy_file import PolicyFile, deploy
-from astra_data.worlds.batched import TargetEnv
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -75,6 +66,8 @@ class CollectConfig(Config):
     """Environment steps after which its training by SAC is stopped at the latest."""
     sac_episode_steps: Count = 500
     """Training by SAC is stopped as soon as trials of the policy last this many steps on average."""
+    random_share: Share = Field(default=0.0, exclude_if=lambda share: not share)
+    """Share of a policy's episodes whose commands are random in place, spread evenly over the dataset."""
     policy: str | None = None
     """Folder of the saved policy, as the stage `train` writes it."""
     grounding: str | None = None
@@ -90,6 +83,8 @@ class CollectConfig(Config):
         given = [name for name in artefacts if getattr(self, name) is not None]
         if self.behavior != "policy" and given:
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
+        if self.random_share and self.behavior in {"random", "stress"}:
+            raise ValueError(f'random_share: expected the behavior of a policy, got "{self.behavior}"')
         if self.hold_s[0] > self.hold_s[1]:
             raise ValueError(f"hold_s: expected the shorter time first, got {list(self.hold_s)}")
         if self.episodes * self.max_steps > MOST_STEPS:
@@ -131,8 +126,9 @@ def collect(
     world = task_named(task)
     files = _saved_files(config).items()
     saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
+    behaviors = config.behavior + ("-and-random" if config.random_share else "")
     description = {
-        "name": name or f"{world.name}-{config.behavior}-seed{seed}".replace("_", "-"),
+        "name": name or f"{world.name}-{behaviors}-seed{seed}".replace("_", "-"),
         "version": "1.0.0",
         "stage": "collect",
         "config": config.model_dump(mode="json") | saved,
@@ -151,14 +147,36 @@ def collect(
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))
+        if config.random_share:
+            behavior = MixedBehavior(behavior, _random(world, config, RandomCommands), config.random_share)
         stopwatch = Stopwatch(metadata.get("spent"))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
         steps = 0
         for first in range(0, config.episodes, config.num_envs):
             rows = range(first, min(first + config.num_envs, config.episodes))
-            if not writer.staged.keys() >= set(rows):
-                steps += _record(world, config, behavior, rows, seed, writer, num_threads, recording)
+            if writer.staged.keys() >= set(rows):
+                continue
+            batch_seed = derive(seed, f"episodes from {first}") if first else seed
+            env = world.target(
+                len(rows),
+                seed=derive(batch_seed, "collect"),
+                start_anywhere=config.start == "anywhere",
+                num_threads=num_threads,
+            )
+            env.reset()
+            behavior.start(len(rows), batch_seed)
+            batch = part(recording, rows.start / config.episodes, rows.stop / config.episodes)
+            steps += record(
+                world,
+                env,
+                behavior,
+                rows,
+                writer,
+                max_steps=config.max_steps,
+                seed=seed,
+                progress=batch,
+            )
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
         metadata |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
@@ -183,9 +201,7 @@ def _behavior(
 ) -> tuple[Behavior, dict[str, Any]]:
     """Return the behaviour and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
-        fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
-        watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
-        return commands(task.objective.action_size, (fewest, most), watch), {}
+        return _random(task, config, commands), {}
     if config.behavior.startswith("suboptimal"):
         from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - TorchRL is slow to import
 
@@ -214,86 +230,12 @@ def _behavior(
     return PolicyBehavior(deployed), {"policy_dataset": trained.dataset}
 
 
+def _random(task: Task, config: CollectConfig, commands: type[RandomCommands]) -> RandomCommands:
+    fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
+    watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
+    return commands(task.objective.action_size, (fewest, most), watch)
+
+
 def _saved_files(config: CollectConfig) -> dict[str, Path]:
     folders = config.model_dump(include={"policy", "grounding", "target_encoder"})
     return {kind: Path(folder) / f"{kind}.safetensors" for kind, folder in folders.items() if folder}
-
-
-def _record(
-    task: Task,
-    config: CollectConfig,
-    behavior: Behavior,
-    rows: range,
-    seed: int,
-    writer: StagedWriter,
-    num_threads: int | None,
-    progress: Progress,
-) -> int:
-    """Record the episodes `rows` as one batch, staging each when it ends; return the number of steps.
-
-    Random numbers are drawn for the whole batch, so episodes that are staged already are simulated again,
-    with the same outcome, but not written again.
-    """
-    count = len(rows)
-    batch_seed = derive(seed, f"episodes from {rows.start}") if rows.start else seed
-    env = task.target(
-        count,
-        seed=derive(batch_seed, "collect"),
-        start_anywhere=config.start == "anywhere",
-        num_threads=num_threads,
-    )
-    env.reset()
-    behavior.start(count, batch_seed)
-    active = torch.ones(count, dtype=torch.bool)
-    columns: dict[str, Array] = {}
-    steps = 0
-    began = time.perf_counter()
-    for step in range(config.max_steps):
-        row = _step(env, behavior, active, last=step == config.max_steps - 1)
-        row[ACTION] = task.limits.in_units(row[ACTION])
-        row[SUCCESS] = task.objective.succeeded(row[SUCCESS], row[TERMINATED] & ~row[SUCCESS], step + 1)
-        for name, values in row.items():
-            if name not in columns:
-                columns[name] = np.empty((config.max_steps, *values.shape), values.numpy().dtype)
-            columns[name][step] = values.numpy()
-        steps += int(active.sum())
-        for index in torch.nonzero(active & row[DONE]).squeeze(1).tolist():
-            if rows[index] not in writer.staged:
-                episode = {name: as_column(values[: step + 1, index]) for name, values in columns.items()}
-                writer.add(_episode(rows[index], episode, seed), rows[index])
-        active &= ~row[DONE]
-        done = rows.start + count * (step + 1) / config.max_steps
-        rate = steps / (time.perf_counter() - began)
-        progress(done / config.episodes, f"{rate:,.0f} target steps/s")
-        if not active.any():
-            break
-    return steps
-
-
-def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> dict[str, Tensor]:
-    state, goal = env.state, env.goal.clone()
-    action = behavior.act(state, goal)
-    outcome = env.step(action, active)
-    truncated = torch.full_like(outcome.terminated, last) & ~outcome.terminated
-    goals = {GOAL: goal} if goal.shape[1] else {}
-    return goals | {
-        STATE: state,
-        ACTION: action,
-        NEXT_STATE: env.state,
-        REWARD: outcome.reward,
-        TERMINATED: outcome.terminated,
-        TRUNCATED: truncated,
-        DONE: outcome.terminated | truncated,
-        SUCCESS: outcome.success,
-    }
-
-
-def _episode(uid: int, values: dict[str, Array], seed: int) -> Episode:
-    success = bool(values[SUCCESS].any())
-    metadata = {
-        "success": success,
-        "failed": bool(values[TERMINATED][-1]) and not success,
-        "return": float(values[REWARD].sum(dtype=np.float64)),
-        "seed": seed,
-    }
-    return Episode(uid, values, metadata)

@@ -128,3 +128,22 @@ class PolicyBehavior:
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
         return self._deployed.act(state, goal)
+
+
+class MixedBehavior:
+    """A policy on a part of the robots, random commands on the others."""
+
+    def __init__(self, policy: Behavior, random: Behavior, share: float) -> None:
+        """Let `random` act on a `share` of the robots, spread evenly, so that the first n have it as well."""
+        self._policy, self._random, self._share = policy, random, share
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin new episodes of B = `count` robots."""
+        self._policy.start(count, seed)
+        self._random.start(count, seed)
+        before = torch.floor(torch.arange(count + 1, dtype=torch.float64) * self._share + 1e-9)
+        self.is_random = (before.diff() > 0).unsqueeze(1)
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return actions (B, A) for target states (B, S) and goals (B, G)."""
+        return torch.where(self.is_random, self._random.act(state, goal), self._policy.act(state, goal))

@@ -3,12 +3,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from small_run import COLLECT, TASK
 
 from astra_data.core.errors import BadInputError
@@ -26,7 +23,7 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.doctor.check import check
-from astra_data.stages.collect import CollectConfig, _step, collect
+from astra_data.stages.collect import CollectConfig, collect
 from astra_data.training import suboptimal
 from astra_data.worlds.registry import TASKS
 
@@ -48,23 +45,6 @@ def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -
         assert columns[TERMINATED][-1] == (len(episode) < COLLECT.max_steps)
         assert dataset.metadata["success"][index] == columns[SUCCESS].any()
         assert dataset.metadata["return"][index] == pytest.approx(columns[REWARD].sum(), abs=1e-4)
-
-
-def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated() -> None:
-    ends = torch.tensor([True, False])
-    env: Any = SimpleNamespace(
-        state=torch.zeros(2, 3),
-        goal=torch.zeros(2, 2),
-        step=lambda action, active: SimpleNamespace(
-            reward=torch.zeros(2), terminated=ends, success=torch.zeros(2, dtype=torch.bool)
-        ),
-    )
-    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
-    for last, truncated in ((True, ~ends), (False, torch.zeros(2, dtype=torch.bool))):
-        row = _step(env, behavior, ends, last=last)
-        assert torch.equal(row[TERMINATED], ends)
-        assert torch.equal(row[TRUNCATED], truncated)
-        assert torch.equal(row[DONE], ends | truncated)
 
 
 def test_commands_are_held_for_a_while(collected: Path) -> None:
@@ -170,6 +150,32 @@ def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
     dataset = Dataset.open(out)
     assert dataset.reference == f"{TASK}-suboptimal-ppo-seed0@data-1.0.0"
     assert dataset.description["behavior"]["trained_steps"] == 64 * 128  # an iteration
+
+
+def test_a_part_of_a_policys_episodes_may_have_random_commands(task: str, tmp_path: Path) -> None:
+    datasets = {}
+    kinds = (("policy", "suboptimal_ppo", 0.0), ("random", "random", 0.0), ("mixed", "suboptimal_ppo", 0.5))
+    for name, behavior, share in kinds:
+        config = TINY.model_copy(
+            update={
+                "behavior": behavior,
+                "random_share": share,
+                "ppo_steps": 1,
+                "max_steps": 3,
+                "episodes": 4,
+            }
+        )
+        collect(task, config, seed=0, out=tmp_path / name, progress=silent)
+        datasets[name] = Dataset.open(tmp_path / name)
+    assert datasets["mixed"].reference == f"{TASK}-suboptimal-ppo-and-random-seed0@data-1.0.0"
+    first = {
+        name: [episode.columns[ACTION][0] for episode in dataset.episodes([ACTION])]
+        for name, dataset in datasets.items()
+    }
+    for index, command in enumerate(first["mixed"]):
+        same, other = ("random", "policy") if index % 2 else ("policy", "random")
+        np.testing.assert_array_equal(command, first[same][index])
+        assert (command != first[other][index]).all()
 
 
 class Stopped(Exception):  # noqa: N818 - stands for a kill
@@ -304,6 +310,8 @@ def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Pa
         CollectConfig(behavior="policy")
     with pytest.raises(ValueError, match=r'policy: expected behavior "policy", got "random"'):
         CollectConfig(policy=str(trained))
+    with pytest.raises(ValueError, match=r'random_share: expected the behavior of a policy, got "stress"'):
+        CollectConfig(behavior="stress", random_share=0.5)
     without_latent = TINY.model_copy(update={"behavior": "policy", "policy": str(trained)})
     with pytest.raises(BadInputError, match=r"takes 24 values, the task gives 8: expected a policy of"):
         collect(task, without_latent, seed=0, out=tmp_path / "out", progress=silent)

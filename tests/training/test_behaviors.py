@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.training.behaviors import RandomCommands, StressCommands, WallWatch
+from astra_data.training.behaviors import MixedBehavior, RandomCommands, StressCommands, WallWatch
 from astra_data.worlds.registry import task_named
 
 TASK = task_named("nao-navigation")
@@ -105,3 +105,29 @@ def test_short_and_long_times_of_stress_are_alike_frequent() -> None:
 
 def test_stress_keeps_clear_of_walls_where_they_are_watched() -> None:
     assert nearest(StressCommands(2, HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [
+        (0.5, [False, True, False, True, False, True]),
+        (0.34, [False, False, True, False, False, True]),
+        (1.0, [True] * 6),
+    ],
+)
+def test_random_commands_are_spread_over_the_robots(share: float, expected: list[bool]) -> None:
+    policy, random = RandomCommands(2, (1, 1)), StressCommands(2, (1, 1))
+    mixed = MixedBehavior(policy, random, share)
+    mixed.start(6, seed=0)
+    assert mixed.is_random[:, 0].tolist() == expected
+    state = believed(torch.zeros(6, 2))
+    acted = mixed.act(state, state[:, :2])
+    for behavior, rows in ((policy, ~mixed.is_random[:, 0]), (random, mixed.is_random[:, 0])):
+        behavior.start(6, seed=0)
+        torch.testing.assert_close(acted[rows], behavior.act(state, state[:, :2])[rows])
+
+
+def test_a_share_of_many_robots_is_exact() -> None:
+    mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
+    mixed.start(100, seed=0)
+    assert int(mixed.is_random.sum()) == 29
