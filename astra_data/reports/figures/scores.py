@@ -107,7 +107,7 @@ def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figu
             axes.tick_params(labelbottom=True)
         for method, seeds in curves.items():
             axes = every[panels.index(base_method(method))]
-            steps, scores = _on_one_grid(seeds)
+            steps, scores = on_one_grid(seeds)
             colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
             if len(seeds) > 1:
                 low, high = scores.min(axis=0), scores.max(axis=0)
@@ -162,7 +162,7 @@ def _tick_label(method: str) -> str:
     return f"{title} ({role})" if (role := method_role(method)) else title
 
 
-def _on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:
+def on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:
     """Return steps (K,) that all seeds cover, and their scores there, (seeds, K)."""
     known = [np.isfinite(seed.score) for seed in seeds]
     parts = [(seed.steps[keep], seed.score[keep]) for seed, keep in zip(seeds, known, strict=True)]

@@ -1,0 +1,60 @@
+"""Draw the learning curves of two published results over each other: what a change to the trainings did.
+
+    uv run python tools/compare_learning.py recipes/results/antmaze_long.json \
+        recipes/results/antmaze_long_fresh.json --out learning.png
+
+A panel for each row that both have. Lines are means over seeds, bands go from the worst seed to the best.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from matplotlib.figure import Figure
+
+from astra_data.reports.figures.scores import Curve, on_one_grid
+from astra_data.reports.figures.style import FAINT, INK, method_title, style
+from astra_data.reports.files import read_published
+from astra_data.reports.schema import Results
+
+
+def main(
+    before: Annotated[Path, typer.Argument(help="Published results, JSON.")],
+    after: Annotated[Path, typer.Argument(help="Others, of the same task.")],
+    out: Annotated[Path, typer.Option(help="PNG file.")],
+) -> None:
+    """Draw the figure and print the mean score of each row at the end."""
+    found = [read_published(path) for path in (before, after)]
+    results = [one for one in found if isinstance(one, Results)]
+    if len(results) < 2:
+        raise typer.BadParameter("expected results of recipes without a sweep")
+    rows = [
+        row
+        for row, of_row in results[1].methods.items()
+        if of_row.learning and row in results[0].methods and results[0].methods[row].learning
+    ]
+    if not rows:
+        raise typer.BadParameter(f"expected a row that both have trained, got none in {before} and {after}")
+    with style():
+        figure = Figure(figsize=(0.6 + 2.2 * len(rows), 2.6), layout="constrained")
+        for axes, row in zip(figure.subplots(1, len(rows), squeeze=False, sharey=True)[0], rows, strict=True):
+            axes.set_title(method_title(row), loc="left")
+            for one, colour in zip(results, (FAINT, INK), strict=True):
+                curves = [
+                    Curve(np.array(seed.steps), np.array(seed.score)) for seed in one.methods[row].learning
+                ]
+                steps, scores = on_one_grid(curves)
+                low, high = scores.min(axis=0), scores.max(axis=0)
+                axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.2, lw=0)
+                axes.plot(steps / 1e6, scores.mean(axis=0), color=colour, label=one.recipe)
+                print(f"{row}: {one.recipe} {scores[:, -1].mean():.2f} of {len(scores)} trainings")
+            axes.set_ylim(0, 1)
+        figure.supxlabel("million steps of training")
+        figure.supylabel("success of training episodes")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+        figure.savefig(out)
+
+
+if __name__ == "__main__":
+    typer.run(main)
