@@ -22,6 +22,7 @@ from astra_data.cli import (
     recipes,
     selecting,
     sharing,
+    shipping,
     starting,
     sweeping,
     tasks,
@@ -108,6 +109,12 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
 for panel, commands in PANELS.items():
     for name, command in commands.items():
         app.command(name, rich_help_panel=panel)(command)
+app.add_typer(
+    shipping.app,
+    name="recipes",
+    help="List the recipes that come with the package, or copy one.",
+    rich_help_panel="Recipes",
+)
 
 
 def main() -> None:

@@ -1,0 +1,109 @@
+"""The recipes that come with the package, with the examples that they name."""
+
+import re
+import shutil
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+
+_PACKAGE = Path(__file__).parents[1]
+
+RECIPES = next(folder for folder in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes") if folder.is_dir())
+"""The folder of recipes: in the installed package, or beside it in a checkout."""
+
+_COMMAND = re.compile(r"(uv run |astra-data |python |--)")
+
+
+@dataclass(frozen=True)
+class ShippedRecipe:
+    """A recipe that comes with the package.
+
+    Attributes:
+        path: of its file, below `RECIPES`.
+        table: its content.
+        about: what its first comments say.
+    """
+
+    path: Path
+    table: dict[str, Any]
+    about: str
+
+    @property
+    def name(self) -> str:
+        """Its file's name, without the ending."""
+        return self.path.stem
+
+    @property
+    def task(self) -> str:
+        """The task that it names, or that what it is based on names; empty where there is none."""
+        if base := self.table.get("based_on"):
+            return str(self.table.get("task", shipped(base).task))
+        return str(self.table.get("task", ""))
+
+    @property
+    def files(self) -> set[Path]:
+        """The files that it needs, below `RECIPES`: with what it is based on, code and mappings."""
+        files = {self.path}
+        if base := self.table.get("based_on"):
+            files |= shipped(base).files
+        folders = [RECIPES / self.path.parent]
+        for key in ("task", "mapping"):
+            place = folders[0] / str(self.table.get(key, "")).partition(":")[0]
+            if place.is_file():
+                files.add(place.resolve().relative_to(RECIPES))
+                folders.append(place.resolve().parent)
+        return files | {code.relative_to(RECIPES) for folder in folders for code in folder.glob("*.py")}
+
+
+def shipped_recipes() -> list[ShippedRecipe]:
+    """Return all recipes, by name."""
+    tables = {path: tomllib.loads(path.read_text()) for path in RECIPES.rglob("*.toml")}
+    found = [
+        ShippedRecipe(path.relative_to(RECIPES), table, _about(path.read_text()))
+        for path, table in tables.items()
+        if not table.keys().isdisjoint(("methods", "based_on", "models"))
+    ]
+    return sorted(found, key=lambda recipe: recipe.name)
+
+
+def shipped(name: str) -> ShippedRecipe:
+    """Return the recipe of this name.
+
+    Raises:
+        BadInputError: there is none.
+    """
+    recipes = {recipe.name: recipe for recipe in shipped_recipes()}
+    if name not in recipes:
+        raise BadInputError(f"no recipe '{name}' comes with astra-data{did_you_mean(name, recipes)}")
+    return recipes[name]
+
+
+def copy_recipe(name: str, folder: Path) -> list[Path]:
+    """Copy a recipe and what it needs to `folder`; return the new files.
+
+    Files that are there with the same bytes stay.
+
+    Raises:
+        BadInputError: there is no such recipe, or a file is there with other bytes.
+    """
+    places = {RECIPES / path: folder / path for path in sorted(shipped(name).files)}
+    for source, place in places.items():
+        if place.exists() and (not place.is_file() or place.read_bytes() != source.read_bytes()):
+            raise BadInputError(f"{place} is there and differs from the shipped one: choose another folder")
+    new = [place for place in places.values() if not place.exists()]
+    for source, place in places.items():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, place)
+    return new
+
+
+def _about(text: str) -> str:
+    """Return what the first comments say below the commands that run the recipe."""
+    lines = text.partition("\n\n")[0].splitlines()
+    comments = [line.removeprefix("#").strip() for line in lines if line.startswith("#")]
+    commands = [number for number, line in enumerate(comments) if _COMMAND.match(line)]
+    return " ".join(comments[max(commands, default=-1) + 1 :]).strip()
