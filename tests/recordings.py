@@ -7,6 +7,8 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Array
@@ -16,7 +18,7 @@ from astra_data.exchange.importing import import_dataset
 LENGTHS = (6, 9, 5)
 STEPS = (5, 9, 4)
 """Of each trial: nobody recorded the next state of its last row, but the second ends in a fall."""
-TABLES = ("log.csv", "log.npz", "log.h5", "log.json")
+TABLES = ("log.csv", "log.npz", "log.h5", "log.json", "log.parquet")
 
 MAPPING = """
 name = "log"
@@ -75,6 +77,8 @@ def write_table(path: Path, fields: Mapping[str, Array]) -> Path:
         with h5py.File(path, "w") as file:
             for name, values in fields.items():
                 file[name] = values
+    elif path.suffix == ".parquet":
+        pq.write_table(pa.table({name: values.tolist() for name, values in fields.items()}), path)
     else:
         path.write_text(json.dumps({name: values.tolist() for name, values in fields.items()}))
     return path

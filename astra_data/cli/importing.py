@@ -23,7 +23,7 @@ FileFormat = Annotated[
     str | None,
     typer.Option(
         "--format",
-        help="csv, hdf5, json, mcap, minari or npz.",
+        help="csv, hdf5, json, mcap, minari, npz or parquet.",
         show_default="inferred from the files' names",
     ),
 ]
@@ -50,7 +50,7 @@ def import_(
     task: Task = None,
     max_bytes: MaxBytes = None,
 ) -> None:
-    """Convert logs (CSV, NPZ, HDF5, Minari, MCAP, JSON) to a dataset."""
+    """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON) to a dataset."""
     from astra_data.exchange.importing import import_dataset
 
     report = import_dataset(

@@ -2,10 +2,9 @@
 
 import logging
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +16,14 @@ from astra_data.dataset.contents import Contents, Ints, read_contents
 from astra_data.dataset.digests import Digests, altered_columns, digests_of, read_digests
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.lerobot_recording import open_recording
+from astra_data.dataset.libraries import to_huggingface, to_lerobot
+from astra_data.dataset.opening import explained, refuse_others
 from astra_data.dataset.plain import read_statistics
 from astra_data.dataset.values import alterations, measure, read_values
+
+if TYPE_CHECKING:
+    import datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 _LOG = logging.getLogger(__name__)
 
@@ -44,8 +49,8 @@ class Dataset(Contents):
             CorruptDatasetError: it is incomplete or was altered; lists every fault.
         """
         root = Path(root)
-        _refuse_others(root)
-        with _explained(root):
+        refuse_others(root)
+        with explained(root):
             is_ours = (root / "meta/astra").is_dir() or not (root / INFO_PATH).is_file()
             return cls(**vars(read_contents(root) if is_ours else open_recording(root)))
 
@@ -222,6 +227,16 @@ class Dataset(Contents):
         for _ in self.blocks(list(self.features)):
             pass
 
+    def to_huggingface(self) -> "datasets.Dataset":
+        """Return the rows as a `datasets.Dataset` in memory, once all values are verified."""
+        self.require_whole()
+        return to_huggingface(self.root)
+
+    def to_lerobot(self, **options: Any) -> "LeRobotDataset":  # noqa: ANN401 - lerobot's own
+        """Return a `LeRobotDataset` of the same files, once all values are verified; it takes `options`."""
+        self.require_whole()
+        return to_lerobot(self.root, self.description["name"], **options)
+
     @cached_property
     def _digests(self) -> Digests:
         """The stored digests; where there are none, those of the values, if these have the content hash."""
@@ -247,7 +262,7 @@ class Dataset(Contents):
 
     def _verified(self, columns: Sequence[Column], chosen: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
         """Yield blocks of whole episodes and their indices; the first one with altered values raises."""
-        with _explained(self.root):
+        with explained(self.root):
             for block, indices in read_values(self, columns, chosen):
                 stored = {name: self._digests[name][indices] for name in block}
                 altered = altered_columns(digests_of(block, self.lengths[indices]), stored)
@@ -266,24 +281,3 @@ class Dataset(Contents):
             known = ", ".join(self.features)
             raise BadInputError(f"{self.reference} has no column {', '.join(unknown)}; it has {known}.")
         return [Column.from_feature(name, self.features[name]) for name in names]
-
-
-def _refuse_others(root: Path) -> None:
-    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
-    if versions:
-        raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
-    if not (root / "meta").is_dir():
-        raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
-
-
-@contextmanager
-def _explained(root: Path) -> Iterator[None]:
-    try:
-        yield
-    except (CorruptDatasetError, KeyError) as error:
-        fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
-        raise CorruptDatasetError(
-            f"{root} is incomplete or was altered: {fault}. "
-            f"Restore it from a copy, run the stage that wrote it again, or save what is whole of it: "
-            f"`astra-data repair {root} --out FOLDER`."
-        ) from error

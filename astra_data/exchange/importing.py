@@ -20,7 +20,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter, Tally
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.import_report import ImportReport, losses
-from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz
+from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz, parquet
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import (
     VALUE_BYTES,
@@ -40,6 +40,7 @@ FORMATS: Mapping[str, ModuleType] = {
     "mcap": mcap,
     "minari": minari,
     "npz": npz,
+    "parquet": parquet,
 }
 IN_ARCHIVES = ("csv", "json")
 """Formats that are read sequentially, so that they can be read inside archives."""

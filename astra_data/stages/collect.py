@@ -20,7 +20,6 @@ from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import place
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.stages.recording import record
 from astra_data.training.behaviors import (
     Behavior,
     MixedBehavior,
@@ -30,6 +29,7 @@ from astra_data.training.behaviors import (
     WallWatch,
 )
 from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.recording import record
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 

@@ -1,4 +1,4 @@
-"""CSV, NPZ, HDF5 and JSON hold the same rows, so they give the same dataset."""
+"""CSV, NPZ, HDF5, JSON and Parquet hold the same rows, so they give the same dataset."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from recordings import LENGTHS, MAPPING, STEPS, TABLES, imported, rows, write_ta
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
-from astra_data.exchange.importers import hdf5, npz
+from astra_data.exchange.importers import hdf5, npz, parquet
 
 STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
 
@@ -18,7 +18,7 @@ STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
 def test_every_value_arrives(
     tmp_path: Path, name: str, block_rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (npz, hdf5):
+    for module in (npz, hdf5, parquet):
         monkeypatch.setattr(module, "BLOCK_ROWS", block_rows)
     fields = rows()
     dataset, report = imported(tmp_path, write_table(tmp_path / name, fields))

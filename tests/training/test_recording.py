@@ -4,7 +4,7 @@ from typing import Any
 import torch
 
 from astra_data.dataset.columns import DONE, TERMINATED, TRUNCATED
-from astra_data.stages.recording import _step
+from astra_data.training.recording import _step
 
 
 def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated() -> None:

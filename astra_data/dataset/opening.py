@@ -1,0 +1,31 @@
+"""What is said of a folder that cannot be opened as a dataset."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.format import INFO_PATH
+
+
+def refuse_others(root: Path) -> None:
+    """Raise BadInputError where `root` holds no dataset, or versions of one."""
+    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
+    if versions:
+        raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
+    if not (root / "meta").is_dir():
+        raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
+
+
+@contextmanager
+def explained(root: Path) -> Iterator[None]:
+    """Say of a CorruptDatasetError, or of missing metadata, which dataset it is and what can be done."""
+    try:
+        yield
+    except (CorruptDatasetError, KeyError) as error:
+        fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
+        raise CorruptDatasetError(
+            f"{root} is incomplete or was altered: {fault}. "
+            f"Restore it from a copy, run the stage that wrote it again, or save what is whole of it: "
+            f"`astra-data repair {root} --out FOLDER`."
+        ) from error
