@@ -1,3 +1,5 @@
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -26,16 +28,26 @@ def test_every_recipe_is_shipped_and_says_what_it_is() -> None:
     assert shipped("humanoid_extended").task == "humanoid-extended"
 
 
+def checked(path: Path) -> str:
+    """Return what `astra-data check` prints; in another process where methods of one's own are registered."""
+    if "own_methods" in tomllib.loads(path.read_text()):
+        command = [sys.executable, "-m", "astra_data", "check", str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout + done.stderr
+    result = CliRunner().invoke(app, ["check", str(path)])
+    return f"{result.output}{result.exception or ''}"
+
+
 @pytest.mark.parametrize("name", sorted(recipes_of_the_repository()))
 def test_a_copy_has_all_that_it_needs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
     copy_recipe(name, tmp_path / "recipes")
-    checked = CliRunner().invoke(app, ["check", str(tmp_path / "recipes" / shipped(name).path)])
-    missing = name in {"cart", "push", "push_ppo", "push_random"}  # datasets that come from elsewhere
-    assert (checked.exception is not None) == missing, checked.output
-    if missing:
-        assert str(checked.exception).startswith("data: no dataset"), checked.exception
+    told = checked(tmp_path / "recipes" / shipped(name).path)
+    if name in {"cart", "push", "push_ppo", "push_random"}:
+        assert "data: no dataset" in told  # it comes from elsewhere
+    else:
+        assert "items are finished" in told or "without faults" in told, told
 
 
 def test_a_copy_brings_nothing_but_what_is_needed(tmp_path: Path) -> None:
