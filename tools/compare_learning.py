@@ -9,11 +9,11 @@ A panel for each row that both have. Lines are means over seeds, bands go from t
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from matplotlib.figure import Figure
 
-from astra_data.reports.figures.scores import Curve, on_one_grid
+from astra_data.reports.drawing import training_curves
+from astra_data.reports.figures.scores import on_one_grid
 from astra_data.reports.figures.style import FAINT, INK, method_title, style
 from astra_data.reports.files import read_published
 from astra_data.reports.schema import Results
@@ -29,22 +29,16 @@ def main(
     results = [one for one in found if isinstance(one, Results)]
     if len(results) < 2:
         raise typer.BadParameter("expected results of recipes without a sweep")
-    rows = [
-        row
-        for row, of_row in results[1].methods.items()
-        if of_row.learning and row in results[0].methods and results[0].methods[row].learning
-    ]
+    curves = [training_curves(one) for one in results]
+    rows = [row for row in curves[1] if row in curves[0]]
     if not rows:
         raise typer.BadParameter(f"expected a row that both have trained, got none in {before} and {after}")
     with style():
         figure = Figure(figsize=(0.6 + 2.2 * len(rows), 2.6), layout="constrained")
         for axes, row in zip(figure.subplots(1, len(rows), squeeze=False, sharey=True)[0], rows, strict=True):
             axes.set_title(method_title(row), loc="left")
-            for one, colour in zip(results, (FAINT, INK), strict=True):
-                curves = [
-                    Curve(np.array(seed.steps), np.array(seed.score)) for seed in one.methods[row].learning
-                ]
-                steps, scores = on_one_grid(curves)
+            for one, of_rows, colour in zip(results, curves, (FAINT, INK), strict=True):
+                steps, scores = on_one_grid(of_rows[row])
                 low, high = scores.min(axis=0), scores.max(axis=0)
                 axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.2, lw=0)
                 axes.plot(steps / 1e6, scores.mean(axis=0), color=colour, label=one.recipe)

@@ -4,6 +4,7 @@ import re
 import shutil
 import tomllib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -59,15 +60,14 @@ class ShippedRecipe:
         return files | {code.relative_to(RECIPES) for folder in folders for code in folder.glob("*.py")}
 
 
-def shipped_recipes() -> list[ShippedRecipe]:
+@cache
+def shipped_recipes() -> tuple[ShippedRecipe, ...]:
     """Return all recipes, by name."""
-    tables = {path: tomllib.loads(path.read_text()) for path in RECIPES.rglob("*.toml")}
-    found = [
-        ShippedRecipe(path.relative_to(RECIPES), table, _about(path.read_text()))
-        for path, table in tables.items()
-        if not table.keys().isdisjoint(("methods", "based_on", "models"))
-    ]
-    return sorted(found, key=lambda recipe: recipe.name)
+    texts = {path.relative_to(RECIPES): path.read_text() for path in RECIPES.rglob("*.toml")}
+    found = [ShippedRecipe(path, tomllib.loads(text), _about(text)) for path, text in texts.items()]
+    runnable = {"methods", "based_on", "models"}
+    kept = [recipe for recipe in found if not runnable.isdisjoint(recipe.table)]
+    return tuple(sorted(kept, key=lambda recipe: recipe.name))
 
 
 def shipped(name: str) -> ShippedRecipe:

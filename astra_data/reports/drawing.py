@@ -83,7 +83,7 @@ def figures_of(
     if maze is not None and folders:
         panels = [_panel(results, row, folder, trajectory_episodes) for row, folder in folders.items()]
         figures["trajectories"] = trajectories(maze, panels)
-    curves = _curves(results)
+    curves = training_curves(results)
     if curves:
         name = "learning" if results.headline == SUCCESS else f"learning_{results.headline.measure}"
         figures[name] = learning_curves(results.headline, curves)
@@ -155,7 +155,8 @@ def _pictures(folders: Mapping[str, Path], camera: Camera) -> dict[str, Figure]:
     return {"strips": strips(times_s, found)} if found else {}
 
 
-def _curves(results: Results) -> dict[str, list[Curve]]:
+def training_curves(results: Results) -> dict[str, list[Curve]]:
+    """Return the trainings of each row whose seeds all have scores."""
     curves = {
         method: [Curve(np.array(seed.steps), np.array(seed.score)) for seed in row.learning]
         for method, row in results.methods.items()
