@@ -24,8 +24,10 @@ from astra_data.grounding.failures import (
     tells_failures,
 )
 from astra_data.grounding.files import load_grounding
+from astra_data.grounding.fit import HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.methods import method_named
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -48,7 +50,7 @@ def main(
     grounding = load_grounding(run / "ground" / row / f"seed_{seed}" / "grounding.safetensors")
     if not isinstance(grounding, HistoryGrounding):
         raise typer.BadParameter(f"{row} has no history grounding")
-    model, whole = grounding.model, PairedEpisodes.load(run / "pair" / f"seed_{seed}")
+    whole = PairedEpisodes.load(run / "pair" / f"seed_{seed}")
     titles = " | ".join(f"{first}-{last}" for first, last in windows)
     print(f"| fitted to | failures | on seed | {titles} | Brier skill |")
     print("|---|---|---|" + "---|" * (len(windows) + 1))
@@ -56,14 +58,15 @@ def main(
         part = whole.select(torch.arange(count))
         if not tells_failures(part):
             continue
-        fitted = fit_failures(world, model, part, members, seed=0)
+        fitted = fit_failures(world, grounding, part, members, seed=0)
         failures = int(part.windows.topples_soon.any(1).sum())
         for name, others in measured.items():
-            said = fitted.probability(replayed_inputs(world, model, fitted, others))
+            said = fitted.probability(replayed_inputs(world, grounding, fitted, others))
             print(f"| {count} episodes | {failures} | {name} {_figures(foresight(said, others, windows))}")
-    predicts_reward = bool(model.failure_cost < 0)
+    fit = method_named(row).fit
+    predicts_reward = isinstance(fit, HistoryFit) and fit.reward
     for name, others in measured.items():
-        compared = compared_foresight(world, model, grounding.failures, others, predicts_reward)
+        compared = compared_foresight(world, grounding, others, predicts_reward)
         for head, found in compared.items():
             print(f"| {row}: {head} | | {name} {_figures(found)}")
     if grounding.failures is not None:

@@ -17,7 +17,6 @@ from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.failure import FailureModel, FailureShape
-from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.paired_windows import RISK_STEPS
 from astra_data.worlds.task import Task
 
@@ -40,7 +39,7 @@ def tells_failures(episodes: PairedEpisodes) -> bool:
 
 
 def fit_failures(
-    task: Task, grounding: GroundingModel, training: PairedEpisodes, members: int, seed: int
+    task: Task, grounding: HistoryGrounding, training: PairedEpisodes, members: int, seed: int
 ) -> FailureModel:
     """Fit a failure model of `members` networks to replays of whole episodes; calibrate it by cross-fitting.
 
@@ -109,7 +108,7 @@ def _drawn(rows: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def replayed_inputs(
-    task: Task, grounding: GroundingModel, failures: FailureModel, episodes: PairedEpisodes
+    task: Task, grounding: HistoryGrounding, failures: FailureModel, episodes: PairedEpisodes
 ) -> Tensor:
     """Return what a failure model sees of each step, (E, T, I), where recorded commands are simulated.
 
@@ -117,10 +116,10 @@ def replayed_inputs(
     `_REPLAYED` steps begin at every `RISK_STEPS`-th recorded moment. What is seen of a step is from the one
     that began longest before it: nearly all that the averages remember is simulated then.
     """
-    windows, grounded = episodes.windows, HistoryGrounding(grounding)
+    windows, grounding = episodes.windows, grounding.for_replay()
     moments = Moments.every(windows, RISK_STEPS)
-    simulator = grounded.corrected(task.simulator(len(moments), str(windows.mask.device)), None)
-    hidden = grounded.hidden_before(windows, RISK_STEPS)
+    simulator = grounding.corrected(task.simulator(len(moments), str(windows.mask.device)), None)
+    hidden = grounding.hidden_before(windows, RISK_STEPS)
     moments.start(simulator, hidden[moments.episode, moments.first // RISK_STEPS])
     state = moments.state
     memory = failures.initial_memory(state, moments.previous_action)
@@ -140,8 +139,7 @@ def replayed_inputs(
 @torch.no_grad()
 def compared_foresight(
     task: Task,
-    grounding: GroundingModel,
-    failures: FailureModel | None,
+    grounding: HistoryGrounding,
     held_out: PairedEpisodes,
     predicts_reward: bool,
 ) -> dict[str, Any]:
@@ -149,16 +147,16 @@ def compared_foresight(
 
     The failure model is measured on replays, the others on what was recorded.
     """
-    windows = held_out.windows
-    latent, _ = grounding.encode(windows)
+    windows, model, failures = held_out.windows, grounding.model, grounding.failures
+    latent, _ = model.encode(windows)
     compared = {}
-    if predicts_reward and grounding.failure_cost < 0:
-        parts = grounding.predict_reward_parts(latent, windows.action)
-        compared["predicted_reward"] = (parts[..., 1] / grounding.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
+    if predicts_reward and model.failure_cost < 0:
+        parts = model.predict_reward_parts(latent, windows.action)
+        compared["predicted_reward"] = (parts[..., 1] / model.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
     if failures is not None:
         compared["failure_model"] = failures.probability(replayed_inputs(task, grounding, failures, held_out))
     else:
-        logit = grounding.topple_logit(latent, windows.action, windows.next_state)
+        logit = model.topple_logit(latent, windows.action, windows.next_state)
         compared["topple_head"] = logit.sigmoid()
     return {name: foresight(probability, held_out) for name, probability in compared.items()}
 

@@ -15,7 +15,7 @@ from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.paired_windows import PairedWindows
-from astra_data.worlds.protocols import PlacedSimulator
+from astra_data.worlds.protocols import PlacedSimulator, WalledSimulator
 
 _FAILURES, _MEMBERS = "failures", "members"
 """Of the tensors and sizes of a failure model, and of members, in files."""
@@ -43,9 +43,15 @@ class GroundedSimulator(EpisodeSimulator):
         scatter: Tensor | None = None,
         failures: FailureModel | None = None,
         members: tuple[GroundingModel, ...] = (),
+        clearance_m: float | None = None,
     ) -> None:
-        """Wrap `simulator`; `scatter` stands for the target's scatter around the correction."""
+        """Wrap `simulator`; `scatter` stands for the target's scatter around the correction.
+
+        Corrections end no closer to walls than `clearance_m`.
+        """
         super().__init__(simulator, scatter=scatter)
+        if clearance_m is not None and isinstance(simulator, WalledSimulator):
+            simulator.keep_clear(clearance_m)
         self.model, self.members, self.failures = model, members, failures
         shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size
@@ -198,6 +204,7 @@ class HistoryGrounding(FittedGrounding):
     Attributes:
         model: fitted to all training episodes. failures: the failure model, if there is one.
         members: models that were fitted to other draws of the episodes, and correct in its place.
+        clearance_m: how close to walls corrections may end; None for as close as the simulator itself.
     """
 
     kind: ClassVar[str] = "history"
@@ -205,6 +212,7 @@ class HistoryGrounding(FittedGrounding):
     model: GroundingModel
     failures: FailureModel | None = None
     members: tuple[GroundingModel, ...] = ()
+    clearance_m: float | None = None
 
     @property
     def encoder(self) -> GroundingModel:
@@ -224,7 +232,12 @@ class HistoryGrounding(FittedGrounding):
     def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> GroundedSimulator:
         """Wrap `simulator`; see `Grounding.corrected`."""
         return GroundedSimulator(
-            simulator, self.model, scatter=scatter, failures=self.failures, members=self.members
+            simulator,
+            self.model,
+            scatter=scatter,
+            failures=self.failures,
+            members=self.members,
+            clearance_m=self.clearance_m,
         )
 
     @torch.no_grad()
@@ -248,6 +261,8 @@ class HistoryGrounding(FittedGrounding):
         if self.failures is not None:
             tensors |= {f"{_FAILURES}.{name}": one for name, one in self.failures.state_dict().items()}
             metadata[_FAILURES] = asdict(self.failures.shape)
+        if self.clearance_m is not None:
+            metadata["clearance_m"] = self.clearance_m
         if self.members:
             metadata[_MEMBERS] = len(self.members)
         for number, member in enumerate(self.members):
@@ -268,7 +283,7 @@ class HistoryGrounding(FittedGrounding):
         model, *members = (
             _loaded(GroundingModel(shape, metadata["target"]), weights, device) for weights in (own, *others)
         )
-        return cls(model, failures, tuple(members))
+        return cls(model, failures, tuple(members), metadata.get("clearance_m"))
 
 
 def _loaded(model: GroundingModel, weights: Mapping[str, Tensor], device: str) -> GroundingModel:

@@ -104,6 +104,15 @@ class PlacedSimulator(SteppedSimulator, Protocol):
         ...
 
 
+@runtime_checkable
+class WalledSimulator(Protocol):
+    """A simulator whose states are among walls."""
+
+    def keep_clear(self, distance_m: float) -> None:
+        """Let corrections end no closer to walls than `distance_m`."""
+        ...
+
+
 class VariableSimulator(PlacedSimulator, Protocol):
     """A simulator whose parameters can be set row by row."""
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.core.config import Config
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.protocols import VariableSimulator
+from astra_data.worlds.protocols import VariableSimulator, WalledSimulator
 
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
@@ -223,6 +223,11 @@ class VariedSimulator(ABC):
     def blocked(self) -> Tensor:
         """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
         return self.simulator.blocked
+
+    def keep_clear(self, distance_m: float) -> None:
+        """Let corrections end no closer to walls than `distance_m`, where there are walls."""
+        if isinstance(self.simulator, WalledSimulator):
+            self.simulator.keep_clear(distance_m)
 
     def by_name(self) -> dict[str, Tensor]:
         """Return the parameters by name, (B, 1) each."""

@@ -48,12 +48,12 @@ def hurried(episodes: int, seed: int) -> PairedEpisodes:
 
 
 def said_of(model: FailureModel, episodes: PairedEpisodes) -> Tensor:
-    return model.probability(replayed_inputs(TASK, grounding_model(), model, episodes))
+    return model.probability(replayed_inputs(TASK, HistoryGrounding(grounding_model()), model, episodes))
 
 
 def test_failures_of_other_episodes_are_foreseen_at_their_rate() -> None:
     training, fresh = hurried(40, 0), hurried(40, 1)
-    model = fit_failures(TASK, grounding_model(), training, 3, seed=0)
+    model = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, seed=0)
     assert len(model.members) == 3
     found = foresight(said_of(model, fresh), fresh)
     assert found["failures"] == 20
@@ -62,7 +62,7 @@ def test_failures_of_other_episodes_are_foreseen_at_their_rate() -> None:
     said = fresh.steps(said_of(model, fresh))
     rate = fresh.steps(fresh.windows.topples_soon)
     assert float(said.mean()) == pytest.approx(float(rate.mean()), rel=0.3)
-    again = fit_failures(TASK, grounding_model(), training, 3, seed=0)
+    again = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, seed=0)
     assert all(
         torch.equal(one, other) for one, other in zip(model.parameters(), again.parameters(), strict=True)
     )
@@ -82,7 +82,7 @@ def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before() 
     windows, grounding = episodes.windows, HistoryGrounding(used)
     failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
     failures.set_move_scales(windows)
-    seen = replayed_inputs(TASK, used, failures, episodes)
+    seen = replayed_inputs(TASK, HistoryGrounding(used), failures, episodes)
     assert seen.shape == (3, 100, failures.shape.input_size)
     for episode, step, begun in ((1, 0, 0), (1, 59, 0), (0, 60, 20), (1, 79, 20), (1, 80, 40), (1, 99, 40)):
         world = grounding.corrected(TASK.simulator(1), None)
@@ -104,7 +104,9 @@ def test_what_the_target_did_later_is_not_seen() -> None:
     other = episodes.windows.state.clone()
     other[:, 41:60] += 1.0
     moved = replace(episodes, windows=replace(episodes.windows, state=other))
-    seen, changed = (replayed_inputs(TASK, used, failures, one) for one in (episodes, moved))
+    seen, changed = (
+        replayed_inputs(TASK, HistoryGrounding(used), failures, one) for one in (episodes, moved)
+    )
     torch.testing.assert_close(seen[:, :100], changed[:, :100])
     assert not torch.allclose(seen, torch.zeros_like(seen))
 
@@ -180,7 +182,7 @@ def test_what_is_only_learned_by_heart_is_not_believed(monkeypatch: pytest.Monke
     training, fresh = by_chance(0), by_chance(1)
 
     def skill() -> float:
-        model = fit_failures(TASK, grounding_model(), training, 3, seed=0)
+        model = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, seed=0)
         found = foresight(said_of(model, fresh), fresh)
         return float(found["brier_skill"])
 
@@ -199,7 +201,7 @@ def test_every_step_is_cross_fitted_once_and_what_was_found_is_used(monkeypatch:
 
     monkeypatch.setattr("astra_data.grounding.failures.calibration", noted)
     episodes = hurried(10, 0)
-    model = fit_failures(TASK, grounding_model(), episodes, 3, seed=0)
+    model = fit_failures(TASK, HistoryGrounding(grounding_model()), episodes, 3, seed=0)
     ((odds, fails),) = given
     steps = int(episodes.windows.mask.sum())
     assert odds.shape == (3, steps) and fails.shape == (steps,)

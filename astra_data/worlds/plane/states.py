@@ -47,6 +47,7 @@ class PlanarStates:
         """
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
+        self._maze, self._settles_in = maze, self.free
         self.num_envs = num_envs
         self.state = torch.zeros(num_envs, self.state_size, device=device)
         self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -74,13 +75,19 @@ class PlanarStates:
         if rows is not None:
             self.blocked = self.blocked.index_fill(0, rows, False)
 
+    def keep_clear(self, distance_m: float) -> None:
+        """Let corrections end no closer to walls than `distance_m`; steps come as close as the disc can."""
+        widest = max(distance_m, self.parameters["radius_m"])
+        device = str(self.state.device)
+        self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=device)
+
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Slide the discs from `before` towards `landed`, both (B, X); all else is that of `landed`.
 
         A wall that stopped the step itself still counts as touched: otherwise policies lean on walls that the
         correction draws them away from.
         """
-        position, stopped = self.free.slide(before[:, :2], landed[:, :2])
+        position, stopped = self._settles_in.slide(before[:, :2], landed[:, :2])
         self.blocked = self.blocked | stopped
         self.reset_to(torch.cat([position, landed[:, 2:]], dim=-1))
         return self.state

@@ -41,6 +41,44 @@ def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
     assert states.blocked.tolist() == [True, False, True]
 
 
+def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() -> None:
+    """The wall's face is at 6 m; the disc's centre comes as close as 0.1 m."""
+    states = planar(3, 5)
+    states.keep_clear(0.5)
+    start = HERE.clone()
+    start[:, 1] = 5.4
+    landed = start.clone()
+    landed[0, 1], landed[1, 1], landed[2, 0] = 5.7, 5.3, -3.5
+    states.reset_to(start)
+    settled = states.settle(start, landed)
+    torch.testing.assert_close(settled[:, 1], torch.tensor([5.5, 5.3, 5.4]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(settled[:, 0], torch.tensor([-4.0, -4.0, -3.5]))
+    assert states.blocked.tolist() == [True, False, False]
+    moved, stopped = states.free.slide(start[:, :2], landed[:, :2])
+    torch.testing.assert_close(moved, landed[:, :2])
+    assert not stopped.any()
+
+
+def test_nobody_comes_closer_than_the_disc_itself_does() -> None:
+    states = planar(3, 5)
+    states.keep_clear(0.0)
+    landed = HERE.clone()
+    landed[:, 1] = 5.99
+    torch.testing.assert_close(states.settle(HERE, landed)[:, 1], torch.full((3,), 5.9), atol=1e-3, rtol=0)
+
+
+def test_simulators_that_vary_keep_clear_as_well() -> None:
+    inner, varied = resting(3, 5, PlanarVariation())
+    varied.keep_clear(0.5)
+    start = HERE.clone()
+    start[:, 1] = 5.4
+    landed = start.clone()
+    landed[:, 1] = 5.8
+    inner.reset_to(start)
+    settled = varied.settle(start, landed)
+    torch.testing.assert_close(settled[:, 1], torch.full((3,), 5.5), atol=1e-3, rtol=0)
+
+
 def test_corrections_slide_along_walls_and_keep_all_else() -> None:
     states = planar(3, 5)
     landed = HERE.clone()
