@@ -1,5 +1,6 @@
 """Corrections that end no closer to walls than the robot came in what was recorded."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
 
 TASK = TASKS["antmaze-umaze"]
 TOP_M = 6.0
@@ -85,3 +87,25 @@ def test_a_fit_takes_it_from_its_training_episodes_if_it_is_asked_to(tmp_path: P
         assert grounding.clearance_m == metrics["clearance_m"] == pytest.approx(1.0, abs=0.11)
     else:
         assert grounding.clearance_m is None
+
+
+def test_the_failure_model_is_fitted_to_replays_that_keep_clear(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[float | None] = []
+
+    def noted(task: Task, grounding: HistoryGrounding, *others: object) -> None:
+        given.append(grounding.clearance_m)
+
+    monkeypatch.setattr("astra_data.grounding.fit.fit_failures", noted)
+    monkeypatch.setattr("astra_data.grounding.fit.compared_foresight", lambda *_: {})
+    failed = torch.zeros(1, 10, 1)
+    failed[0, -1] = 1.0
+    training = recorded(*[1.0] * 10)
+    training = replace(training, windows=replace(training.windows, topples_soon=failed))
+    config = GroundConfig(
+        updates=1, batch_windows=1, window=2, latent_size=8, recorded_clearance=True, failure_members=1
+    )
+    fitting = Fitting(TASK, config, None, training, training, 0, "cpu", tmp_path, silent)
+    HistoryFit(latent=False, reward=False)(fitting)
+    assert given == [pytest.approx(1.0, abs=0.11)]
