@@ -81,19 +81,24 @@ def render_card(
         size_categories=[_size_category(int(dataset.lengths.sum()))],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
+    picture = f"![Steps per cell of the plane]({figure})" if figure else ""
     sections = {
+        "Loading": loading(dataset, source),
         "Behavior": notes.behavior,
         "Intended use": notes.intended_use,
         "Limits": notes.limits,
-        "Contents": _counts(dataset) + (f"\n\n![Steps per cell of the plane]({figure})" if figure else ""),
+        "Contents": _counts(dataset),
         "Columns": _columns(dataset),
-        "Provenance": _provenance(description),
-        "Loading": loading(dataset, source),
+        "Provenance": _folded("How it was made, and the sum of its values", _provenance(description)),
         "Citation": f"The method that these datasets are made for:\n\n{CITATION}",
     }
-    parts = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
-    parts += [f"## {title}\n\n{text.strip()}" for title, text in sections.items() if text]
+    front = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
+    parts = [*front, picture, *(f"## {title}\n\n{text.strip()}" for title, text in sections.items() if text)]
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def _folded(summary: str, text: str) -> str:
+    return f"<details>\n<summary>{summary}</summary>\n\n{text}\n\n</details>"
 
 
 def _opening(dataset: Dataset) -> str:

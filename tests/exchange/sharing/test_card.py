@@ -65,7 +65,7 @@ def test_without_notes_their_sections_are_left_out(fake: Dataset) -> None:
     text = render_card(fake, Notes())
     assert "license: unknown" in text
     assert re.findall(r"^## (.*)", text, re.MULTILINE) == [
-        *("Contents", "Columns", "Provenance", "Loading", "Citation")
+        *("Loading", "Contents", "Columns", "Provenance", "Citation")
     ]
 
 
@@ -79,7 +79,17 @@ def test_words_cannot_break_a_table(tmp_path: Path) -> None:
 def test_the_figure_is_shown(fake: Dataset, tmp_path: Path) -> None:
     card, figure = write_card(fake, tmp_path / "it.md", Notes())
     assert figure.read_bytes().startswith(b"\x89PNG")
-    assert f"]({figure.name})" in card.read_text()
+    text = card.read_text()
+    assert text.index(f"]({figure.name})") < text.index("## Loading") < text.index("## Contents")
+
+
+def test_sums_are_folded_away(fake: Dataset) -> None:
+    text = render_card(fake, NOTES)
+    shown, _, folded = text.partition("<details>")
+    folded, _, after = folded.partition("</details>")
+    assert fake.content_hash in folded and fake.content_hash not in shown + after
+    # A table inside of HTML is read as one only after an empty line.
+    assert "</summary>\n\n| what | value |" in folded and folded.endswith("|\n\n")
 
 
 def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -35,3 +36,15 @@ def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
         return
     assert f"]({figure.name})" in text
     assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_a_card_begins_with_what_a_person_wants_and_folds_sums_away(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    titles = re.findall(r"^## (.+)$", text, re.MULTILINE)
+    assert titles[:2] == ["Loading", "Behavior"]
+    assert titles[-3:] == ["Columns", "Provenance", "Citation"]
+    if "![" in text:
+        assert text.index("![") < text.index("## Loading")
+    shown = re.sub(r"<details>.*?</details>", "", text, flags=re.DOTALL)
+    assert re.search(r"[0-9a-f]{40}", text) and not re.search(r"[0-9a-f]{40}", shown)
