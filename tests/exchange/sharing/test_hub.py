@@ -10,9 +10,12 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, SharingError
+from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
 from astra_data.exchange.sharing.pull import pull
 from astra_data.exchange.sharing.push import push
+from astra_data.stages.collect import CollectConfig, collect
+from astra_data.worlds.registry import TASKS
 
 pytestmark = [
     pytest.mark.usefixtures("quick_figure"),
@@ -21,6 +24,11 @@ pytestmark = [
 ]
 
 DATA = "data/chunk-000/file-000.parquet"
+NOTES = {
+    path.stem.removesuffix("-random-seed0"): path
+    for path in (Path(__file__).parents[3] / "dataset_cards").glob("*-random-seed0.toml")
+}
+"""Of the cards of datasets that `collect` records by random commands, by the task."""
 
 
 def versioned(root: Path, version: str, **changes: object) -> Dataset:
@@ -230,3 +238,28 @@ def test_the_command_line_shares_and_fetches(
     assert contents(home / "fake/data-1.0.0") == contents(fake.root)
     assert call("card", "fake", "--notes", "notes.toml") == "written: fake.md\nwritten: fake-coverage.png\n"
     assert "license: mit" in Path("fake.md").read_text()
+
+
+@pytest.mark.parametrize("task", sorted(NOTES.keys() & TASKS.keys()))
+def test_the_datasets_of_our_cards_are_shared_with_their_notes(hub: Hub, task: str, home: Path) -> None:
+    """Two episodes of each, since the whole takes minutes; a card that was paired has columns more."""
+    config = CollectConfig(behavior="random", episodes=2, max_steps=20)
+    recorded = collect(task, config, seed=0, out=home / "recorded", progress=silent)
+    name = f"{task}-random-seed0"
+    push(recorded, f"me/{name}", notes=NOTES[task])
+    repo = hub.repos[f"me/{name}"]
+    card = repo.commits[repo.head]["README.md"].decode()
+    committed = NOTES[task].with_suffix(".md").read_text(encoding="utf-8")
+    for title in ("Behavior", "Intended use", "Limits", "Columns"):
+        expected = [line for line in section(committed, title) if not line.startswith("| `abstract.")]
+        assert section(card, title) == expected
+    assert f'LeRobotDataset("me/{name}", revision="data-1.0.0")' in card
+    pulled = pull(f"me/{name}")
+    assert pulled.root == home / name / "data-1.0.0"
+    assert contents(pulled.root) == contents(recorded)
+
+
+def section(card: str, title: str) -> list[str]:
+    _, _, after = card.partition(f"\n## {title}\n")
+    assert after
+    return after.partition("\n## ")[0].splitlines()
