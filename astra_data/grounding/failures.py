@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import mannwhitneyu
 from torch import Tensor
 from torch.nn import functional
 
@@ -173,6 +172,8 @@ def foresight(
         there is no such error. "reliability": predicted and observed rate, and number of steps, by predicted
         probability. All but the first None without failures.
     """
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 - half a second to import
+
     windows = episodes.windows
     mask = windows.mask.bool()
     fails = windows.topples_soon.bool() & mask
