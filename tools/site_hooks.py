@@ -1,8 +1,8 @@
 """MkDocs's hooks: pages keep their places in the repository, and bring along what they link to.
 
-In the site each page is known by its path from the repository's root, so that links which work on GitHub, such as
-`../recipes/results/x.png` or `../SECURITY.md`, lead to the same files here. Pages of `docs/` have addresses without
-that folder; everything else lies under `repository/`.
+In the site each page is known by its path from the repository's root, so that links which work on GitHub,
+such as `../recipes/results/x.png` or `../SECURITY.md`, lead to the same files here. Pages of `docs/` have
+addresses without that folder; everything else lies under `repository/`.
 """
 
 from pathlib import Path

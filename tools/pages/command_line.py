@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pages.markdown import table
+from pages.markdown import plain, table
 from typer.core import TyperGroup
 from typer.main import get_command
 
@@ -10,12 +10,13 @@ from astra_data.cli.app import app
 
 _INTRODUCTION = """# The command line
 
-Every command with its arguments and options, as `--help` prints them; [commands](../commands.md) says what they are for.
+Every command with its arguments and options, as `--help` prints them;
+[commands](../commands.md) says what they are for.
 """
 
 
 def command_line() -> str:
-    """Return the page: a section for each command and each command of a group, with its options in a table."""
+    """Return the page: a section for each command, also those of groups, with its options in a table."""
     top: Any = get_command(app)
     context = top.context_class(top, info_name="astra-data")
     return _INTRODUCTION + _section(top, context)
@@ -24,7 +25,7 @@ def command_line() -> str:
 def _section(command: Any, context: Any) -> str:  # noqa: ANN401 - Typer's own copy of Click has no public types
     parts = [
         f"\n## {context.command_path}\n",
-        f"{command.help}\n",
+        f"{plain(command.help)}\n",
         f"```text\n{context.get_usage().removeprefix('Usage: ')}\n```\n",
     ]
     records = [_record(parameter, context) for parameter in command.params]
@@ -40,4 +41,4 @@ def _section(command: Any, context: Any) -> str:  # noqa: ANN401 - Typer's own c
 
 def _record(parameter: Any, context: Any) -> tuple[str, str]:  # noqa: ANN401 - as above
     names, meaning = parameter.get_help_record(context)
-    return f"`{names}`", meaning
+    return f"`{names}`", plain(meaning)

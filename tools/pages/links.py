@@ -38,5 +38,5 @@ def linked(root: Path, pages: Iterable[str]) -> list[str]:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Return the files in `folder` and below that a reader may want, without figures and numbers of results."""
+    """Return the texts in `folder` and below: no pictures, and no numbers of results."""
     return sorted(file for file in folder.rglob("*") if file.suffix in {".md", ".py", ".toml", ".csv"})

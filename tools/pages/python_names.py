@@ -6,8 +6,8 @@ import astra_data
 
 _INTRODUCTION = """# The Python package
 
-What `from astra_data import ...` gives. Letters in shapes: B batch, T steps, E episodes, S target state, X abstract state, A action,
-G goal, O observation, Z latent, N rows.
+What `from astra_data import ...` gives.
+The letters of shapes are in the [glossary](../glossary.md#letters-in-shapes).
 """
 
 

@@ -7,19 +7,21 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
-from pages.markdown import table
+from pages.markdown import plain, table
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from astra_data.experiments.recipe import Recipe
 from astra_data.methods import METHODS, tables
 from astra_data.stages.registry import STAGES
+from astra_data.worlds.variation import AnyVariation
 
 _INTRODUCTION = """# Keys of recipes
 
-A [recipe](../recipes.md) is a TOML file with the keys of the first table here and one table `[…]` for each section below it. A key that
-is left out has its default; without one it is not set, and its meaning says what happens then. Units are those of the key's
-name. Numbers of things are at most 10¹², of things that are in memory at the same time 10⁶.
+A [recipe](../recipes.md) is a TOML file with the keys of the first table here and one table `[…]` for each
+section below it. A key that is left out has its default; without one it is not set, and its meaning says what
+happens then. Units are those of the key's name. Numbers of things are at most 10¹², of things that are in
+memory at the same time 10⁶.
 """
 UNITS = {
     "m_s": "m/s",
@@ -31,8 +33,9 @@ UNITS = {
     "percent": "%",
 }
 """By the last words of a key's name."""
-_LEAST_UNTOLD = 10**6
+_SAFETY = 10**6
 """Bounds from here on are those of the introduction."""
+_KINDS = {bool: "true or false", int: "whole number", float: "number", str: "string"}
 _HEAD = ("key", "type", "default", "unit", "meaning")
 
 
@@ -49,8 +52,8 @@ def _section(name: str, models: list[type[BaseModel]]) -> str:
         return _titled("own_methods.NAME", models[0], _key_table(models[0].model_fields))
     if name == "plus":
         return (
-            "## `[plus]`\n\nThe training of rows with `_plus`: the keys of [`[train]`](#train), laid over what the recipe "
-            "has there. A key that is left out has its value from `[train]`.\n"
+            "## `[plus]`\n\nThe training of rows with `_plus`: the keys of [`[train]`](#train), laid "
+            "over what the recipe has there. A key that is left out has its value from `[train]`.\n"
         )
     if len(models) > 1:
         return _choice(name, models)
@@ -58,12 +61,12 @@ def _section(name: str, models: list[type[BaseModel]]) -> str:
 
 
 def _titled(name: str, model: type[BaseModel], keys: str) -> str:
-    about = " ".join(filter(None, (_of_paragraphs(model), _presence(name))))
+    about = " ".join(filter(None, (_about(model), _presence(name))))
     return f"## `[{name}]`\n\n{about}\n\n{keys}"
 
 
-def _of_paragraphs(model: type[BaseModel]) -> str:
-    return " ".join((model.__doc__ or "").split())
+def _about(model: type[BaseModel]) -> str:
+    return plain(" ".join((model.__doc__ or "").split()))
 
 
 def _presence(name: str) -> str:
@@ -78,7 +81,7 @@ def _presence(name: str) -> str:
 
 
 def _choice(name: str, models: list[type[BaseModel]]) -> str:
-    """Return the section of a table of several models, told apart by `learner`: what they share, and the rest."""
+    """Return the section of a table whose model depends on `learner`: the keys of all, and of each."""
     shared = {
         key: field
         for key, field in models[0].model_fields.items()
@@ -87,8 +90,8 @@ def _choice(name: str, models: list[type[BaseModel]]) -> str:
     parts = [f"## `[{name}]`\n\nThe keys of every learner:\n\n{_key_table(shared)}"]
     for model in models:
         own = {key: field for key, field in model.model_fields.items() if key not in shared}
-        learner = model.model_fields["learner"].default
-        parts.append(f'### `[{name}] learner = "{learner}"`\n\n{_of_paragraphs(model)}\n\n{_key_table(own)}')
+        (learner,) = get_args(model.model_fields["learner"].annotation)
+        parts.append(f'### `[{name}] learner = "{learner}"`\n\n{_about(model)}\n\n{_key_table(own)}')
     return "\n".join(parts)
 
 
@@ -97,12 +100,7 @@ def _usual(name: str) -> tuple[Mapping[str, object], Iterable[str]]:
     if name not in tables():
         return {}, ()
     found = tables()[name]
-    ranges = _ranges() if found.ranges else ()
-    return found.usual.model_dump(mode="json"), ranges
-
-
-def _ranges() -> Iterable[str]:
-    return tables()["domain_randomization"].model.model_fields
+    return found.usual.model_dump(mode="json"), AnyVariation.model_fields if found.ranges else ()
 
 
 def _key_table(
@@ -114,8 +112,8 @@ def _key_table(
         if key in of_task:
             default = f"the task's, else {default}"
         kind = _kind(field.annotation, field.metadata)
-        rows.append((f"`{key}`", kind, default, unit(key), (field.description or "").replace("<", "&lt;")))
-    return table(_HEAD, rows)
+        rows.append((f"`{key}`", kind, default, unit(key), plain(field.description or "")))
+    return f'<div class="keys" markdown>\n\n{table(_HEAD, rows)}\n</div>\n'
 
 
 def unit(key: str) -> str:
@@ -132,40 +130,43 @@ def _default(field: FieldInfo, usual: object) -> str:
     return "" if value is None else f"`{json.dumps(value, ensure_ascii=False)}`"
 
 
-def _kind(annotation: Any, metadata: Iterable[object] = ()) -> str:  # noqa: ANN401 - an annotation is any object
-    """Return a type in the words of TOML."""
+def _kind(
+    annotation: Any,  # noqa: ANN401 - an annotation is any object
+    metadata: Iterable[object] = (),
+    *,
+    several: bool = False,
+) -> str:
+    """Return a type in the words of TOML, or what `several` of it are."""
     marks = list(metadata)
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         of = [mark for part in arguments[1:] for mark in getattr(part, "metadata", [part])]
-        return _kind(arguments[0], of)
+        return _kind(arguments[0], of, several=several)
     if origin in (Union, UnionType):
         return " or ".join(_kind(argument, marks) for argument in arguments if argument is not NoneType)
     if origin is Literal:
         return ", ".join(f"`{json.dumps(value)}`" for value in arguments)
     if origin is tuple:
-        if arguments[-1] is Ellipsis:
-            return f"array of: {_kind(arguments[0])}"
-        return f"array of {len(arguments)}: {_kind(arguments[0])}"
+        count = "" if arguments[-1] is Ellipsis else f"{len(arguments)} "
+        return f"array of {count}{_kind(arguments[0], several=True)}"
     if origin is dict:
-        return f"table of: {_kind(arguments[1])}"
-    names = {bool: "true or false", int: "whole number", float: "number", str: "string"}
-    return " ".join(filter(None, (names[annotation], _bounds(marks))))
+        return f"table of {_kind(arguments[1], several=True)}"
+    return " ".join([_KINDS[annotation] + "s" * several, *_bounds(marks)])
 
 
-def _bounds(marks: Iterable[object]) -> str:
-    told = []
+def _bounds(marks: Iterable[object]) -> list[str]:
+    bounds = []
     for mark in marks:
         match mark:
             case Ge(ge=bound):
-                told.append(f"≥ {bound}")
+                bounds.append(f"≥ {bound}")
             case Gt(gt=bound):
-                told.append(f"> {bound}")
-            case Le(le=bound) if bound < _LEAST_UNTOLD:
-                told.append(f"≤ {bound}")
+                bounds.append(f"> {bound}")
+            case Le(le=int() | float() as bound) if bound < _SAFETY:
+                bounds.append(f"≤ {bound}")
             case Lt(lt=bound):
-                told.append(f"&lt; {bound}")
-    return ", ".join(told)
+                bounds.append(f"&lt; {bound}")
+    return [", ".join(bounds)] if bounds else []
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401 - an annotation is any object
