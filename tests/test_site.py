@@ -193,19 +193,29 @@ def test_units_are_those_of_names(site: Path, table: str, key: str, unit: str) -
     assert page(site / "reference/recipe_keys/index.html").keys(f"[{table}]")[key][2] == unit
 
 
-def help_of(*words: str) -> str:
-    return CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "200", "TERM": "dumb"}).output
+def named_by_help(*words: str) -> list[str]:
+    """Return the commands, arguments and options that `--help` lists, as they are written there."""
+    text = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "400", "TERM": "dumb"}).output
+    names = re.findall(r"^│ [* ]*(\S+)  .*│$", text, re.MULTILINE)
+    return [name.removesuffix("...") for name in names if name != "--help"]
 
 
 def test_every_command_and_option_that_help_names_is_in_the_reference(site: Path) -> None:
     sections = page(site / "reference/command_line/index.html").sections
-    commands = re.findall(r"^│ (\w+)  ", help_of(), re.MULTILINE)
-    assert len(commands) > 30
-    for name in commands:
-        lines = re.findall(r"^│ [* ] +(?:.* )?(--[\w-]+).*", help_of(name), re.MULTILINE)
-        shown = " ".join(cell for row in sections[f"astra-data {name}"] for cell in row)
-        assert not [option for option in lines if option != "--help" and option not in shown], name
-    assert {"astra-data recipes list", "astra-data recipes copy"} <= set(sections)
+    commands = [name for name in named_by_help() if not name.startswith("-")]
+    groups = [("recipes", name) for name in named_by_help("recipes")]
+    everything = {"astra-data": ()} | {
+        " ".join(("astra-data", *words)): words for words in [*zip(commands, strict=True), *groups]
+    }
+    assert everything.keys() == sections.keys() - {"The command line"}
+    missing = []
+    for title, words in everything.items():
+        shown = " ".join(row[0] for row in sections[title] if row)
+        of_commands = commands if not words else [name for _, name in groups] if words == ("recipes",) else []
+        named = [name for name in named_by_help(*words) if name not in of_commands]
+        missing += [(title, name) for name in named if name not in shown]
+        assert len(named) >= len([row for row in sections[title] if row]), title
+    assert not missing, missing
 
 
 def test_every_public_name_is_in_the_reference_with_its_docstring(site: Path) -> None:

@@ -1,7 +1,7 @@
 """Tables and plain text in Markdown."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 _CODE = re.compile(r"(`[^`]*`)")
 
@@ -13,11 +13,16 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    return _beside_code(" ".join(text.split()), {"|": "\\|"})
 
 
 def plain(text: str) -> str:
     """Return text in which only code between backticks is marked up: no tags, no emphasis."""
+    return _beside_code(text, {"<": "&lt;", "*": "\\*"})
+
+
+def _beside_code(text: str, written: Mapping[str, str]) -> str:
+    """Return text with some characters written otherwise, but not in code."""
     parts = _CODE.split(text)
-    parts[::2] = [part.replace("<", "&lt;").replace("*", "\\*") for part in parts[::2]]
+    parts[::2] = [part.translate(str.maketrans(dict(written))) for part in parts[::2]]
     return "".join(parts)
