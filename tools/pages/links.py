@@ -16,7 +16,7 @@ def links(text: str) -> Iterator[str]:
 
 
 def linked(root: Path, pages: Iterable[str]) -> list[str]:
-    """Return `pages` and everything that they, and pages among that, link to, if it is there.
+    """Return `pages` and everything in the repository that they, and pages among that, link to.
 
     Args:
         root: of the repository.
@@ -27,7 +27,7 @@ def linked(root: Path, pages: Iterable[str]) -> list[str]:
     while waiting:
         name = waiting.pop(0)
         path = root / name
-        if name in found or not path.exists():
+        if name in found or name.startswith("..") or not path.exists():
             continue
         found[name] = None
         if path.is_dir():

@@ -24,5 +24,6 @@ def plain(text: str) -> str:
 def _beside_code(text: str, written: Mapping[str, str]) -> str:
     """Return text with some characters written otherwise, but not in code."""
     parts = _CODE.split(text)
-    parts[::2] = [part.translate(str.maketrans(dict(written))) for part in parts[::2]]
+    others = {ord(character): other for character, other in written.items()}
+    parts[::2] = [part.translate(others) for part in parts[::2]]
     return "".join(parts)
