@@ -273,7 +273,8 @@ def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[T
     not change; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
     """
     fields: dict[str, Any] = {stage.name: stage_field(stage) for stage in stages if stage.config}
-    fields["based_on"] = (str | None, None)
+    about = "The recipe of the settings that are not given here, and of the artefacts that do not change."
+    fields["based_on"] = (str | None, Field(default=None, description=about))
     fields["sweep"] = (SweepConfig, SweepConfig())
     fields["plus"] = fields["train"]
     fields |= {table.name: method_field(table) for table in methods}

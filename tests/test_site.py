@@ -1,0 +1,236 @@
+"""The documentation's site: built strictly, with what pages link to, and with a reference that is whole."""
+
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cache
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import pytest
+from markdown_it import MarkdownIt
+from typer.testing import CliRunner
+
+import astra_data
+from astra_data.cli.app import app
+from astra_data.experiments.recipe import Recipe
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
+COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
+SCHEMA: dict[str, Any] = Recipe.model_json_schema()
+TABLES = [name for name in SCHEMA["properties"] if name not in {"plus", "own_methods"}]
+
+
+@dataclass
+class Page(HTMLParser):
+    """What the article of a page has: tags, pictures, and rows of tables by section."""
+
+    text: str
+    pictures: set[str] = field(default_factory=set)
+    tags: Counter[str] = field(default_factory=Counter)
+    sections: dict[str, list[list[str]]] = field(default_factory=dict)
+    words: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        self.in_article = "<article" not in self.text
+        self.feed(self.text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.in_article |= tag == "article"
+        if not self.in_article:
+            return
+        self.tags[tag] += 1
+        self.pictures |= {dict(attrs)["src"] or ""} if tag == "img" else set()
+        if tag in {"h1", "h2", "h3", "td"}:
+            self.words = []
+        if tag == "tr" and self.sections:
+            self.rows.append([])
+
+    def handle_endtag(self, tag: str) -> None:
+        words = " ".join("".join(self.words).replace("¶", "").split())
+        if tag in {"h1", "h2", "h3"} and self.in_article:
+            self.sections[words] = []
+        elif tag == "td" and self.in_article and self.sections:
+            self.rows[-1].append(words)
+        self.in_article &= tag != "article"
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """The rows of the last section so far."""
+        return list(self.sections.values())[-1]
+
+    def keys(self, section: str) -> dict[str, list[str]]:
+        """Return the rows of a section by their first cells."""
+        return {row[0]: row[1:] for row in self.sections[section] if row}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+@cache
+def page(file: Path) -> Page:
+    return Page(file.read_text())
+
+
+def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+    texts = {file: file.read_text() for file in site.rglob("*.html") if file.name != "404.html"}
+    ids = {file: set(re.findall(r'\bid="([^"]+)"', text)) for file, text in texts.items()}
+    assert len(texts) > 100
+    dead, elsewhere = [], []
+    for file, text in texts.items():
+        elsewhere += re.findall(r'<(?:script|img|link)[^>]*(?:src|href)="?((?:https?:)?//[^">]*)', text)
+        for link in set(re.findall(r'\b(?:href|src)="([^"]*)"', text)):
+            parts = urlsplit(unescape(link))
+            if parts.scheme or parts.netloc:
+                continue
+            target = Path(os.path.normpath(file.parent / unquote(parts.path))) if parts.path else file
+            target = target / "index.html" if target not in texts and target.is_dir() else target
+            if not target.is_file() or (parts.fragment and unquote(parts.fragment) not in ids[target]):
+                dead.append(f"{file.relative_to(site)}: {link}")
+    assert not dead, "\n".join(dead)
+    assert not elsewhere
+
+
+@pytest.mark.parametrize("name", DOCS)
+def test_every_page_is_in_the_navigation_and_shows_what_github_shows(site: Path, name: str) -> None:
+    place = "" if name == "index" else f"{name}/"
+    navigation = (site / "404.html").read_text()  # which has nothing else
+    assert f'href="/{place or "."}"' in navigation
+    markdown = MarkdownIt("commonmark").enable("table").render((ROOT / f"docs/{name}.md").read_text())
+    shown, expected = page(site / place / "index.html").tags, Page(markdown).tags
+    assert {tag: shown[tag] for tag in COUNTED} == {tag: expected[tag] for tag in COUNTED}
+
+
+def test_pictures_of_a_page_are_in_the_site(site: Path) -> None:
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "docs/antmaze.md").read_text())
+    assert len(pictures) > 5
+    shown = page(site / "antmaze/index.html").pictures
+    for picture in pictures:
+        (loaded,) = (link for link in shown if Path(link).name == Path(picture).name)
+        assert (site / "antmaze" / loaded).read_bytes() == (ROOT / "docs" / picture).read_bytes()
+
+
+def models_of(schema: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the models that a key's schema names."""
+    given = [schema, *schema.get("anyOf", []), *schema.get("oneOf", [])]
+    return [SCHEMA["$defs"][part["$ref"].rpartition("/")[2]] for part in given if "$ref" in part]
+
+
+def agrees(row: list[str], key: str, model: dict[str, Any], usual: dict[str, Any]) -> bool:
+    """Tell whether a row of the reference has the default, the bounds and the meaning of a key's schema."""
+    schema = model["properties"][key]
+    kind, default, _, meaning = row
+    made: object = (
+        {} if "additionalProperties" in schema else None
+    )  # by a factory, which the schema does not tell
+    known = usual.get(key, schema.get("default", made))
+    expected = "required" if key in model.get("required", []) else "" if known is None else json.dumps(known)
+    bounds = [schema, *schema.get("anyOf", []), schema.get("items", {}), *schema.get("prefixItems", [])]
+    least = [f"≥ {part['minimum']:g}" for part in bounds if "minimum" in part]
+    least += [f"> {part['exclusiveMinimum']:g}" for part in bounds if "exclusiveMinimum" in part]
+    return (
+        default.removeprefix("the task's, else ") == expected
+        and all(bound in kind.replace(".0", "") for bound in least)
+        and meaning == " ".join(schema["description"].replace("`", "").split())
+    )
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_key_of_recipes_has_its_default_and_meaning(site: Path, table: str) -> None:
+    reference = page(site / "reference/recipe_keys/index.html")
+    schema = SCHEMA["properties"][table]
+    models = models_of(schema)
+    if not models:
+        assert agrees(reference.keys("Keys of recipes")[table], table, SCHEMA, {})
+    for model in models:
+        rows = reference.keys(f"[{table}]")
+        if len(models) > 1:
+            rows |= reference.keys(f'[{table}] learner = "{model["properties"]["learner"]["const"]}"')
+        assert sorted(rows) == sorted(model["properties"])
+        faults = [key for key in rows if not agrees(rows[key], key, model, schema.get("default") or {})]
+        assert not faults
+
+
+def test_plus_has_the_keys_of_train(site: Path) -> None:
+    assert models_of(SCHEMA["properties"]["plus"]) == models_of(SCHEMA["properties"]["train"])
+    reference = page(site / "reference/recipe_keys/index.html")
+    assert 'href="#train"' in reference.text
+    assert reference.sections["[plus]"] == []
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "unit"),
+    [
+        ("collect", "hold_s", "s"),
+        ("augment", "margin_m", "m"),
+        ("compass", "velocity_noise_m_s", "m/s"),
+        ("compass", "heading_bias_deg", "°"),
+        ("sweep", "percent", "%"),
+        ("pair", "reset_tolerance", ""),
+    ],
+)
+def test_units_are_those_of_names(site: Path, table: str, key: str, unit: str) -> None:
+    assert page(site / "reference/recipe_keys/index.html").keys(f"[{table}]")[key][2] == unit
+
+
+def named_by_help(*words: str) -> list[str]:
+    """Return the commands, arguments and options that `--help` lists, as they are written there."""
+    text = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "400", "TERM": "dumb"}).output
+    names = re.findall(r"^│ [* ]*(\S+)  .*│$", text, re.MULTILINE)
+    return [name.removesuffix("...") for name in names if name != "--help"]
+
+
+def test_every_command_and_option_that_help_names_is_in_the_reference(site: Path) -> None:
+    sections = page(site / "reference/command_line/index.html").sections
+    commands = [name for name in named_by_help() if not name.startswith("-")]
+    groups = [("recipes", name) for name in named_by_help("recipes")]
+    everything = {"astra-data": ()} | {
+        " ".join(("astra-data", *words)): words for words in [*zip(commands, strict=True), *groups]
+    }
+    assert everything.keys() == sections.keys() - {"The command line"}
+    missing = []
+    for title, words in everything.items():
+        shown = " ".join(row[0] for row in sections[title] if row)
+        of_commands = commands if not words else [name for _, name in groups] if words == ("recipes",) else []
+        named = [name for name in named_by_help(*words) if name not in of_commands]
+        missing += [(title, name) for name in named if name not in shown]
+        assert len(named) >= len([row for row in sections[title] if row]), title
+    assert not missing, missing
+
+
+def test_every_public_name_is_in_the_reference_with_its_docstring(site: Path) -> None:
+    reference = page(site / "reference/python/index.html")
+    text = " ".join(unescape(re.sub(r"<[^>]+>", "", reference.text)).split())
+    for name in astra_data.__all__:
+        assert f'id="astra_data.{name}"' in reference.text
+        public = getattr(astra_data, name)
+        about = (inspect.getdoc(public) or "").partition("\n")[0].replace("`", "")
+        assert isinstance(public, dict) or about in text
+
+
+def test_the_glossary_has_the_words_of_the_house() -> None:
+    section = (ROOT / "CONTRIBUTING.md").read_text().partition("\n| word |")[2].partition("| not | but |")[0]
+    words = re.findall(r"^\| ([^|]+?) \| .+ \|$", section, re.MULTILINE)
+    assert len(words) > 30
+    glossary = (ROOT / "docs/glossary.md").read_text()
+    assert not [word for word in words if f"\n| {word} |" not in glossary]
