@@ -39,7 +39,6 @@ class GroundedSimulator(EpisodeSimulator):
         self,
         simulator: PlacedSimulator,
         model: GroundingModel,
-        *,
         scatter: Tensor | None = None,
         failures: FailureModel | None = None,
         members: tuple[GroundingModel, ...] = (),
@@ -232,12 +231,7 @@ class HistoryGrounding(FittedGrounding):
     def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> GroundedSimulator:
         """Wrap `simulator`; see `Grounding.corrected`."""
         return GroundedSimulator(
-            simulator,
-            self.model,
-            scatter=scatter,
-            failures=self.failures,
-            members=self.members,
-            clearance_m=self.clearance_m,
+            simulator, self.model, scatter, self.failures, self.members, self.clearance_m
         )
 
     @torch.no_grad()
