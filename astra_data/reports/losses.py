@@ -68,10 +68,8 @@ def _loss(results: Results, name: str, row: MethodResults) -> Loss:
     lost = simulated.mean - row.summary[headline.measure].mean if simulated else None
     # A minus sign of a rounded zero says nothing.
     cells.append("-" if lost is None else f"{round(lost, headline.digits) + 0.0:.{headline.digits}f}")
-    cells += [
-        mean_std(list(outcomes[kind]), 2)
-        for kind in ("failed", [*outcomes][-1 if headline == SUCCESS else 0])
-    ]
+    last = "out of time" if headline == SUCCESS else "lasted"
+    cells += [mean_std(list(outcomes[kind]), 2) for kind in ("failed", last)]
     return Loss(
         name=name,
         title=row.title,
@@ -118,7 +116,7 @@ def remaining_errors(results: Results, *, steps: int = 10) -> tuple[int, list[st
                 cells.append("-")
                 continue
             raw, left = gap.raw[quantity].mean[place], gap.grounded[quantity].mean[place]
-            share = f" ({left / raw:.0%})" if raw > 0 else ""
+            share = f" ({100 * left / raw:.0f} %)" if raw > 0 else ""
             cells.append(f"{left:.3g} of {raw:.3g}{share}")
         lines.append([quantity, *cells])
     return horizon, list(gaps), lines

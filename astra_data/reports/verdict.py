@@ -9,7 +9,8 @@ from astra_data.reports.schema import MethodResults, Ranked, Results
 from astra_data.reports.statistics import share_interval
 from astra_data.reports.tested import where
 
-_SURE = "95\N{NO-BREAK SPACE}%"
+_PERCENT = "\N{NO-BREAK SPACE}%"
+_SURE = f"95{_PERCENT}"
 _MOSTLY = 0.5
 """Share of episodes that fail from which on a verdict warns of it."""
 
@@ -109,7 +110,7 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
             yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
         if best is not row:
             yield f"By the mean over seeds {best.title} is ahead: {_score(results, best)}."
-        if results.choice.regret:
+        if results.choice.regret and chosen is candidates[0]:
             yield (
                 f"In hindsight another policy is better in the target, by {results.choice.regret:.2f}: "
                 "that is the regret of the choice."
@@ -130,7 +131,10 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         yield from _against(results, row, floor)
     failed = row.summary["failed"].mean
     if failed >= _MOSTLY:
-        yield f"{row.title} fails in {failed:.0%} of its episodes: look at how before a robot depends on it."
+        yield (
+            f"{row.title} fails in {100 * failed:.0f}{_PERCENT} of its episodes: "
+            "look at how before a robot depends on it."
+        )
 
 
 def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iterator[str]:
@@ -179,7 +183,7 @@ def _why_best(results: Results, row: MethodResults, percent: int | None) -> str:
 
 def _trained(results: Results, percent: int | None) -> str:
     """Return on how much data the policies were trained; empty if the results do not tell."""
-    share = "" if percent is None else f"{percent} % of "
+    share = "" if percent is None else f"{percent}{_PERCENT} of "
     if source := results.settings.get("data"):
         return f", trained on {share}the episodes of {source}"
     collect = results.settings.get("collect")
