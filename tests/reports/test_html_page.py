@@ -157,6 +157,13 @@ def test_sizes_stand_in_a_table_and_the_rest_is_of_the_largest() -> None:
     assert "trained on 100\N{NO-BREAK SPACE}% of 60 episodes of data for each of 5 seeds" in page.words
 
 
+def test_results_of_no_target_say_so_above_the_verdict(tmp_path: Path) -> None:
+    page = read_page(render_html(toy(tmp_path).model_copy(update={"tested_in": "simulators"}), {}))
+    warned, judged = (page.text.index(of) for of in ("Nothing was tested on a robot", "Deploy ASTRA+"))
+    assert warned < judged
+    assert "success in a simulator" in page.table(LOSSES)[0]
+
+
 def test_one_seed_has_neither_spread_nor_comparisons_and_few_policies_no_correlation(tmp_path: Path) -> None:
     results = toy(tmp_path, seeds=(1,))
     images = published_figures(PUBLISHED, "antmaze_long_fresh")
