@@ -58,7 +58,7 @@ def test_a_page_loads_nothing_and_shows_every_figure(path: Path) -> None:
     assert all(address.startswith("data:") for address in addresses)
     policy = page.attributes("meta")[3]
     assert policy["http-equiv"] == "Content-Security-Policy"
-    assert "default-src 'none'" in (policy["content"] or "")
+    assert policy["content"] == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
     figures = published_figures(PUBLISHED, path.stem)
     shown = [b64decode((image["src"] or "").partition("base64,")[2]) for image in page.attributes("img")]
     assert sorted(shown) == sorted(figures.values())
@@ -120,7 +120,11 @@ def test_bars_tell_how_episodes_ended() -> None:
     assert f'aria-label="{label}"' in text
     bar = text.partition(label)[2].partition("</svg>")[0]
     widths = [part.partition('"')[0] for part in bar.split(' width="')[1:]]
+    places = [part.partition('"')[0] for part in bar.split(' x="')[1:]]
     assert widths == [f"{1000 * share:.1f}" for share in (success, failed, late)]
+    assert places == ["0.0", f"{1000 * success:.1f}", f"{1000 * (success + failed):.1f}"]
+    # At the very end the mark of the simulator would be cut off.
+    assert own == 1.0 and bar.count('d="M997.0 0V100"') == 2
 
 
 def test_of_lasting_tasks_it_shows_survived_steps_and_return() -> None:
