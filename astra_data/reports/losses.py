@@ -39,7 +39,7 @@ def loss_head(results: Results) -> list[str]:
         for title in (f"{score.title} {where(results)}", "IQM [95\N{NO-BREAK SPACE}%]")
     ]
     last = "out of time" if results.headline == SUCCESS else "lasted"
-    return ["seeds", f"{results.headline.title} in its simulator", *scores, "lost", "failed", last]
+    return [f"{results.headline.title} in its simulator", *scores, "lost", "failed", last, "seeds"]
 
 
 def losses(results: Results) -> list[Loss]:
@@ -56,7 +56,7 @@ def _loss(results: Results, name: str, row: MethodResults) -> Loss:
         outcomes = {"success": reached, "failed": failed, "out of time": late}
     else:
         outcomes = {"lasted": 1.0 - failed, "failed": failed}
-    cells = [f"{len(row.seeds)}", spread(simulated, headline.digits) if simulated else "-"]
+    cells = [spread(simulated, headline.digits) if simulated else "-"]
     for score in results.scores:
         summary = row.summary[score.measure]
         cells.append(spread(summary, score.digits))
@@ -70,6 +70,7 @@ def _loss(results: Results, name: str, row: MethodResults) -> Loss:
     cells.append("-" if lost is None else f"{round(lost, headline.digits) + 0.0:.{headline.digits}f}")
     last = "out of time" if headline == SUCCESS else "lasted"
     cells += [mean_std(list(outcomes[kind]), 2) for kind in ("failed", last)]
+    cells.append(f"{len(row.seeds)}")
     return Loss(
         name=name,
         title=row.title,

@@ -25,31 +25,31 @@ def test_outcomes_add_up_and_those_out_of_time_are_the_rest(results: Results) ->
     assert (row.name, row.title, row.role) == ("astra", "ASTRA", None)
     assert row.outcomes == pytest.approx({"success": 0.5, "failed": 1 / 6, "out of time": 1 / 3})
     assert row.simulated == pytest.approx(0.75)
-    assert row.cells[0] == "3" and row.cells[4:] == ["0.25", "0.17 ± 0.14", "0.33 ± 0.14"]
-    assert len(row.cells) + 2 == len(loss_head(found)) + 2
+    assert row.cells[3:] == ["0.25", "0.17 ± 0.14", "0.33 ± 0.14", "3"]
+    assert len(row.cells) == len(loss_head(found))
 
 
 def test_a_row_without_a_simulator_loses_nothing_there(results: Results) -> None:
     follower = losses(results)[-1]
     assert (follower.role, follower.simulated) == ("ceiling", None)
-    assert follower.cells[1] == follower.cells[4] == "-"
+    assert follower.cells[0] == follower.cells[3] == "-"
 
 
 def test_a_gain_is_negative_and_a_rounded_zero_has_no_sign(results: Results) -> None:
     gained = changed(results, "astra", success=[1.0, 1.0, 1.0])
-    assert losses(gained)[1].cells[4] == "-0.25"
+    assert losses(gained)[1].cells[3] == "-0.25"
     level = changed(results, "astra", success=[0.751, 0.751, 0.751])
-    assert losses(level)[1].cells[4] == "0.00"
+    assert losses(level)[1].cells[3] == "0.00"
 
 
 def test_of_lasting_tasks_steps_are_lost_and_shares_last(results: Results) -> None:
     lasting = results.model_copy(update={"scores": (SURVIVED_STEPS, RETURN)})
     row = losses(lasting)[1]
-    assert loss_head(lasting)[-3:] == ["lost", "failed", "lasted"] and len(loss_head(lasting)) == len(
-        row.cells
-    )
+    assert loss_head(lasting)[-4:] == ["lost", "failed", "lasted", "seeds"] and len(
+        loss_head(lasting)
+    ) == len(row.cells)
     assert row.outcomes == pytest.approx({"lasted": 0.5, "failed": 0.5}) and row.simulated is None
-    assert row.cells[-3:] == ["0", "0.50 ± 0.25", "0.50 ± 0.25"]
+    assert row.cells[-4:] == ["0", "0.50 ± 0.25", "0.50 ± 0.25", "3"]
 
 
 def test_every_seed_has_a_line_with_what_some_row_has(results: Results) -> None:
