@@ -63,7 +63,7 @@ def write_held_out(
         return None
     every = [gap for sizes in found.values() for gap in sizes.values()]
     horizons = [h for h in every[0].horizons if all(h in gap.horizons for gap in every)]
-    rates = _rates(root, groundings, seeds, max(percents, default=None))
+    rates = failure_rates(root, groundings, seeds, max(percents, default=None))
     if rates:
         from astra_data.reports.figures import png, reliability
 
@@ -75,7 +75,7 @@ def write_held_out(
         head=[*(["size"] if percents else []), "simulator"],
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
-        foresight=_foresight(root, groundings, seeds, percents),
+        foresight=foresight_lines(root, groundings, seeds, percents),
         reliability=RELIABILITY if rates else None,
         enough=[
             enough(method_title(method), name, sizes, horizons)
@@ -88,7 +88,7 @@ def write_held_out(
     return root / PAGE
 
 
-def _foresight(
+def foresight_lines(
     root: Path, groundings: Sequence[str], seeds: Sequence[int], percents: Sequence[int]
 ) -> list[list[str]]:
     """Return a line for each size, grounding and part of it that foresees failures, with means over seeds."""
@@ -114,7 +114,7 @@ def _measured(
     return measured
 
 
-def _rates(
+def failure_rates(
     root: Path, groundings: Sequence[str], seeds: Sequence[int], percent: int | None
 ) -> dict[str, dict[str, Floats]]:
     """Return rates by part that foresees failures and grounding, over all seeds, as a figure takes them."""

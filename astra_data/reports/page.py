@@ -70,14 +70,14 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         warning=warning(results),
         where=where(results),
         machines=" and ".join(dict.fromkeys(map(machine, stages))),
-        scores=_scores(results),
+        scores=score_table(results),
         has_plus=any(map(is_plus, rows)),
-        encoders=_encoders(results),
+        encoders=encoder_lines(results),
         horizons=[f"{horizon} step{'s' if horizon > 1 else ''}" for horizon in first.horizons]
         if first
         else [],
-        gaps=_gaps(results),
-        correlation=_correlation,
+        gaps=gap_tables(results),
+        correlation=correlation_text,
         grounding=f"{method_title(reference)}'s, of the same seed" if reference else "each row's own",
         untested=[row.title for row in rows.values() if "raw" not in row.simulator_returns],
         choice=choice_values(results.choice),
@@ -89,7 +89,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
     )
 
 
-def _scores(results: Results) -> tuple[list[str], list[list[str]]]:
+def score_table(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return head and lines of the table of scores."""
     rows, scores, beside = results.methods, results.scores, BESIDE[results.headline.measure]
     bare = OF_PLANES | NEGLIGIBLE.keys() if results.tested_in == "target" else set(beside)
@@ -132,7 +132,7 @@ def _some(measure: str) -> Callable[[MethodResults], bool]:
     return lambda row: measure in row.summary and abs(row.summary[measure].mean) > least
 
 
-def _encoders(results: Results) -> list[list[str]]:
+def encoder_lines(results: Results) -> list[list[str]]:
     """Return the scores by encoder of the rows that have several."""
     return [
         [row.title, encoder, *(mean_std(values[score.measure], score.digits) for score in results.scores)]
@@ -142,7 +142,7 @@ def _encoders(results: Results) -> list[list[str]]:
     ]
 
 
-def _gaps(results: Results) -> dict[str, list[list[str]]]:
+def gap_tables(results: Results) -> dict[str, list[list[str]]]:
     """Return quantity → lines of the table of open-loop errors, the raw simulator once if all share it."""
     gaps = {method_title(name): gap for name, gap in results.gaps().items()}
     if not gaps:
@@ -165,5 +165,6 @@ def _cells(band: BandMeans) -> list[str]:
     return [f"{mean:.3g} [{low:.3g}, {high:.3g}]" for mean, low, high in ends]
 
 
-def _correlation(found: Correlation | None) -> str:
+def correlation_text(found: Correlation | None) -> str:
+    """Return a coefficient with its interval; a dash where it is undefined."""
     return interval(found.value, found.low, found.high) if found else "-"

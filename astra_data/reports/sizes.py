@@ -48,17 +48,10 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         figures: name → file name of each figure that was drawn; names as in `files.FIGURES`.
     """
     first = found.sizes[0].results
-    score = first.headline
     seconds = sum(size.results.wall_seconds["total"] for size in found.sizes)
     # The artefacts of these stages are in the results of every size.
     seconds -= (len(found.sizes) - 1) * sum(first.wall_seconds.get(stage, 0.0) for stage in SHARED)
-    means, intervals = [], []
-    for method, row in first.methods.items():
-        summaries = [size.results.methods[method].summary[score.measure] for size in found.sizes]
-        means.append([row.title, *(spread(summary, score.digits) for summary in summaries)])
-        intervals.append(
-            [row.title, *(interval(one.iqm, one.low, one.high, score.digits) for one in summaries)]
-        )
+    means, intervals = size_lines(found)
     return fill(
         "sizes.md.jinja",
         found=found,
@@ -67,12 +60,31 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         warning=warning(first),
         where=where(first),
         wall_seconds=seconds,
-        head=["method", *(f"{size.percent} %" for size in found.sizes)],
+        head=size_head(found),
         means=means,
         intervals=intervals,
         choices=[_choice(size) for size in found.sizes if size.results.choice],
         made=provenance([origin for size in found.sizes for origin in size.results.origins]),
     )
+
+
+def size_head(found: SizesResults) -> list[str]:
+    """Return the head of the tables whose lines `size_lines` returns."""
+    return ["method", *(f"{size.percent} %" for size in found.sizes)]
+
+
+def size_lines(found: SizesResults) -> tuple[list[list[str]], list[list[str]]]:
+    """Return each row's headline score by size: mean and spread, and interquartile mean with its interval."""
+    first = found.sizes[0].results
+    score = first.headline
+    means, intervals = [], []
+    for method, row in first.methods.items():
+        summaries = [size.results.methods[method].summary[score.measure] for size in found.sizes]
+        means.append([row.title, *(spread(summary, score.digits) for summary in summaries)])
+        intervals.append(
+            [row.title, *(interval(one.iqm, one.low, one.high, score.digits) for one in summaries)]
+        )
+    return means, intervals
 
 
 def _choice(size: SizeResults) -> list[str]:

@@ -159,6 +159,14 @@ def mean_interval(shares: Sequence[float]) -> tuple[float, float]:
     return max(mean - half, 0.0), min(mean + half, 1.0)
 
 
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share: `count` of `total` episodes of one policy."""
+    from scipy.stats import binomtest
+
+    found = binomtest(count, total).proportion_ci(confidence_level=CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
+
+
 def mean_rank_correlation(
     rows: Collection[Mapping[int, tuple[float, float]]], *, least: int, replicates: int = REPLICATES
 ) -> Correlation | None:

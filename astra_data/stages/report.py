@@ -1,4 +1,4 @@
-"""Report: the results of all rows and seeds of a recipe, as results.json, results.md and figures."""
+"""Report: the results of all rows and seeds of a recipe, as results.json, .md, .html and figures."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -10,6 +10,7 @@ from pydantic import Field
 from astra_data.core.checkpoint import finished_folder
 from astra_data.core.config import Config, Share
 from astra_data.core.digest import file_digest
+from astra_data.core.durable import write_file
 from astra_data.core.manifest import write_manifest
 from astra_data.core.naming import place
 from astra_data.core.progress import Progress
@@ -19,6 +20,8 @@ from astra_data.reports.assembly import assemble
 from astra_data.reports.choice import SELECTED
 from astra_data.reports.command_replay import replay_commands
 from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
+from astra_data.reports.held_out import failure_rates, foresight_lines
+from astra_data.reports.html_page import HTML, render_html
 from astra_data.reports.page import render
 from astra_data.reports.runs import Reported
 from astra_data.reports.schema import Results
@@ -60,13 +63,13 @@ def report(
     add_to: Path | None = None,
     config: ReportConfig = DEFAULTS,
 ) -> None:
-    """Write results.json, results.md and the figures to `root`/report.
+    """Write results.json, results.md, results.html and the figures to `root`/report.
 
     Args:
         recipe: names the task, the rows and the seeds.
         root: the recipe's folder of runs.
         command: the command line to print as the results' origin.
-        publish: a folder for copies named after the recipe, or None.
+        publish: a folder for copies named after the recipe, of all but results.html, or None.
         progress: called with the share done and a note.
         add_to: a file of published results to merge with those at `root`, or None.
         config: settings.
@@ -77,7 +80,7 @@ def report(
         BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
     from astra_data.reports.drawing import figure_of_sizes, figures_of
-    from astra_data.reports.figures import dynamics_mismatch, png
+    from astra_data.reports.figures import dynamics_mismatch, png, reliability
 
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
@@ -126,8 +129,12 @@ def report(
             )
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
+    foreseen = (root, list(sizes[-1].gaps()), sizes[-1].seeds)
+    rates = failure_rates(*foreseen, max(recipe.percents, default=None))
+    inlined = images | ({"reliability": png(reliability(rates))} if rates else {})
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
+        write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, recipe.percents)))
         write_manifest(folder, read)
     if publish is not None:
         kept = {} if add_to is None else published_figures(publish, recipe.name)

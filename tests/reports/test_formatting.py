@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from jinja2 import UndefinedError
 
-from astra_data.reports.formatting import duration, fill, interval, mean_std, short, spread, table
+from astra_data.reports.formatting import duration, fill, inline, interval, mean_std, short, spread, table
 from astra_data.reports.statistics import Summary
 
 
@@ -54,3 +54,8 @@ def test_what_a_template_lacks_is_an_error_and_markdown_is_not_escaped() -> None
         fill("sizes.md.jinja")
     made = {"code": "a & b", "machine": "<x>", "versions": "'1'"}
     assert fill("origin.md.jinja", made=made).strip() == ""
+
+
+def test_a_sentence_of_markdown_is_escaped_before_it_is_marked() -> None:
+    assert str(inline("**Of** `a<b` & *c*")) == "<strong>Of</strong> <code>a&lt;b</code> &amp; *c*"
+    assert str(inline("`<script>`: <b>")) == "<code>&lt;script&gt;</code>: &lt;b&gt;"

@@ -15,6 +15,7 @@ from astra_data.reports.statistics import (
     mean_interval,
     mean_rank_correlation,
     probability_of_improvement,
+    share_interval,
     summarise,
 )
 
@@ -208,6 +209,14 @@ def test_the_mean_of_shares_has_students_interval() -> None:
     expected = stats.t.interval(0.95, 3, loc=0.35, scale=stats.sem(shares))
     assert mean_interval(shares) == pytest.approx(expected)
     assert mean_interval([0.0, 1.0]) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(("count", "total"), [(64, 100), (0, 20), (7, 7), (1, 4)])
+def test_the_interval_of_a_share_is_wilsons(count: int, total: int) -> None:
+    share, z = count / total, stats.norm.ppf(0.975)
+    middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
+    half = z / (1 + z**2 / total) * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
+    assert share_interval(count, total) == pytest.approx((middle - half, middle + half), abs=1e-9)
 
 
 def test_students_interval_covers_the_mean_where_a_bootstrap_does_not() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from fake_runs import (
     write_evaluation,
     write_runs,
 )
+from html_pages import read_page
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
@@ -131,6 +133,38 @@ def test_publishing_copies_all_under_the_recipes_name(root: Path, tmp_path: Path
     assert "](antmaze_u_mismatch.png)" in (published / "antmaze_u.md").read_text()
 
 
+def test_the_html_page_has_every_figure_of_the_folder_and_is_not_published(
+    root: Path, tmp_path: Path
+) -> None:
+    make(root, tmp_path / "results")
+    page = read_page((root / "report/results.html").read_text())
+    inlined = [b64decode((image["src"] or "").partition("base64,")[2]) for image in page.attributes("img")]
+    assert sorted(inlined) == sorted(path.read_bytes() for path in (root / "report").glob("*.png"))
+    assert "Deploy ASTRA+: success 0.92 ± 0.14 in the target" in page.text
+    manifest = read_manifest(root / "report")
+    assert manifest and manifest.faults(root / "report", verify=True) == []
+    assert manifest.foreign(root / "report") == []
+    assert not list((tmp_path / "results").glob("*.html"))
+
+
+def test_the_html_page_tells_how_failures_are_foreseen(root: Path) -> None:
+    for seed in SEEDS:
+        found = {
+            "failures": 3 + seed,
+            "auc": {"1-20": 0.9, "11-30": 0.8, "21-40": None},
+            "brier_skill": 0.25,
+            "reliability": [(0.005, 0.0, 90), (0.4, 0.5, 10)],
+        }
+        edit_json(root / f"ground/astra/seed_{seed}/metrics.json", failures={"failure_model": found})
+    make(root)
+    page = read_page((root / "report/results.html").read_text())
+    assert page.table("On held-out episodes")[1] == [
+        *("ASTRA: failure model", "12", "0.90", "0.80", "-", "0.25", "0.50 of 0.40"),
+    ]
+    assert len(page.attributes("img")) == 1 + len(images(root / "report"))
+    assert "Reliability of the failure model" in page.text
+
+
 def test_results_are_added_to_published_ones(root: Path, tmp_path: Path) -> None:
     published = tmp_path / "results"
     make(root, published, FakeRecipe(seeds=(0, 1)))
@@ -188,6 +222,9 @@ def test_sizes_are_set_side_by_side(tasks: None, tmp_path: Path) -> None:
     assert [dataset.stage for dataset in found.sizes[0].results.datasets] == ["subset"] * 3
     page = (root / "report/results.md").read_text()
     assert "| method | 50 % | 100 % |" in page
+    html = read_page((root / "report/results.html").read_text())
+    head, _, astra = html.table("Success in the target, mean")
+    assert (head, astra) == (["method", "50 %", "100 %"], ["ASTRA", "0.25 ± 0.25", "0.50 ± 0.25"])
     assert "| ASTRA | 0.25 ± 0.25 | 0.50 ± 0.25 |" in page
     assert (root / "report/data_efficiency.png").stat().st_size > 0
     published = (tmp_path / "results/sizes.md").read_text()

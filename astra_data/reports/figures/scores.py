@@ -118,7 +118,8 @@ def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figu
         every[0].xaxis.set_major_formatter(_steps_label)
         every[0].xaxis.set_major_locator(MaxNLocator(4))
         figure.supxlabel("steps of training")
-        figure.supylabel(f"{score.title} of training episodes, from all starts")
+        # In two lines, since a single row of panels is low.
+        figure.supylabel(f"{score.title} of training\nepisodes, from all starts")
         if any(map(is_plus, curves)):
             handles = [
                 Line2D([], [], color=INK, label="without the [plus] settings"),

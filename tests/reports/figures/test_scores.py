@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.style import method_colour
-from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS
+from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS, Score
 
 
 def legend(figure: Figure) -> list[str]:
@@ -50,7 +51,7 @@ def test_survived_steps_have_no_limit_and_no_decimals() -> None:
     figure = learning_curves(SURVIVED_STEPS, {"nas": [curve]})
     low, high = figure.axes[0].get_ylim()
     assert low == 0 and 400 < high < 450
-    assert figure.get_supylabel() == "survived steps of training episodes, from all starts"
+    assert figure.get_supylabel() == "survived steps of training\nepisodes, from all starts"
 
 
 def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
@@ -87,3 +88,14 @@ def test_many_rows_get_a_panel_each_and_readable_bars() -> None:
     labels = [label.get_window_extent() for label in bars.axes[0].get_yticklabels()]
     assert all(upper.y0 > lower.y1 for upper, lower in pairwise(labels))
     assert min(label.x0 for label in labels) >= 0
+
+
+@pytest.mark.parametrize("rows", [("nas",), ("nas", "astra", "compass", "rma", "iql")])
+@pytest.mark.parametrize("score", [SUCCESS, SURVIVED_STEPS])
+def test_labels_of_learning_curves_lie_within_the_figure(score: Score, rows: tuple[str, ...]) -> None:
+    curve = Curve(np.array([0.0, 1e6]), np.array([0.0, 1.0]))
+    figure = learning_curves(score, {row: [curve] for row in rows})
+    figure.canvas.draw()
+    (label,) = [text for text in figure.findobj(Text) if text.get_text() == figure.get_supylabel()]
+    box = label.get_window_extent()
+    assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1 and box.x0 >= 0

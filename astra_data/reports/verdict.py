@@ -1,0 +1,246 @@
+"""Which row of results to deploy, in a sentence or two, and what stands beside that."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from astra_data.reports.choice_page import named
+from astra_data.reports.formatting import interval, spread
+from astra_data.reports.schema import MethodResults, Ranked, Results
+from astra_data.reports.statistics import share_interval
+from astra_data.reports.tested import where
+
+_PERCENT = "\N{NO-BREAK SPACE}%"
+_SURE = f"95{_PERCENT}"
+_MOSTLY = 0.5
+"""Share of episodes that fail from which on a verdict warns of it."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A number beside the verdict.
+
+    Attributes:
+        label: what it is of.
+        value: as text.
+        note: its interval, and what it was measured on.
+    """
+
+    label: str
+    value: str
+    note: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to deploy.
+
+    Attributes:
+        row: name of the row; None where all rows are references.
+        opening: what comes before the title in the verdict.
+        title: of the row, with the seed of a chosen policy.
+        reason: what comes behind it.
+        remarks: what limits it.
+        facts: the numbers that it rests on, and those of the references.
+    """
+
+    row: str | None
+    opening: str
+    title: str
+    reason: str
+    remarks: list[str]
+    facts: list[Fact]
+
+
+def verdict_of(results: Results, percent: int | None = None) -> Verdict:
+    """Name the row to deploy: that of the chosen policy, or else the one with the best mean over seeds.
+
+    A row with a role, such as the floor, is a reference and never the one.
+
+    Args:
+        results: of all rows.
+        percent: the size of the dataset, if there are several.
+    """
+    references = [_of_row(results, row) for row in results.methods.values() if row.role]
+    if len(references) == len(results.methods):
+        return Verdict(None, "No row to deploy: all rows are references.", "", "", [], references)
+    chosen = chosen_of(results)
+    name = chosen.row if chosen else best_of(results)
+    row = results.methods[name]
+    as_good = [floor.title for floor in _floors(results) if _mean(results, floor) >= _mean(results, row)]
+    opening = "Deploy"
+    if as_good:
+        opening = (
+            f"No gain over the floor: {' and '.join(as_good)} does as well or better. Of the rest, deploy"
+        )
+    facts = [_of_row(results, row), *references]
+    remarks = [*_remarks(results, name, chosen)]
+    if chosen:
+        title, reason = named(chosen.row, chosen.seed), _why_chosen(results, chosen, percent)
+        return Verdict(name, opening, title, reason, remarks, [*_of_choice(results, chosen), *facts])
+    return Verdict(name, opening, row.title, _why_best(results, row, percent), remarks, facts)
+
+
+def best_of(results: Results) -> str:
+    """Return the row with the best mean over seeds that is no reference."""
+    return max(
+        (name for name, row in results.methods.items() if not row.role),
+        key=lambda name: _mean(results, results.methods[name]),
+    )
+
+
+def chosen_of(results: Results) -> Ranked | None:
+    """Return the best candidate of `select` whose row is tested and no reference; None without one."""
+    candidates = results.choice.candidates if results.choice else []
+    return next((one for one in candidates if not _passed_over(results, one)), None)
+
+
+def _passed_over(results: Results, one: Ranked) -> str:
+    """Return why a candidate is not the one to deploy; empty if it may be."""
+    row = results.methods.get(one.row)
+    if row is None:
+        return "has not been tested yet"
+    return f"is of a reference row ({row.role})" if row.role else ""
+
+
+def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
+    row, best = results.methods[name], results.methods[best_of(results)]
+    if chosen and results.choice:
+        candidates = results.choice.candidates
+        for one in candidates[: candidates.index(chosen)]:
+            yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
+        if best is not row:
+            yield f"By the mean over seeds {best.title} is ahead: {_score(results, best)}."
+        if results.choice.regret and chosen is candidates[0]:
+            yield (
+                f"In hindsight another policy is better in the target, by {results.choice.regret:.2f}: "
+                "that is the regret of the choice."
+            )
+        for figure, why in results.choice.withheld.items():
+            yield f"Withheld of the choice: {figure.replace('_', ' ')}, because {why}."
+        if results.choice.shares_episodes:
+            yield "All seeds have the same episodes, so no judge is independent of what it judges."
+    else:
+        ties = [
+            of.title
+            for of in results.methods.values()
+            if of is not row and not of.role and _mean(results, of) == _mean(results, row)
+        ]
+        if ties:
+            yield f"As good by the mean: {', '.join(ties)}."
+    for floor in _floors(results):
+        yield from _against(results, row, floor)
+    failed = row.summary["failed"].mean
+    if failed >= _MOSTLY:
+        yield (
+            f"{row.title} fails in {100 * failed:.0f}{_PERCENT} of its episodes: "
+            "look at how before a robot depends on it."
+        )
+
+
+def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iterator[str]:
+    """Yield a warning if the seeds do not show a difference to the floor."""
+    measure = results.headline.measure
+    ours, its = row.summary[measure], floor.summary[measure]
+    if ours.low is None or ours.high is None or its.low is None or its.high is None:
+        yield (
+            f"One seed has no interval over seeds, so the difference between {row.title} and {floor.title} "
+            "has none: another seed may come out differently."
+        )
+    elif ours.low <= its.high and its.low <= ours.high:
+        yield (
+            f"The {_SURE} intervals of {row.title} and {floor.title} overlap: so few seeds leave open "
+            "whether they differ."
+        )
+
+
+def _floors(results: Results) -> list[MethodResults]:
+    return [row for row in results.methods.values() if row.role == "floor"]
+
+
+def _mean(results: Results, row: MethodResults) -> float:
+    return row.summary[results.headline.measure].mean
+
+
+def _why_chosen(results: Results, chosen: Ranked, percent: int | None) -> str:
+    predicted = _with_interval(chosen.predicted, chosen.low, chosen.high)
+    text = f". Its success was predicted, without the target, as {predicted}"
+    if chosen.target is None:
+        text += ", and not measured in the target"
+    else:
+        measured = _with_interval(chosen.target, *_ends(results, chosen.target))
+        text += f" and measured in the target as {measured}, over {results.episodes} episodes"
+    count = len(results.choice.candidates) if results.choice else 0
+    return f"{text}. The stage select chose it from {count} policies{_trained(results, percent)}."
+
+
+def _why_best(results: Results, row: MethodResults, percent: int | None) -> str:
+    seeds = "best mean over seeds" if len(results.seeds) > 1 else "best result"
+    return (
+        f": {_score(results, row)}. It is the row with the {seeds}{_trained(results, percent)}; "
+        "the stage select chose no policy."
+    )
+
+
+def _trained(results: Results, percent: int | None) -> str:
+    """Return on how much data the policies were trained; empty if the results do not tell."""
+    share = "" if percent is None else f"{percent}{_PERCENT} of "
+    if source := results.settings.get("data"):
+        return f", trained on {share}the episodes of {source}"
+    collect = results.settings.get("collect")
+    episodes = collect.get("episodes") if isinstance(collect, dict) else None
+    if not episodes:
+        return ""
+    seeds = len(results.seeds)
+    return (
+        f", trained on {share}{episodes} episodes of data{f' for each of {seeds} seeds' if seeds > 1 else ''}"
+    )
+
+
+def _with_interval(share: float, low: float | None, high: float | None) -> str:
+    return f"{share:.2f} (" + (
+        f"{_SURE} interval {low:.2f} to {high:.2f})" if low is not None else "interval withheld)"
+    )
+
+
+def _seeds(row: MethodResults) -> str:
+    return "one seed" if len(row.seeds) == 1 else f"{len(row.seeds)} seeds"
+
+
+def _score(results: Results, row: MethodResults) -> str:
+    score = results.headline
+    summary = row.summary[score.measure]
+    middle = ""
+    if summary.low is not None and summary.high is not None:
+        ends = f"{_SURE} interval {score.text(summary.low)} to {score.text(summary.high)}"
+        middle = f"; interquartile mean {score.text(summary.iqm)}, {ends}"
+    tested = f"{_seeds(row)} with {results.episodes} episodes{' each' if len(row.seeds) > 1 else ''}"
+    return f"{score.title} {spread(summary, score.digits)} {where(results)} ({tested}{middle})"
+
+
+def _ends(results: Results, share: float) -> tuple[float, float]:
+    """Return the 95 % interval of a policy's success over its episodes."""
+    return share_interval(round(share * results.episodes), results.episodes)
+
+
+def _of_choice(results: Results, chosen: Ranked) -> Iterator[Fact]:
+    ends = "interval withheld" if chosen.low is None else f"{_SURE} [{chosen.low:.2f}, {chosen.high:.2f}]"
+    judges = f"{chosen.judges} judge{'s' if chosen.judges > 1 else ''}"
+    yield Fact("Predicted success", f"{chosen.predicted:.2f}", f"{ends}, by {judges}")
+    if chosen.target is None:
+        yield Fact("Measured success", "-", "not tested in the target")
+    else:
+        low, high = _ends(results, chosen.target)
+        note = f"{_SURE} [{low:.2f}, {high:.2f}], {results.episodes} episodes of this policy"
+        yield Fact("Measured success", f"{chosen.target:.2f}", note)
+
+
+def _of_row(results: Results, row: MethodResults) -> Fact:
+    score = results.headline
+    summary = row.summary[score.measure]
+    if summary.low is None or summary.high is None:
+        note = f"{score.title}, {_seeds(row)}: no interval"
+    else:
+        ends = interval(summary.iqm, summary.low, summary.high, score.digits)
+        note = f"{score.title}, {_seeds(row)}; IQM {ends}"
+    label = f"{row.title} ({row.role})" if row.role else row.title
+    return Fact(label, spread(summary, score.digits), note)

@@ -1,0 +1,173 @@
+"""What is named as the row to deploy, in toy results and in published ones."""
+
+import json
+from pathlib import Path
+
+import pytest
+from fake_runs import ROWS, SEEDS, write_choice, write_runs
+
+from astra_data.reports.assembly import assemble
+from astra_data.reports.comparing import summarised
+from astra_data.reports.files import read_published
+from astra_data.reports.schema import Choice, Ranked, Results
+from astra_data.reports.verdict import Verdict, verdict_of
+
+PUBLISHED = Path(__file__).parents[2] / "recipes/results"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return made(tmp_path_factory.mktemp("verdict"))
+
+
+def made(parent: Path, *, select: bool = False, seeds: tuple[int, ...] = SEEDS) -> Results:
+    root = write_runs(parent)
+    if select:
+        write_choice(root)
+    return assemble("toy", "antmaze-u", ROWS, seeds, root=root, command="", replicates=100)
+
+
+def with_success(results: Results, **shares: list[float]) -> Results:
+    rows = {
+        name: summarised(results.methods[name].model_copy(update={"success": of}), 100)
+        for name, of in shares.items()
+    }
+    return results.model_copy(update={"methods": results.methods | rows})
+
+
+def sentence(verdict: Verdict) -> str:
+    """Return the verdict as it is read, with plain spaces."""
+    return f"{verdict.opening} {verdict.title}{verdict.reason}".replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_without_a_choice_it_is_the_best_mean_of_no_reference(results: Results) -> None:
+    # The follower has 1, ASTRA+ a mean of 11/12, the floor and ASTRA less.
+    verdict = verdict_of(results)
+    assert (verdict.row, verdict.opening, verdict.title) == ("astra_plus", "Deploy", "ASTRA+")
+    assert sentence(verdict).startswith(
+        "Deploy ASTRA+: success 0.92 ± 0.14 in the target (3 seeds with 4 episodes each; "
+    )
+    assert "It is the row with the best mean over seeds; the stage select chose no policy." in verdict.reason
+    labels = [(fact.label, fact.value) for fact in verdict.facts]
+    assert labels == [
+        ("ASTRA+", "0.92 ± 0.14"),
+        ("Direct transfer (floor)", "0.17 ± 0.14"),
+        ("Careful follower (ceiling)", "1.00 ± 0.00"),
+    ]
+    assert verdict.remarks == []
+
+
+def test_the_choice_of_select_comes_before_the_best_mean(tmp_path: Path) -> None:
+    verdict = verdict_of(made(tmp_path, select=True))
+    assert (verdict.row, verdict.title) == ("astra", "ASTRA, seed 2")
+    # Wilson's interval of 3 of 4 episodes.
+    assert sentence(verdict).startswith(
+        "Deploy ASTRA, seed 2. Its success was predicted, without the target, as 1.00 "
+        "(95 % interval 1.00 to 1.00) and measured in the target as 0.75 (95 % interval 0.30 to 0.95), "
+        "over 4 episodes. The stage select chose it from 6 policies."
+    )
+    assert any(
+        remark.startswith("By the mean over seeds ASTRA+ is ahead: success 0.92")
+        for remark in verdict.remarks
+    )
+    assert any("better in the target, by 0.25" in remark for remark in verdict.remarks)
+    assert [fact.value for fact in verdict.facts[:3]] == ["1.00", "0.75", "0.50 ± 0.25"]
+
+
+@pytest.mark.parametrize("floor", [[1.0, 1.0, 1.0], [1.0, 0.75, 1.0]])
+def test_a_floor_that_is_as_good_is_told_first_and_not_deployed(results: Results, floor: list[float]) -> None:
+    verdict = verdict_of(with_success(results, direct_transfer=floor))
+    assert verdict.row == "astra_plus"
+    assert sentence(verdict).startswith(
+        "No gain over the floor: Direct transfer does as well or better. Of the rest, deploy ASTRA+: "
+    )
+    less = verdict_of(with_success(results, direct_transfer=[0.75, 0.75, 1.0]))
+    assert less.opening == "Deploy"
+    assert any("intervals of ASTRA+ and Direct transfer overlap" in remark for remark in less.remarks)
+
+
+def candidate(row: str, seed: int, predicted: float) -> Ranked:
+    return Ranked(
+        row=row, seed=seed, judges=2, lower=predicted, predicted=predicted, low=None, high=None, target=None
+    )
+
+
+def test_a_choice_of_the_floor_or_of_what_is_untested_is_passed_over(results: Results) -> None:
+    candidates = [candidate("nas", 0, 0.9), candidate("direct_transfer", 1, 0.8), candidate("astra", 2, 0.7)]
+    withheld = {"interval": "fewer than 3 judges"}
+    choice = Choice(
+        judge="nas", episodes=4, shares_episodes=True, candidates=candidates, regret=0.3, withheld=withheld
+    )
+    verdict = verdict_of(results.model_copy(update={"choice": choice}))
+    assert verdict.title == "ASTRA, seed 2"
+    assert "as 0.70 (interval withheld), and not measured in the target. " in verdict.reason
+    assert verdict.remarks[:2] == [
+        "select ranks NAS, seed 0 higher, but it has not been tested yet.",
+        "select ranks Direct transfer, seed 1 higher, but it is of a reference row (floor).",
+    ]
+    assert "Withheld of the choice: interval, because fewer than 3 judges." in verdict.remarks
+    assert any("All seeds have the same episodes" in remark for remark in verdict.remarks)
+    # The regret is that of the first candidate.
+    assert not any("regret" in remark for remark in verdict.remarks)
+    assert verdict.facts[1].value == "-"
+
+
+def test_a_single_seed_has_no_interval(tmp_path: Path) -> None:
+    verdict = verdict_of(made(tmp_path, seeds=(1,)))
+    assert sentence(verdict).startswith(
+        "Deploy ASTRA+: success 0.75 in the target (one seed with 4 episodes). "
+    )
+    assert "95" not in sentence(verdict) and "±" not in "".join(fact.value for fact in verdict.facts)
+    assert any("One seed has no interval over seeds" in remark for remark in verdict.remarks)
+
+
+def test_ties_and_failures_are_told(results: Results) -> None:
+    tied = verdict_of(with_success(results, astra=[1.0, 0.75, 1.0]))
+    assert tied.row == "astra" and "As good by the mean: ASTRA+." in tied.remarks
+    row = results.methods["astra_plus"].model_copy(update={"failed": [1.0, 0.5, 0.75]})
+    failing = results.model_copy(update={"methods": results.methods | {"astra_plus": summarised(row, 100)}})
+    assert verdict_of(failing).remarks[-1].startswith("ASTRA+ fails in 75\N{NO-BREAK SPACE}% of its episodes")
+
+
+def test_references_alone_are_not_deployed(results: Results) -> None:
+    alone = {name: results.methods[name] for name in ("direct_transfer", "follower")}
+    verdict = verdict_of(results.model_copy(update={"methods": alone}))
+    assert verdict.row is None and sentence(verdict).startswith("No row to deploy: all rows are references.")
+
+
+@pytest.mark.parametrize(
+    ("settings", "percent", "text"),
+    [
+        ({"collect": {"episodes": 60}}, None, ", trained on 60 episodes of data for each of 3 seeds; "),
+        ({"collect": {"episodes": 60}}, 25, ", trained on 25 % of 60 episodes of data for each of 3 seeds; "),
+        ({"data": "walks@data-1.0.0"}, None, ", trained on the episodes of walks@data-1.0.0; "),
+        ({}, 25, "best mean over seeds; "),
+    ],
+)
+def test_it_says_on_how_much_data(
+    results: Results, settings: dict[str, object], percent: int | None, text: str
+) -> None:
+    assert text in sentence(verdict_of(results.model_copy(update={"settings": settings}), percent))
+
+
+@pytest.mark.parametrize(
+    ("name", "measure"), [("cart_study", "success"), ("humanoid_walker2d", "steps"), ("nao_kick", "success")]
+)
+def test_published_rows_are_judged_by_their_means(name: str, measure: str) -> None:
+    path = PUBLISHED / f"{name}.json"
+    rows = json.loads(path.read_text())["methods"]
+    means = {key: sum(row[measure]) / len(row[measure]) for key, row in rows.items() if not row["role"]}
+    found = read_published(path)
+    assert isinstance(found, Results)
+    assert verdict_of(found).row == max(means, key=means.__getitem__)
+
+
+def test_a_published_choice_is_the_first_candidate() -> None:
+    path = PUBLISHED / "antmaze_long_fresh.json"
+    first = json.loads(path.read_text())["choice"]["candidates"][0]
+    found = read_published(path)
+    assert isinstance(found, Results)
+    verdict = verdict_of(found)
+    assert verdict.row == first["row"] and verdict.title.endswith(f", seed {first['seed']}")
+    for share in (first["predicted"], first["low"], first["high"], first["target"]):
+        assert f"{share:.2f}" in verdict.reason
