@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from scipy.stats import binomtest
-
 from astra_data.reports.schema import Results
+from astra_data.reports.statistics import share_interval
 
 
 def eval_info(results: Results) -> dict[str, Any]:
@@ -13,11 +12,6 @@ def eval_info(results: Results) -> dict[str, Any]:
     `pc_success` is in percent, `pc_success_ci95` the ends of Wilson's interval for episodes alone, in
     percent: how much other seeds of a training would differ is in results.json.
     """
-    rows = {
-        name: row
-        for name, row in results.methods.items()
-        if results.headline.measure == "success" and row.seeds
-    }
     return {
         "per_task": [
             {
@@ -26,12 +20,12 @@ def eval_info(results: Results) -> dict[str, Any]:
                 "metrics": _counted([share], results.episodes)
                 | {"avg_sum_reward": total, "avg_episode_steps": steps},
             }
-            for name, row in rows.items()
+            for name, row in results.methods.items()
             for seed, share, total, steps in zip(row.seeds, row.success, row.returns, row.steps, strict=True)
         ],
         "per_group": {
             name: _counted(row.success, results.episodes) | {"avg_sum_reward": _mean(row.returns)}
-            for name, row in rows.items()
+            for name, row in results.methods.items()
         },
         "provenance": {
             "made_by": results.command,
@@ -48,12 +42,11 @@ def _counted(shares: list[float], episodes: int) -> dict[str, Any]:
     """Return how many of the `episodes` of each share succeeded, all together."""
     count = episodes * len(shares)
     successes = sum(round(share * episodes) for share in shares)
-    interval = binomtest(successes, count).proportion_ci(method="wilson")
     return {
         "n_episodes": count,
         "n_success": successes,
         "pc_success": 100 * successes / count,
-        "pc_success_ci95": [100 * interval.low, 100 * interval.high],
+        "pc_success_ci95": [100 * end for end in share_interval(successes, count)],
     }
 
 

@@ -1,5 +1,6 @@
 """Report: the results of all rows and seeds of a recipe, as results.json, .md, .html and figures."""
 
+import json
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.assembly import assemble
 from astra_data.reports.choice import SELECTED
 from astra_data.reports.command_replay import replay_commands
+from astra_data.reports.eval_info import eval_info
 from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
 from astra_data.reports.held_out import failure_rates, foresight_lines
 from astra_data.reports.html_page import HTML, render_html
@@ -28,6 +30,7 @@ from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
 from astra_data.reports.statistics import REPLICATES
 from astra_data.worlds.registry import task_named
+from astra_data.worlds.score import SUCCESS
 from astra_data.worlds.task import Task
 
 if TYPE_CHECKING:
@@ -135,6 +138,8 @@ def report(
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
         write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, recipe.percents)))
+        if isinstance(found, Results) and found.headline == SUCCESS:
+            write_file(folder / "eval_info.json", json.dumps(eval_info(found), indent=1))
         write_manifest(folder, read)
     if publish is not None:
         kept = {} if add_to is None else published_figures(publish, recipe.name)

@@ -58,8 +58,3 @@ def test_where_they_come_from_is_said() -> None:
     assert told["made_by"] == results.command and told["env"] == "antmaze-long"
     assert told["datasets"][0]["hashes"] == results.evaluated_with[0].hashes
     assert told["origins"][0]["commit"] == results.origins[0].commit
-
-
-def test_rows_without_a_success_are_left_out() -> None:
-    info = eval_info(published("humanoid_walker2d"))
-    assert info["per_task"] == [] and info["per_group"] == {}

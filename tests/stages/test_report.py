@@ -147,6 +147,14 @@ def test_the_html_page_has_every_figure_of_the_folder_and_is_not_published(
     assert not list((tmp_path / "results").glob("*.html"))
 
 
+def test_successes_are_counted_as_lerobot_counts_them(folder: Path) -> None:
+    info = json.loads((folder / "eval_info.json").read_text())
+    counted = info["per_group"]["astra"]
+    assert (counted["n_episodes"], counted["n_success"], counted["pc_success"]) == (12, 6, 50.0)
+    assert counted["pc_success_ci95"] == pytest.approx([25.38, 74.62], abs=0.01)
+    assert {one["task_id"] for one in info["per_task"]} == {*SEEDS}
+
+
 def test_the_html_page_tells_how_failures_are_foreseen(root: Path) -> None:
     for seed in SEEDS:
         found = {
@@ -326,6 +334,7 @@ def test_of_lasting_tasks_the_page_tells_survived_steps_and_return(
     # What is stored tells the scores by itself.
     found = Results.model_validate_json(stored)
     assert found.scores == (SURVIVED_STEPS, RETURN)
+    assert not (root / "report/eval_info.json").exists()
     assert render(found, {name: f"{name}.png" for name in drawn}) == page
 
 
