@@ -1,6 +1,8 @@
 """`astra-data inspect` and `astra-data list`."""
 
+from json import dumps
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import typer
@@ -16,27 +18,36 @@ def inspect(
         Path | None,
         typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures"),
     ] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(help="File for the findings, with all episodes of each.", show_default="no file"),
+    ] = None,
 ) -> None:
-    """Show the contents of a dataset: its values, its episodes, where the robot was."""
+    """Show the contents of a dataset: its values, its episodes, where the robot was, what is odd."""
     from rich.console import Console
 
     from astra_data.cli.inspection_page import inspection_page
+    from astra_data.dataset.checkup.checkup import check_up
     from astra_data.dataset.inspection import inspect_dataset
     from astra_data.dataset.versions import open_dataset
 
-    inspection = inspect_dataset(open_dataset(dataset))
-    Console(soft_wrap=True).print(inspection_page(inspection))
+    found = open_dataset(dataset)
+    inspection, checkup = inspect_dataset(found), check_up(found, quote(dataset))
+    Console(soft_wrap=True).print(inspection_page(inspection, checkup))
+    if json is not None:
+        write_file(json, dumps(checkup.record(), indent=1, ensure_ascii=False) + "\n")
+        typer.echo(f"written: {json}")
     if plot is None:
         return
     from astra_data.reports.figures import coverage, png
 
     maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
-    found = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
-    if not found:
+    drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
+    if not drawn:
         raise BadInputError(
             f"{inspection.reference}: its state has no column with the role position or velocity"
         )
-    for planar, label, unit in found:
+    for planar, label, unit in drawn:
         path = plot / f"{label}_coverage.png"
         write_file(path, png(coverage(planar.counts, planar.extent, label, unit)))
         typer.echo(f"written: {path}")

@@ -1,4 +1,4 @@
-"""The contents of a dataset for the terminal: a table of all values, and a map of the robot's positions."""
+"""The contents of a dataset for the terminal: all values, where the robot was, and findings."""
 
 from collections.abc import Iterator
 
@@ -7,19 +7,26 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.inspection import BINS, Inspection, Ints, Map, Spread
 
 _BARS = " ▁▂▃▄▅▆▇█"
 _SHADES = " ░▒▓█"
+_STYLES = {"warning": "yellow", "note": ""}
 
 
-def inspection_page(inspection: Inspection) -> RenderableType:
-    """Lay out an inspection."""
+def inspection_page(inspection: Inspection, checkup: Checkup) -> RenderableType:
+    """Lay out an inspection, and below it a check-up."""
     parts: list[RenderableType] = [Text(_summary(inspection)), *_tables(inspection.spreads)]
     if inspection.positions is not None:
         left, right, bottom, top = inspection.positions.extent
         label = f"positions, x {left:.1f} to {right:.1f} m, y {bottom:.1f} to {top:.1f} m"
         parts += [Text(label), Text(shaded(inspection.positions))]
+    parts.append(Text("check-up", style="bold"))
+    parts += [Text(line) for line in checkup.summary]
+    parts += [Text(str(finding), style=_STYLES[finding.severity]) for finding in checkup.findings]
+    if not checkup.findings:
+        parts.append(Text("no findings"))
     return Group(*parts)
 
 

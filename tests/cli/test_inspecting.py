@@ -1,9 +1,11 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
 import pytest
 from fake_dataset import COLUMNS, write_fake
+from toy_logs import Columns, toy_columns, write_logs
 from typer.testing import CliRunner, Result
 
 from astra_data.cli import app as cli
@@ -22,6 +24,23 @@ def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:
     # Its roles tell positions but no velocities.
     (picture,) = (tmp_path / "plots").iterdir()
     assert matplotlib.image.imread(picture).std() > 0.05
+
+
+def test_findings_are_shown_and_written(tmp_path: Path) -> None:
+    def copied(uid: int, columns: Columns) -> Columns | None:
+        return toy_columns(2) if uid > 20 else None
+
+    logs = tmp_path / "my logs"
+    write_logs(logs, copied)
+    result = call("inspect", str(logs), "--json", str(tmp_path / "found.json"))
+    assert result.exit_code == 0
+    lines = result.output.splitlines()
+    found = json.loads((tmp_path / "found.json").read_text())
+    (finding,) = found["findings"]
+    assert finding["episodes"] == [*range(21, 30)]
+    assert f"astra-data delete '{logs}' --episode 21" in finding["advice"]
+    shown = "warning: " + finding["what"] + " (episodes 21, 22, 23, 24, 25 and 4 more): " + finding["advice"]
+    assert lines[-5:] == ["check-up", *found["summary"], shown, f"written: {tmp_path / 'found.json'}"][-5:]
 
 
 def test_what_does_not_fit_is_told(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from io import StringIO
 
 import numpy as np
@@ -5,6 +6,8 @@ import pytest
 from rich.console import Console
 
 from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
+from astra_data.dataset.checkup.checkup import Checkup
+from astra_data.dataset.checkup.finding import Finding
 from astra_data.dataset.columns import Column
 from astra_data.dataset.endings import Endings
 from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
@@ -31,14 +34,34 @@ def test_shades_follow_the_square_root_of_the_visits() -> None:
     assert shaded(plane([[0, 4, 36, 100], [0, 0, 0, 0]])) == " ░▓█"
 
 
-@pytest.mark.parametrize("success", [None, 1])
-def test_a_page_sums_up_the_dataset(success: int | None) -> None:
+NOTHING = Checkup("fake@data-1.0.0", ("endings: 3 cut", "rate: 20 Hz declared"), ())
+
+
+def test_findings_stand_below_all_else() -> None:
+    findings = (
+        Finding("warning", "a [gap] of 3 s", "begin there", (4, 9)),
+        Finding("note", "constant: x", "check it"),
+    )
+    file = StringIO()
+    checkup = replace(NOTHING, findings=findings)
+    Console(file=file, width=120).print(inspection_page(inspection(success=1), checkup))
+    lines = file.getvalue().splitlines()
+    assert lines[lines.index("█") + 1 :] == [
+        "check-up",
+        "endings: 3 cut",
+        "rate: 20 Hz declared",
+        "warning: a [gap] of 3 s (episodes 4, 9): begin there",
+        "note: constant: x: check it",
+    ]
+
+
+def inspection(success: int | None) -> Inspection:
     column = Column("action", size=2, names=("vx", "vy"), astra={"unit": ["m/s", "m/s"]})
     counts = np.zeros((2, BINS), np.int64)
     spread = Spread(
         column, low=np.array([-1.0, 0.0]), high=np.array([1.0, 0.123456]), mean=np.zeros(2), counts=counts
     )
-    inspection = Inspection(
+    return Inspection(
         reference="fake@data-1.0.0",
         lengths=np.array([600, 1200, 1800]),
         fps=20,
@@ -48,8 +71,12 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
         positions=plane([[1, 0], [0, 0]]),
         velocities=None,
     )
+
+
+@pytest.mark.parametrize("success", [None, 1])
+def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     file = StringIO()
-    Console(file=file, width=120).print(inspection_page(inspection))
+    Console(file=file, width=120).print(inspection_page(inspection(success), NOTHING))
     lines = file.getvalue().splitlines()
     assert lines[0] == "fake@data-1.0.0: 3 episodes, 3,600 steps, 3.0 min"
     assert lines[1].startswith("lengths 600 to 1800, median 1200  ")
@@ -61,3 +88,4 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     assert table[2].split() == ["vy", "m/s", "0", "0", "0.1235"]
     assert table[3] == "positions, x -1.0 to 0.0 m, y 2.0 to 3.0 m"
     assert table[4] == "█"
+    assert table[5:] == ["check-up", "endings: 3 cut", "rate: 20 Hz declared", "no findings"]

@@ -11,6 +11,7 @@ from rich.console import Console
 from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode, Scalar
 from astra_data.dataset.edit import filter_episodes
 from astra_data.dataset.inspection import BINS, Inspection, Map, inspect_dataset, visited
@@ -68,7 +69,7 @@ def test_episodes_are_summed_up(inspection: Inspection) -> None:
 def test_the_page_shows_every_value_within_80_columns(inspection: Inspection) -> None:
     console = Console(width=80, file=StringIO())
     with console.capture() as captured:
-        console.print(inspection_page(inspection))
+        console.print(inspection_page(inspection, Checkup("fake@data-1.0.0", (), ())))
     text = captured.get()
     for words in ("fake@data-1.0.0: 5 episodes, 55 steps", "success 2 of 5", "yaw", "rad", "mode (1) int64"):
         assert words in text

@@ -1,0 +1,84 @@
+"""Check a dataset up in one pass: how episodes end, which commands were given, its rate, and findings."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from astra_data.dataset.checkup.clock import Clock, is_clock
+from astra_data.dataset.checkup.commands import GivenCommands
+from astra_data.dataset.checkup.dead import DeadChannels
+from astra_data.dataset.checkup.duplicates import Duplicates
+from astra_data.dataset.checkup.ends import EpisodeEnds
+from astra_data.dataset.checkup.finding import Finding
+from astra_data.dataset.checkup.jumps import Jumps
+from astra_data.dataset.checkup.outliers import Outliers
+from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, TERMINATED, Episode
+from astra_data.dataset.reader import Dataset
+
+LOOKED_AT = (STATE, ACTION, NEXT_STATE, REWARD, TERMINATED)
+
+
+class _Part(Protocol):
+    """One question that is asked of every episode."""
+
+    def add(self, episode: Episode) -> None:
+        """Take the next episode."""
+
+
+@dataclass(frozen=True)
+class Checkup:
+    """What a check-up found.
+
+    Attributes:
+        reference: name and version of the dataset.
+        summary: a line each on how episodes end, on commands and on the rate.
+        findings: warnings first.
+    """
+
+    reference: str
+    summary: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    def record(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {
+            "dataset": self.reference,
+            "summary": list(self.summary),
+            "findings": [finding.record() for finding in self.findings],
+        }
+
+
+def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
+    """Look at all episodes of `dataset`, one at a time; those with large steps twice.
+
+    Args:
+        dataset: any.
+        called: how commands are to call it, by default its name and version.
+
+    Raises:
+        CorruptDatasetError: a file cannot be read.
+    """
+    called = called or dataset.reference
+    fps, successes = int(dataset.info["fps"]), dataset.successes()
+    columns = {column.name: column for column in dataset.schema}
+    clocks = [Clock(column, fps) for column in columns.values() if is_clock(column)]
+    ends, duplicates = EpisodeEnds(successes), Duplicates()
+    dead = DeadChannels(list(columns.values()))
+    outliers = Outliers(columns.get(STATE), successes)
+    commands = GivenCommands(columns[ACTION], fps) if ACTION in columns else None
+    jumps = Jumps(columns[STATE], int(dataset.lengths.sum())) if STATE in columns else None
+    names = [column.name for column in columns.values() if column.name in LOOKED_AT or is_clock(column)]
+    parts: list[_Part] = [ends, duplicates, dead, outliers, *clocks]
+    parts += [part for part in (commands, jumps) if part is not None]
+    for episode in dataset.episodes(names or list(columns)):
+        for part in parts:
+            part.add(episode)
+    findings = [finding for clock in clocks for finding in clock.findings(called)]
+    findings += jumps.findings(dataset, called) if jumps else []
+    findings += duplicates.findings(called) + dead.findings(called) + outliers.findings(called)
+    findings += (commands.findings() if commands else []) + ends.findings()
+    rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no column of times to compare it with"]
+    summary = [f"endings: {ends}"]
+    summary += [f"commands: {commands}"] if commands else []
+    summary += [f"rate: {rate}" for rate in rates]
+    findings.sort(key=lambda finding: finding.severity != "warning")
+    return Checkup(dataset.reference, tuple(summary), tuple(findings))

@@ -1,0 +1,146 @@
+"""The declared rate against recorded times: gaps, jitter, clocks that stand still."""
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.dataset.checkup.finding import Finding, deletion
+from astra_data.dataset.columns import RESERVED, Column, Episode
+
+GAP = 1.5
+"""A step that takes more than so many periods is a gap."""
+WRONG_RATE = 0.05
+"""Relative difference between the declared and the recorded rate above which the declared one is wrong."""
+JITTERY = 0.2
+"""Periods by which 5 % of the steps are off at least in a jittery recording."""
+MANY_GAPS = 0.01
+"""Share of the steps from which on gaps are many."""
+INNER = 0.95
+"""Share of the steps that the rate and the jitter are of."""
+FINE = 1000
+"""Bins of a period."""
+MOST_PERIODS = 100
+"""Longer steps are counted as so long."""
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+
+
+def is_clock(column: Column) -> bool:
+    """Return whether a column holds times: one number, and a name that ends in time, stamp or timestamp."""
+    named = re.fullmatch(r"(.*[._/])?(time|stamp|timestamp)(_(s|ms|us|ns))?", column.name.lower())
+    return column.size == 1 and column.dtype != "bool" and column.name not in RESERVED and named is not None
+
+
+class Clock:
+    """The times of a dataset in `column` (T,), in its unit, by default s."""
+
+    def __init__(self, column: Column, fps: int) -> None:
+        self._name, self._fps = column.name, fps
+        unit = (column.astra or {}).get("unit", [""])[0] or column.name.rpartition("_")[2]
+        self._scale = _SECONDS.get(unit, 1.0)
+        self._bins: NDArray[np.int64] = np.zeros(FINE * MOST_PERIODS + 1, np.int64)
+        self._longest_s: list[float] = []
+        self._standing: list[int] = []
+        self._standing_steps = 0
+        self._uids: list[int] = []
+
+    def add(self, episode: Episode) -> None:
+        """Count the steps between the times of the next episode."""
+        steps_s = np.diff(episode.columns[self._name].astype(np.float64)) * self._scale
+        goes_on = steps_s[steps_s > 0]
+        bins = np.rint(goes_on * self._fps * FINE).clip(0, FINE * MOST_PERIODS).astype(np.int64)
+        self._bins += np.bincount(bins, minlength=len(self._bins))
+        self._uids.append(episode.uid)
+        self._longest_s.append(float(goes_on.max(initial=0.0)))
+        if len(goes_on) < len(steps_s):
+            self._standing.append(episode.uid)
+            self._standing_steps += len(steps_s) - len(goes_on)
+
+    @property
+    def period_s(self) -> float:
+        """The usual step in s; 0 if time never goes on."""
+        return self._period() / (FINE * self._fps)
+
+    @property
+    def gaps(self) -> int:
+        """Steps that took over `GAP` periods."""
+        return int(self._bins[self._first_gap() :].sum())
+
+    @property
+    def jitter(self) -> float:
+        """Periods by which 5 % of the steps are off at least, gaps aside."""
+        period = self._period()
+        if not period:
+            return 0.0
+        offsets = np.rint(np.abs(np.arange(self._first_gap()) - period)).astype(np.int64)
+        counts = np.bincount(offsets, weights=self._bins[: self._first_gap()])
+        return _quantile(counts.astype(np.int64), INNER) / period
+
+    def __str__(self) -> str:
+        """Compare the rates."""
+        if not self._has_rate:
+            return f"{self._fps} Hz declared; {self._name} does not go on in most steps"
+        return (
+            f"{self._fps} Hz declared, {1 / self.period_s:.4g} Hz by {self._name}; {self.gaps} gaps, jitter "
+            f"{100 * self.jitter:.1f} % of a period"
+        )
+
+    def findings(self, called: str) -> list[Finding]:
+        """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
+        found = []
+        period_s = self.period_s
+        if self._standing:
+            remedy = "store it as seconds since the start (`offset`) or as int64, or leave the episodes out"
+            what = f"{self._name} stands still or goes back between steps"
+            advice = f"{remedy}: {deletion(called, self._standing)}"
+            found.append(Finding("warning", what, advice, tuple(self._standing)))
+        if not self._has_rate:
+            return found
+        if self._period() > FINE * (MOST_PERIODS - 1):
+            what = f"a step takes {MOST_PERIODS} periods or more, by {self._name}"
+            advice = "give its `unit` (s, ms, us or ns) or correct `fps` in the mapping, and import again"
+            return [*found, Finding("warning", what, advice)]
+        if abs(1 / period_s / self._fps - 1) > WRONG_RATE:
+            found.append(
+                Finding(
+                    "warning",
+                    f"{self._name} goes on at {1 / period_s:.4g} Hz, but {self._fps} Hz is declared",
+                    "correct `fps` in the mapping, or resample, and import again",
+                )
+            )
+        if self.gaps:
+            longest = np.array(self._longest_s)
+            uids = np.array(self._uids)[longest * self._fps * FINE >= self._first_gap() - 0.5]
+            split = f"begin new episodes there (`gap_s = {GAP * period_s:.3g}` in the mapping's [split])"
+            # Many gaps are a recording of another rate, of which splits would leave crumbs.
+            advice = (
+                split if self.gaps < MANY_GAPS * self._bins.sum() else f"resample the recording, or {split}"
+            )
+            what = f"{self.gaps} steps took over {GAP:g} periods, the longest {longest.max():.3g} s"
+            found.append(Finding("warning", what, f"{advice} and import again", tuple(uids.tolist())))
+        if self.jitter > JITTERY:
+            off = f"{100 * self.jitter:.0f} %"
+            what = f"5 % of the steps are off by {off} of a period or more, by {self._name}"
+            advice = f"resample the recording to {self._fps} Hz and import again"
+            found.append(Finding("note", what, advice))
+        return found
+
+    @property
+    def _has_rate(self) -> bool:
+        """Whether time goes on in most steps: float32 cannot hold the seconds since 1970, for one."""
+        return bool(self._bins.sum() > self._standing_steps)
+
+    def _period(self) -> float:
+        """The mean over the `INNER` share of steps around the median, in bins: gaps do not move it."""
+        low, high = (_quantile(self._bins, share) for share in ((1 - INNER) / 2, (1 + INNER) / 2))
+        inner = self._bins[low : high + 1]
+        return float(np.arange(low, high + 1) @ inner / inner.sum()) if inner.sum() else 0.0
+
+    def _first_gap(self) -> int:
+        return min(int(GAP * self._period()) + 1, len(self._bins))
+
+
+def _quantile(counts: NDArray[np.int64], share: float) -> int:
+    """Return the first index up to which `share` of the `counts` lie; 0 if there are none."""
+    total = np.cumsum(counts)
+    return int(np.searchsorted(total, share * total[-1])) if total[-1] else 0

@@ -1,0 +1,138 @@
+"""Steps of the state unlike those before and after: the robot localised itself anew, or was carried."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.dataset.checkup.finding import Finding, channels, deletion, labels
+from astra_data.dataset.columns import NEXT_STATE, STATE, Array, Column, Episode
+from astra_data.dataset.reader import Dataset
+
+LARGE = 20.0
+"""Median steps above which a step may be a jump; steps without any movement do not count for the median."""
+ALONE = 10.0
+"""How much larger than each of its neighbours a jump is."""
+NEIGHBOURS = 3
+"""Steps on either side that are compared."""
+LONGEST = 2
+"""Consecutive large steps that are still one jump: there and back, or in two."""
+ROUGH = 0.02
+"""Share of large steps above which a value moves in jerks, such as a joint, and none of them is a jump."""
+RARE = 0.001
+"""Largest share of steps that an advised split cuts."""
+SAMPLES = 2**18
+"""Steps from which the median and the share are estimated; of a dataset with no more, exactly."""
+
+_TURN = {"rad": 2 * np.pi, "deg": 360.0}
+
+Floats = NDArray[np.float64]
+
+
+class Jumps:
+    """The steps of a dataset's states in `column` (T, S), of `steps` in all."""
+
+    def __init__(self, column: Column, steps: int) -> None:
+        self._column = column
+        astra = column.astra or {}
+        units = astra.get("unit", [""] * column.size)
+        roles = astra.get("role", [""] * column.size)
+        # A velocity may change at once, where the robot hits something.
+        self._placed = np.array(
+            ["/s" not in unit and role != "vector" for unit, role in zip(units, roles, strict=True)]
+        )
+        self._turns = np.array(
+            [
+                2 * np.pi if role == "heading" else _TURN.get(unit, 0.0)
+                for unit, role in zip(units, roles, strict=True)
+            ]
+        )
+        self._quaternions = [group for role, group in column.roles if role == "quaternion"]
+        self._every = -(-steps // SAMPLES)
+        self._seen = 0
+        self._samples: list[Floats] = []
+        self._largest: list[Floats] = []
+
+    def add(self, episode: Episode) -> None:
+        """Measure the steps of the next episode."""
+        steps = self.steps(episode.columns)
+        self._samples.append(steps[-self._seen % self._every :: self._every])
+        self._seen += len(steps)
+        self._largest.append(steps.max(axis=0, initial=0.0))
+
+    def steps(self, columns: Mapping[str, Array]) -> Floats:
+        """Return how far each value moves in each step, (T, S) or without next states (T - 1, S)."""
+        state: Floats = columns[STATE].reshape(len(columns[STATE]), -1).astype(np.float64)
+        if NEXT_STATE in columns:
+            following: Floats = columns[NEXT_STATE].reshape(len(state), -1).astype(np.float64)
+        else:
+            state, following = state[:-1], state[1:].copy()
+        for group in self._quaternions:  # q and -q are the same rotation
+            flipped = (state[:, group] * following[:, group]).sum(axis=1) < 0
+            following[flipped, group] *= -1
+        steps = following - state
+        turning = self._turns > 0
+        turns = self._turns[turning]
+        steps[:, turning] -= turns * np.rint(steps[:, turning] / turns)
+        return np.abs(steps)
+
+    def limits(self) -> Floats:
+        """Return for each value (S,) the step above which it may jump; infinite where no jump can be told."""
+        sampled = np.concatenate(self._samples)
+        limits = np.full(self._column.size, np.inf)
+        for index in np.flatnonzero(self._placed):
+            moved = sampled[:, index][sampled[:, index] > 0]
+            if len(moved):
+                limit = LARGE * float(np.median(moved))
+                if (sampled[:, index] > limit).mean() <= ROUGH:
+                    limits[index] = limit
+        return limits
+
+    def findings(self, dataset: Dataset, called: str) -> list[Finding]:
+        """Tell where the state jumps; episodes with large steps are read a second time.
+
+        Raises:
+            CorruptDatasetError: a file cannot be read.
+        """
+        limits = self.limits()
+        suspects = np.flatnonzero((np.array(self._largest) > limits).any(axis=1)).tolist()
+        names = [name for name in (STATE, NEXT_STATE) if name in dataset.features]
+        sizes: dict[int, list[float]] = {}
+        uids, count = [], 0
+        for episode in dataset.episodes(names, suspects) if suspects else ():
+            steps = self.steps(episode.columns)
+            jumped: set[int] = set()
+            for index in np.flatnonzero(steps.max(axis=0, initial=0.0) > limits).tolist():
+                for at in jumps(steps[:, index], limits[index]):
+                    sizes.setdefault(index, []).append(float(steps[at, index]))
+                    jumped.add(at)
+            count += len(jumped)
+            uids += [episode.uid] if jumped else []
+        if not uids:
+            return []
+        where = channels(self._column, sorted(sizes))
+        worst = max(sizes, key=lambda index: max(sizes[index]) / limits[index])
+        # Where large steps are many, a split at the smallest jump would leave no episodes.
+        usual = np.quantile(np.concatenate(self._samples)[:, worst], 1 - RARE)
+        above, most = max(float(usual), 0.9 * min(sizes[worst])), max(sizes[worst])
+        what = (
+            f"{count} single-step jump{'s' if count > 1 else ''} in {where}; the farthest is {most:.3g} in "
+            f"{labels(self._column)[worst]}, whose median step is {limits[worst] / LARGE:.2g}"
+        )
+        advice = (
+            f'begin new episodes there ([split.jump] in the mapping: column = "{STATE}", values = [{worst}], '
+            f"above = {above:.2g}) and import again, or {deletion(called, uids)}"
+        )
+        return [Finding("warning", what, advice, tuple(uids))]
+
+
+def jumps(steps: Floats, limit: float) -> Iterator[int]:
+    """Yield where in `steps` (T,) one, or two in a row, are above `limit` and far above their neighbours."""
+    large = np.flatnonzero(steps > limit)
+    for run in np.split(large, np.flatnonzero(np.diff(large) > 1) + 1):
+        if 0 < len(run) <= LONGEST:
+            first, last = int(run[0]), int(run[-1])
+            before = steps[max(0, first - NEIGHBOURS) : first]
+            beside = np.concatenate([before, steps[last + 1 : last + 1 + NEIGHBOURS]])
+            if len(beside) >= NEIGHBOURS and steps[run].min() > ALONE * beside.max():
+                yield first

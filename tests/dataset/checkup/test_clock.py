@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from astra_data.dataset.checkup.clock import Clock, is_clock
+from astra_data.dataset.columns import Column, Episode
+
+SECONDS = Column("time", astra={"unit": ["s"]})
+
+
+def clock(*steps_s: ArrayLike, fps: int = 10) -> Clock:
+    """Times in ms."""
+    found = Clock(Column("time", "int64", astra={"unit": ["ms"]}), fps)
+    for uid, steps in enumerate(steps_s):
+        times = np.cumsum([0, *np.asarray(steps)]) * 1000
+        found.add(Episode(uid, {"time": np.rint(times).astype(np.int64)}))
+    return found
+
+
+REGULAR = [0.1] * 100
+
+
+@pytest.mark.parametrize(
+    ("column", "is_one"),
+    [
+        (Column("time"), True),
+        (Column("observation.stamp"), True),
+        (Column("header_timestamp_ns", "int64"), True),
+        (Column("lifetime"), False),
+        (Column("time_to_goal"), False),
+        (Column("time", size=2), False),
+        (Column("timestamp"), False),  # the writer's own
+        (Column("time", "bool"), False),
+    ],
+)
+def test_clocks_are_known_by_their_name(column: Column, is_one: bool) -> None:
+    assert is_clock(column) is is_one
+
+
+@pytest.mark.parametrize(
+    ("column", "per_second"),
+    [
+        (Column("time", "int64", astra={"unit": ["ns"]}), 10**9),
+        (Column("time_us", "int64"), 10**6),
+        (Column("time", "int64"), 1),
+    ],
+)
+def test_times_have_units(column: Column, per_second: int) -> None:
+    found = Clock(column, 2)
+    found.add(Episode(0, {column.name: np.arange(50, dtype=np.int64) * per_second}))
+    assert found.period_s == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "found"), [(0.0955, False), (0.1, False), (0.105, False), (0.106, True), (0.095, True)]
+)
+def test_a_rate_that_is_off_by_over_a_twentieth_is_wrong(period_s: float, found: bool) -> None:
+    timed = Clock(SECONDS, 10)
+    timed.add(Episode(0, {"time": (np.arange(100) * period_s).astype(np.float32)}))
+    assert ["is declared" in finding.what for finding in timed.findings("walks")] == [True] * found
+
+
+def test_gaps_do_not_move_the_rate() -> None:
+    timed = clock([*REGULAR, 5.0])
+    assert timed.period_s == pytest.approx(0.1)
+    assert timed.jitter == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("step_s", "found"), [(0.149, False), (0.152, True)])
+def test_a_step_of_over_one_and_a_half_periods_is_a_gap(step_s: float, found: bool) -> None:
+    timed = clock(REGULAR, [*REGULAR, step_s], REGULAR)
+    assert timed.gaps == found
+    findings = timed.findings("walks")
+    assert [finding.episodes for finding in findings] == [(1,)] * found
+
+
+def test_gaps_are_counted_where_the_declared_rate_is_wrong_too() -> None:
+    timed = clock([*REGULAR, 0.3, 0.4], fps=100)
+    assert timed.gaps == 2
+    wrong, gaps = timed.findings("walks")
+    assert "at 10 Hz, but 100 Hz is declared" in wrong.what
+    assert "the longest 0.4 s" in gaps.what
+    assert "gap_s = 0.15" in gaps.advice
+
+
+@pytest.mark.parametrize(("off_s", "found"), [(0.019, False), (0.022, True)])
+def test_steps_that_are_off_by_a_fifth_of_a_period_are_jitter(off_s: float, found: bool) -> None:
+    # Every tenth step is late and the next early: a fifth of all steps.
+    steps = np.tile([0.1 + off_s, 0.1 - off_s, *[0.1] * 8], 20)
+    timed = clock(steps)
+    assert timed.jitter == pytest.approx(10 * off_s, abs=0.01)
+    assert ["resample" in finding.advice for finding in timed.findings("walks")] == [True] * found
+
+
+def test_few_steps_that_are_off_are_no_jitter() -> None:
+    assert clock(np.tile([0.13, 0.07, *[0.1] * 48], 20)).jitter < 0.01
+
+
+@pytest.mark.parametrize(("step_s", "found"), [(0.01, False), (0.0, True), (-0.3, True)])
+def test_time_must_go_on(step_s: float, found: bool) -> None:
+    findings = clock(REGULAR, [*REGULAR, step_s]).findings("walks")
+    assert [finding.episodes for finding in findings] == [(1,)] * found
+
+
+@pytest.mark.parametrize(("still", "told"), [(99, True), (100, False)])
+def test_time_that_stands_in_half_of_the_steps_has_no_rate(still: int, told: bool) -> None:
+    timed = clock([*REGULAR, *[0.0] * still])
+    assert ("Hz by time" in str(timed)) is told
+
+
+def test_time_that_never_goes_on_has_no_rate() -> None:
+    timed = clock([0.0] * 20)
+    assert str(timed) == "10 Hz declared; time does not go on in most steps"
+    (finding,) = timed.findings("walks")
+    assert "int64" in finding.advice
+
+
+def test_seconds_since_1970_in_float32_have_no_rate() -> None:
+    timed = Clock(SECONDS, 10)
+    timed.add(Episode(0, {"time": (1.6e9 + np.arange(5000) / 10).astype(np.float32)}))
+    (finding,) = timed.findings("walks")
+    assert "stands still" in finding.what
+
+
+@pytest.mark.parametrize(("count", "is_many"), [(1, False), (3, True)])
+def test_a_recording_with_many_gaps_is_to_be_resampled(count: int, is_many: bool) -> None:
+    (finding,) = clock(REGULAR * 2 + [0.3] * count).findings("walks")
+    assert finding.advice.startswith("resample") is is_many
+
+
+def test_episodes_of_one_step_have_no_times_between() -> None:
+    timed = clock([], REGULAR)
+    assert not timed.findings("walks")
+
+
+def test_a_step_of_a_hundred_periods_is_another_unit() -> None:
+    timed = clock(np.full(50, 100.0))
+    (finding,) = timed.findings("walks")
+    assert "100 periods or more" in finding.what
+    (slow,) = clock(np.full(50, 9.8)).findings("walks")
+    assert "at 0.102 Hz" in slow.what

@@ -1,0 +1,143 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_logs import Columns, write_logs
+
+from astra_data.dataset.checkup import jumps as module
+from astra_data.dataset.checkup.jumps import Jumps, jumps
+from astra_data.dataset.columns import NEXT_STATE, STATE, Array, Column, Episode
+
+
+def steps(*large: float, usual: float = 0.1) -> Array:
+    """Ten usual steps, those given, ten usual ones."""
+    return np.array([usual] * 10 + list(large) + [usual] * 10)
+
+
+@pytest.mark.parametrize(
+    ("large", "found"),
+    [
+        ([5.0], [10]),
+        ([2.0], []),  # not above the limit
+        ([2.01], [10]),
+        ([5.0, 5.0], [10]),  # there and back
+        ([5.0, 5.0, 5.0], []),  # a robot that moves
+        ([0.49, 5.0], [11]),
+        ([0.51, 5.0], []),  # a neighbour has a tenth of it
+        ([5.0, 0.51], []),
+        ([5.0, 0.1, 0.51], []),
+        ([5.0, 0.1, 0.1, 0.51], []),
+        ([5.0, 0.1, 0.1, 0.1, 0.51], [10]),  # four steps away
+        ([5.0] + [0.1] * 6 + [6.0], [10, 17]),
+        ([5.0] + [0.1] * 2 + [6.0], []),
+    ],
+)
+def test_a_jump_is_far_above_its_neighbours(large: list[float], found: list[int]) -> None:
+    assert list(jumps(steps(*large), 2.0)) == found
+
+
+@pytest.mark.parametrize(("before", "found"), [(2, []), (3, [3])])
+def test_a_jump_has_three_neighbours(before: int, found: list[int]) -> None:
+    assert list(jumps(np.array([0.1] * before + [5.0]), 2.0)) == found
+
+
+def column(unit: str = "", role: str = "") -> Column:
+    astra = {key: [word] for key, word in (("unit", unit), ("role", role)) if word}
+    return Column(STATE, astra=astra or None)
+
+
+def limits(values: Array, spec: Column) -> float:
+    found = Jumps(spec, len(values))
+    found.add(Episode(0, {STATE: values.astype(np.float32)}))
+    return float(found.limits()[0])
+
+
+WALK = np.cumsum(np.full(1000, 0.5))
+
+
+def test_a_large_step_is_twenty_median_ones_of_those_that_move() -> None:
+    assert limits(WALK, column()) == pytest.approx(10.0)
+    assert limits(WALK.repeat(5), column()) == pytest.approx(10.0)
+    assert limits(np.zeros(100), column()) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("unit", "role", "told"),
+    [
+        ("m", "", True),
+        ("", "invariant", True),
+        ("m/s", "", False),
+        ("rad/s", "", False),
+        ("", "vector", False),
+    ],
+)
+def test_velocities_do_not_jump(unit: str, role: str, told: bool) -> None:
+    if role == "vector":
+        spec = Column(STATE, size=2, astra={"role": ["vector"] * 2})
+        values = np.column_stack([WALK, WALK])
+    else:
+        spec, values = column(unit, role), WALK
+    assert np.isfinite(limits(values, spec)) == told
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.019, True), (0.021, False)])
+def test_a_value_that_moves_in_jerks_does_not_jump(share: float, told: bool) -> None:
+    moved = np.full(10_000, 0.5)
+    moved[: round(share * 10_000)] = 50.0
+    assert np.isfinite(limits(np.concatenate([[0], np.cumsum(moved)]), column())) == told
+
+
+@pytest.mark.parametrize(
+    ("spec", "turn"),
+    [(column("rad"), 2 * np.pi), (column("deg"), 360.0), (column(role="heading"), 2 * np.pi)],
+)
+def test_an_angle_that_wraps_does_not_jump(spec: Column, turn: float) -> None:
+    values = (np.arange(500) * turn / 64) % turn
+    found = Jumps(spec, 499)
+    np.testing.assert_allclose(found.steps({STATE: values}), turn / 64)
+    np.testing.assert_allclose(Jumps(column("m"), 499).steps({STATE: values}).max(), turn * 63 / 64)
+
+
+def test_a_quaternion_of_the_other_sign_is_the_same_rotation() -> None:
+    spec = Column(STATE, size=4, astra={"role": ["quaternion"] * 4})
+    angles = np.linspace(0, 3, 50)
+    values = np.column_stack([np.cos(angles / 2), np.zeros(50), np.zeros(50), np.sin(angles / 2)])
+    flipped = values.copy()
+    flipped[25:] *= -1
+    found = Jumps(spec, 49)
+    np.testing.assert_allclose(found.steps({STATE: flipped}), found.steps({STATE: values}))
+
+
+def test_next_states_give_the_last_step_too() -> None:
+    values = np.array([0.0, 1.0, 3.0])
+    found = Jumps(column(), 3)
+    assert found.steps({STATE: values})[:, 0].tolist() == [1, 2]
+    assert found.steps({STATE: values, NEXT_STATE: np.array([1.0, 3.0, 7.0])})[:, 0].tolist() == [1, 2, 4]
+
+
+def test_of_many_steps_every_other_is_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SAMPLES", 10)
+    found = Jumps(column(), 25)
+    values = np.arange(25.0) ** 2
+    for first, last in ((0, 4), (4, 12), (12, 25)):
+        part = {STATE: values[first:last], NEXT_STATE: (np.arange(first, last) + 1.0) ** 2}
+        found.add(Episode(0, {name: each.astype(np.float32) for name, each in part.items()}))
+    sampled = np.concatenate(found._samples)[:, 0]
+    assert sampled.tolist() == [2 * index + 1 for index in range(0, 25, 3)]
+
+
+def test_jumps_are_found_in_the_episodes_that_have_them(tmp_path: Path) -> None:
+    def carried(uid: int, columns: Columns) -> None:
+        for at, far in {3: [(20, 1.0), (60, 2.0)], 8: [(50, 0.7)]}.get(uid, []):
+            columns[STATE][at:, 1] += far
+            columns[NEXT_STATE][at - 1 :, 1] += far
+
+    dataset = write_logs(tmp_path / "logs", carried)
+    (spec,) = dataset.specs([STATE])
+    found = Jumps(spec, int(dataset.lengths.sum()))
+    for episode in dataset.episodes([STATE, NEXT_STATE]):
+        found.add(episode)
+    (finding,) = found.findings(dataset, "walks")
+    assert finding.episodes == (3, 8)
+    assert finding.what.startswith("3 single-step jumps in y of observation.state; the farthest is 1.98 in y")
+    assert 'column = "observation.state", values = [1], above = 0.6' in finding.advice
