@@ -64,7 +64,7 @@ class EpisodeEnds:
         return [
             Finding(
                 "note",
-                f"{len(failures)} episodes fail, of which a failure model would learn little",
+                f"{len(failures)} failure{'s' if len(failures) > 1 else ''}, little for a failure model to learn from",
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
                 "ground without failure_members",
                 tuple(failures),

@@ -112,7 +112,7 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (rewarded, "note", (8,), "8 by return 59", "delete walks --episode 8"),
     (far, "note", (1,), "1 by y of observation.state, which reaches -4", "delete walks --episode 1"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
-    (failing, "note", tuple(range(9)), "9 episodes fail", "--behavior stress"),
+    (failing, "note", tuple(range(9)), "9 failures, little", "--behavior stress"),
 ]
 
 
