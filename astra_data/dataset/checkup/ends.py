@@ -61,10 +61,11 @@ class EpisodeEnds:
         failures = self.failures
         if not 0 < len(failures) < FEW_FAILURES:
             return []
+        count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"
         return [
             Finding(
                 "note",
-                f"{len(failures)} failure{'s' if len(failures) > 1 else ''}, little for a failure model to learn from",
+                f"{count}, little for a failure model to learn from",
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
                 "ground without failure_members",
                 tuple(failures),
