@@ -105,6 +105,18 @@ def test_without_abstract_states_the_position_is_the_path(tmp_path: Path) -> Non
     assert f"/episode_3/{ACTION}/v" in found
 
 
+def test_a_place_is_known_by_its_role_too(tmp_path: Path) -> None:
+    roles = {"role": ["heading", "position", "position"]}
+    columns = [Column(STATE, size=3, names=("yaw", "east", "north"), astra=roles)]
+    description = {"name": "field", "stage": "x"}
+    values = np.arange(12, dtype=np.float32).reshape(4, 3)
+    with DatasetWriter(tmp_path / "field", columns, fps=5, task="x", description=description) as writer:
+        writer.add(Episode(0, {STATE: values}))
+    view(Dataset.open(tmp_path / "field"), save=tmp_path / "field.rrd")
+    (line,) = read(tmp_path / "field.rrd")["/episode_0/target/path"]["LineStrips3D:strips"].to_pylist()[0]
+    assert line == [[1, 2, 0], [4, 5, 0], [7, 8, 0], [10, 11, 0]]
+
+
 def test_without_places_there_are_values_alone(tmp_path: Path) -> None:
     columns = [Column(STATE, size=2, names=("x", "height")), Column(ACTION)]
     description = {"name": "rail", "stage": "x"}

@@ -48,8 +48,8 @@ class EpisodeEnds:
         timed = others & (lengths == limit) & ((lengths == limit).sum() > 1)
         failed, unknown = len(self.failures), int((terminated & ~known).sum()) - len(self.failures)
         counts = (
-            (int(known.sum()), "success"),
-            (failed, "failure"),
+            (int(known.sum()), "in success"),
+            (failed, "in failure"),
             (unknown, "terminated, success unknown"),
             (int(timed.sum()), f"after {limit} steps, the longest (a time limit)"),
             (int((others & ~timed).sum()), "cut"),
