@@ -71,7 +71,7 @@ def test_most_episodes_must_move(others: int, found: bool) -> None:
     states = [moving(uid) for uid in range(5)]
     states[3] = held(states[3], 0, 30)
     for uid in range(others):
-        states[uid] = held(states[uid], 5, 15) if uid else states[uid] * np.float32([1, 1e-6, 1])
+        states[uid] = held(states[uid], 5, 15) if uid else states[uid] * np.array([1, 1e-6, 1], np.float32)
     assert bool(findings(states)) is found
 
 
