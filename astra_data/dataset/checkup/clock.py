@@ -111,7 +111,8 @@ class Clock:
         if self.gaps:
             longest = np.array(self._longest_s)
             uids = np.array(self._uids)[longest * self._fps * FINE >= self._first_gap() - 0.5]
-            split = f"begin new episodes there (`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the mapping)"
+            keys = f"`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the mapping"
+            split = f"begin new episodes there ({keys})"
             # Many gaps are a recording of another rate, of which splits would leave crumbs.
             advice = (
                 split if self.gaps < MANY_GAPS * self._bins.sum() else f"resample the recording, or {split}"
