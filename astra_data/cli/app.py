@@ -26,6 +26,7 @@ from astra_data.cli import (
     starting,
     sweeping,
     tasks,
+    viewing,
 )
 from astra_data.core.disk import disk_error
 from astra_data.core.durable import NO_FSYNC
@@ -93,6 +94,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "filter": editing.filter_,
         "list": inspecting.list_,
         "inspect": inspecting.inspect,
+        "view": viewing.view,
         "validate": checking.validate,
         "repair": checking.repair,
         "log": comparing.log,

@@ -81,7 +81,7 @@ class Clock:
         if not self._has_rate:
             return f"{self._fps} Hz declared; {self._name} does not go on in most steps"
         return (
-            f"{self._fps} Hz declared, {1 / self.period_s:.4g} Hz by {self._name}; {self.gaps} gaps, jitter "
+            f"{self._fps} Hz declared, {1 / self.period_s:.4g} Hz by {self._name}; gaps: {self.gaps}, jitter "
             f"{100 * self.jitter:.1f} % of a period"
         )
 
@@ -111,12 +111,13 @@ class Clock:
         if self.gaps:
             longest = np.array(self._longest_s)
             uids = np.array(self._uids)[longest * self._fps * FINE >= self._first_gap() - 0.5]
-            split = f"begin new episodes there (`gap_s = {GAP * period_s:.3g}` in the mapping's [split])"
+            keys = f"`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the mapping"
+            split = f"begin new episodes there ({keys})"
             # Many gaps are a recording of another rate, of which splits would leave crumbs.
             advice = (
                 split if self.gaps < MANY_GAPS * self._bins.sum() else f"resample the recording, or {split}"
             )
-            what = f"{self.gaps} steps took over {GAP:g} periods, the longest {longest.max():.3g} s"
+            what = f"steps of over {GAP:g} periods: {self.gaps}, the longest {longest.max():.3g} s"
             found.append(Finding("warning", what, f"{advice} and import again", tuple(uids.tolist())))
         if self.jitter > JITTERY:
             off = f"{100 * self.jitter:.0f} %"

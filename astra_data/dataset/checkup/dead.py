@@ -8,8 +8,12 @@ from astra_data.dataset.columns import ACTION, STATE, Array, Column, Episode
 
 STUCK = 0.5
 """Share of an episode without any change above which a value is stuck, if others move in as many steps."""
+MOST = 0.5
+"""Share of the episodes above which they are most."""
+SMALLEST_SPAN = 0.01
+"""Share of its whole range that a value moves through in most episodes: noise of a simulator is no motion."""
 MOVING = 0.1
-"""Largest share in the median episode: what often rests, such as a ball, is not stuck where it does."""
+"""Longest rest in most episodes: what often rests, such as a ball, is not stuck where it does."""
 FEWEST_STEPS = 10
 """Shorter episodes tell nothing of it."""
 
@@ -22,6 +26,7 @@ class DeadChannels:
         self._first: dict[str, Array] = {}
         self._changed = {column.name: np.zeros(column.size, bool) for column in self._columns}
         self._rests: list[NDArray[np.float64]] = []
+        self._extremes: list[NDArray[np.float64]] = []
         self._others_move: list[bool] = []
         self._uids: list[int] = []
 
@@ -34,6 +39,7 @@ class DeadChannels:
             if column.name == STATE and len(values) >= FEWEST_STEPS:
                 changes = values[1:] != values[:-1]
                 self._rests.append(longest_rests(changes) / len(changes))
+                self._extremes.append(np.array([values.min(axis=0), values.max(axis=0)], np.float64))
                 self._others_move.append(bool(changes.any(axis=1).mean() > STUCK))
                 self._uids.append(episode.uid)
 
@@ -57,8 +63,11 @@ class DeadChannels:
         return found
 
     def _stuck(self, column: Column, called: str) -> list[Finding]:
-        rests = np.array(self._rests)
-        stuck = (rests > STUCK) & np.array(self._others_move)[:, None] & (np.median(rests, axis=0) < MOVING)
+        rests, extremes = np.array(self._rests), np.array(self._extremes)
+        lows, highs = extremes[:, 0], extremes[:, 1]
+        spans, whole = highs - lows, highs.max(axis=0) - lows.min(axis=0)
+        moves = np.mean((rests < MOVING) & (spans > SMALLEST_SPAN * whole), axis=0) > MOST
+        stuck = (rests > STUCK) & np.array(self._others_move)[:, None] & moves
         indices = np.flatnonzero(stuck.any(axis=0)).tolist()
         uids = np.array(self._uids)[stuck.any(axis=1)].tolist()
         if not indices:

@@ -48,8 +48,8 @@ class EpisodeEnds:
         timed = others & (lengths == limit) & ((lengths == limit).sum() > 1)
         failed, unknown = len(self.failures), int((terminated & ~known).sum()) - len(self.failures)
         counts = (
-            (int(known.sum()), "success"),
-            (failed, "failure"),
+            (int(known.sum()), "in success"),
+            (failed, "in failure"),
             (unknown, "terminated, success unknown"),
             (int(timed.sum()), f"after {limit} steps, the longest (a time limit)"),
             (int((others & ~timed).sum()), "cut"),
@@ -61,10 +61,11 @@ class EpisodeEnds:
         failures = self.failures
         if not 0 < len(failures) < FEW_FAILURES:
             return []
+        count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"
         return [
             Finding(
                 "note",
-                f"{len(failures)} episodes fail, of which a failure model would learn little",
+                f"{count}, little for a failure model to learn from",
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
                 "ground without failure_members",
                 tuple(failures),

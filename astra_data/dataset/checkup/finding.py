@@ -54,6 +54,8 @@ def labels(column: Column) -> list[str]:
     """Return a name for each value of `column`."""
     if column.names:
         return list(column.names)
+    if column.size == 1:
+        return [column.name]
     return [str(index) for index in range(column.size)]
 
 

@@ -19,6 +19,8 @@ LONGEST = 2
 """Consecutive large steps that are still one jump: there and back, or in two."""
 ROUGH = 0.02
 """Share of large steps above which a value moves in jerks, such as a joint, and none of them is a jump."""
+PLACES = ("", "1", "m", "cm", "mm", "km", "rad", "deg")
+"""Units of what cannot jump; "" where it is unknown."""
 RARE = 0.001
 """Largest share of steps that an advised split cuts."""
 SAMPLES = 2**18
@@ -37,9 +39,9 @@ class Jumps:
         astra = column.astra or {}
         units = astra.get("unit", [""] * column.size)
         roles = astra.get("role", [""] * column.size)
-        # A velocity may change at once, where the robot hits something.
+        # A velocity may change at once, where the robot hits something, and so may a force or a timer.
         self._placed = np.array(
-            ["/s" not in unit and role != "vector" for unit, role in zip(units, roles, strict=True)]
+            [unit in PLACES and role != "vector" for unit, role in zip(units, roles, strict=True)]
         )
         self._turns = np.array(
             [

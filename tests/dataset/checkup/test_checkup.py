@@ -19,7 +19,7 @@ def test_good_logs_have_no_findings(tmp_path: Path) -> None:
         (
             "endings: 30 after 100 steps, the longest (a time limit)",
             "commands: held 0.5 s (median), 0.5 s (95 %); steps at the edge of the range: v 0.7 %, w 0.7 %",
-            "rate: 20 Hz declared, 20 Hz by time; 0 gaps, jitter 0.0 % of a period",
+            "rate: 20 Hz declared, 20 Hz by time; gaps: 0, jitter 0.0 % of a period",
         ),
         (),
     )
@@ -100,7 +100,7 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
         "1 single-step jump in x of observation.state; the farthest is 1",
         "[split.jump]",
     ),
-    (missed, "warning", (3, 4), "2 steps took over 1.5 periods, the longest 0.15 s", "gap_s = 0.075"),
+    (missed, "warning", (3, 4), "steps of over 1.5 periods: 2, the longest 0.15 s", "gap_s = 0.075"),
     (slow, "warning", (), "time goes on at 10 Hz, but 20 Hz is declared", "correct `fps`"),
     (jittery, "note", (), "5 % of the steps are off by 24 %", "resample the recording to 20 Hz"),
     (standing, "warning", (9,), "time stands still or goes back", "delete walks --episode 9"),
@@ -112,7 +112,7 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (rewarded, "note", (8,), "8 by return 59", "delete walks --episode 8"),
     (far, "note", (1,), "1 by y of observation.state, which reaches -4", "delete walks --episode 1"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
-    (failing, "note", tuple(range(9)), "9 episodes fail", "--behavior stress"),
+    (failing, "note", tuple(range(9)), "9 failures, little", "--behavior stress"),
 ]
 
 

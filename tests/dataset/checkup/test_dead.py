@@ -65,6 +65,27 @@ def test_what_often_rests_is_not_stuck(rests: int, found: bool) -> None:
     assert bool(findings(states)) is found
 
 
+@pytest.mark.parametrize(("others", "found"), [(1, True), (2, False)])
+def test_most_episodes_must_move(others: int, found: bool) -> None:
+    # A puck rests once it was pushed, and before it trembles by the simulator's noise.
+    states = [moving(uid) for uid in range(5)]
+    states[3] = held(states[3], 0, 30)
+    for uid in range(others):
+        states[uid] = held(states[uid], 5, 15) if uid else states[uid] * np.array([1, 1e-6, 1], np.float32)
+    assert bool(findings(states)) is found
+
+
+@pytest.mark.parametrize(("far", "found"), [(90.0, True), (110.0, False)])
+def test_what_hardly_moves_in_most_episodes_is_not_stuck(far: float, found: bool) -> None:
+    # In an episode y spans 1, in one it is also elsewhere.
+    states = [moving(uid) for uid in range(5)]
+    for uid, state in enumerate(states):
+        state[:, 1] = np.linspace(0, 1, 41)
+        state[0, 1] += far * (uid == 4)
+    states[3] = held(states[3], 0, 30)
+    assert bool(findings(states)) is found
+
+
 @pytest.mark.parametrize(("last", "found"), [(19, True), (20, False)])
 def test_a_robot_that_rests_as_a_whole_is_not_stuck(last: int, found: bool) -> None:
     states = [moving(uid) for uid in range(5)]

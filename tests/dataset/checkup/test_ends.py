@@ -30,7 +30,7 @@ def test_every_way_to_end_is_counted() -> None:
     ]
     outcomes = counted(ends, [True, False, False, None, False, None])
     assert str(outcomes) == (
-        "1 success, 1 failure, 1 terminated, success unknown, "
+        "1 in success, 1 in failure, 1 terminated, success unknown, "
         "2 after 50 steps, the longest (a time limit), 1 cut"
     )
     assert outcomes.failures == [1]
@@ -38,7 +38,7 @@ def test_every_way_to_end_is_counted() -> None:
 
 def test_a_success_at_the_time_limit_is_a_success() -> None:
     assert str(counted([(50, False), (50, False)], [True, False])) == (
-        "1 success, 1 after 50 steps, the longest (a time limit)"
+        "1 in success, 1 after 50 steps, the longest (a time limit)"
     )
 
 

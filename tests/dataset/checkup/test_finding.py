@@ -24,6 +24,7 @@ def test_five_episodes_are_named_and_the_others_counted() -> None:
 def test_values_have_names() -> None:
     pose = Column("pose", size=2, names=("x", "y"))
     assert labels(pose) == ["x", "y"]
+    assert labels(Column("charge")) == ["charge"]
     assert channels(pose, [1]) == "y of pose"
     assert channels(Column("pose", size=3), [0, 2]) == "0, 2 of pose"
     assert channels(Column("charge"), [0]) == "charge"

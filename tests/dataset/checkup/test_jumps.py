@@ -68,10 +68,13 @@ def test_a_large_step_is_twenty_median_ones_of_those_that_move() -> None:
         ("", "invariant", True),
         ("m/s", "", False),
         ("rad/s", "", False),
+        ("s", "", False),
+        ("1", "", True),
+        ("deg", "", True),
         ("", "vector", False),
     ],
 )
-def test_velocities_do_not_jump(unit: str, role: str, told: bool) -> None:
+def test_only_places_and_angles_jump(unit: str, role: str, told: bool) -> None:
     if role == "vector":
         spec = Column(STATE, size=2, astra={"role": ["vector"] * 2})
         values = np.column_stack([WALK, WALK])

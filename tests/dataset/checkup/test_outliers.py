@@ -80,6 +80,12 @@ def test_a_state_is_far_beyond_twice_the_range_of_the_others(reach: float, is_fa
     ] == ([True] * is_far)
 
 
+# Reaching 0, 1, ..., 39 and one more deviates by 10 in the median: 8 robust deviations from 20 are 138.6.
+@pytest.mark.parametrize(("reach", "is_far"), [(138.0, False), (139.0, True)])
+def test_a_state_that_varies_is_measured_by_its_deviation(reach: float, is_far: bool) -> None:
+    assert bool(found([50] * 41, reach=[*map(float, range(40)), reach])) is is_far
+
+
 def test_a_state_that_others_vary_in_far_more_than_in_each_is_none() -> None:
     # Robots that go to many places.
     assert not found([50] * 41, reach=[float(index**2) for index in range(41)])
