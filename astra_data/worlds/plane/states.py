@@ -85,11 +85,16 @@ class PlanarStates:
         """Slide the discs from `before` towards `landed`, both (B, X); all else is that of `landed`.
 
         A wall that stopped the step itself still counts as touched: otherwise policies lean on walls that the
-        correction draws them away from.
+        correction draws them away from. Who is kept clear of one stands there: otherwise policies lean on a
+        wall with the velocity of progress, and are paid for it.
         """
         position, stopped = self._settles_in.slide(before[:, :2], landed[:, :2])
         self.blocked = self.blocked | stopped
-        self.reset_to(torch.cat([position, landed[:, 2:]], dim=-1))
+        velocity = landed[:, 2:4]
+        if self._settles_in is not self.free:
+            moved = (position - before[:, :2]) / self.period_s
+            velocity = torch.where(position == landed[:, :2], velocity, moved)
+        self.reset_to(torch.cat([position, velocity, landed[:, 4:]], dim=-1))
         return self.state
 
 

@@ -59,6 +59,26 @@ def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() 
     assert not stopped.any()
 
 
+def test_who_is_kept_clear_of_a_wall_stands_there() -> None:
+    """Across the wall the velocity is what is left of the motion; along it, and without a wall, as it was."""
+    states = planar(3, 5)
+    start = HERE.clone()
+    start[:, 1] = 5.45
+    landed = start.clone()
+    landed[:, 2:4] = torch.tensor([0.3, 0.9])
+    landed[:, 0] += 0.02
+    landed[:2, 1] += 0.2
+    states.keep_clear(0.5)
+    settled = states.settle(start, landed)
+    period_s = states.parameters["timestep_s"]
+    torch.testing.assert_close(settled[:2, 3], torch.full((2,), 0.05 / period_s), atol=0.05, rtol=0)
+    torch.testing.assert_close(settled[:, 2], torch.full((3,), 0.3))
+    torch.testing.assert_close(settled[2, 3], torch.tensor(0.9))
+    free = planar(3, 5)
+    landed[:, 1] += 1.0
+    torch.testing.assert_close(free.settle(start, landed)[:, 2:4], landed[:, 2:4])
+
+
 def test_nobody_comes_closer_than_the_disc_itself_does() -> None:
     states = planar(3, 5)
     states.keep_clear(0.0)
