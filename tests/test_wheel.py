@@ -21,11 +21,11 @@ fields = ["vx", "vy"]
 """
 
 
-def told(*words: str | Path, folder: Path) -> str:
+def output_of(*words: str | Path, folder: Path) -> str:
     """Run a command without this checkout on any path; return what it prints."""
-    shown = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run(
-        [str(word) for word in words], cwd=folder, env=shown, capture_output=True, text=True, check=False
+        [str(word) for word in words], cwd=folder, env=outside, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -37,23 +37,23 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if UV is None:
         pytest.skip("uv builds and installs the wheel, and is not on the path")
     made = tmp_path_factory.mktemp("wheel")
-    told(UV, "build", "--wheel", "--python", sys.executable, "--out-dir", made, ROOT, folder=made)
+    output_of(UV, "build", "--wheel", "--python", sys.executable, "--out-dir", made, ROOT, folder=made)
     lowest = ["--resolution", "lowest-direct", "--python", sys.executable]
-    told(UV, "pip", "compile", *lowest, ROOT / "pyproject.toml", "-o", made / "lowest.txt", folder=made)
-    told(UV, "venv", "--python", sys.executable, made / "venv", folder=made)
+    output_of(UV, "pip", "compile", *lowest, ROOT / "pyproject.toml", "-o", made / "lowest.txt", folder=made)
+    output_of(UV, "venv", "--python", sys.executable, made / "venv", folder=made)
     python = made / "venv" / "bin" / "python"
     wheel = next(made.glob("*.whl"))
-    told(UV, "pip", "install", "--python", python, "-r", made / "lowest.txt", folder=made)
-    told(UV, "pip", "install", "--python", python, "--no-deps", wheel, folder=made)
+    output_of(UV, "pip", "install", "--python", python, "-r", made / "lowest.txt", folder=made)
+    output_of(UV, "pip", "install", "--python", python, "--no-deps", wheel, folder=made)
     return python.parent
 
 
 def test_commands_answer_and_recipes_are_in_it(installed: Path, tmp_path: Path) -> None:
     program = installed / "astra-data"
-    assert "collect" in told(program, "--help", folder=tmp_path)
-    assert "--mapping" in told(program, "import", "--help", folder=tmp_path)
-    assert "quickstart" in told(program, "recipes", "list", folder=tmp_path)
-    told(program, "recipes", "copy", "quickstart", folder=tmp_path)
+    assert "collect" in output_of(program, "--help", folder=tmp_path)
+    assert "--mapping" in output_of(program, "import", "--help", folder=tmp_path)
+    assert "quickstart" in output_of(program, "recipes", "list", folder=tmp_path)
+    output_of(program, "recipes", "copy", "quickstart", folder=tmp_path)
     copied = tmp_path / "recipes"
     for name in ("quickstart.toml", "examples/cart/cart.py"):
         assert (copied / name).read_bytes() == (ROOT / "recipes" / name).read_bytes()
@@ -64,8 +64,8 @@ def test_logs_become_a_dataset(installed: Path, tmp_path: Path) -> None:
     rows = "".join(f"{step / 10},1.0,2.0,0.5\n" for step in range(40))
     (tmp_path / "walk.csv").write_text("x,y,vx,vy\n" + rows)
     (tmp_path / "walks.toml").write_text(MAPPING)
-    told(program, "import", "walk.csv", "--mapping", "walks.toml", folder=tmp_path)
-    assert "1 episodes" in told(program, "validate", "walks", folder=tmp_path)
-    told(program, "inspect", "walks", folder=tmp_path)
+    output_of(program, "import", "walk.csv", "--mapping", "walks.toml", folder=tmp_path)
+    assert "1 episodes" in output_of(program, "validate", "walks", folder=tmp_path)
+    output_of(program, "inspect", "walks", folder=tmp_path)
     read = "from astra_data import Dataset; print(Dataset.open('datasets/walks/data-1.0.0').lengths)"
-    assert told(installed / "python", "-c", read, folder=tmp_path).strip() == "[39]"
+    assert output_of(installed / "python", "-c", read, folder=tmp_path).strip() == "[39]"

@@ -20,21 +20,21 @@ def main(
     version: Annotated[str, typer.Argument(help="Such as 0.2.0, as in the changelog's heading.")],
 ) -> None:
     """Make release `version` of this checkout."""
-    if _told("git", "status", "--porcelain"):
+    if _output("git", "status", "--porcelain"):
         raise typer.BadParameter("there are uncommitted changes: commit or stash them first")
     texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in FILES}
     for name, text in released(texts, version, datetime.now(UTC).date()).items():
         (ROOT / name).write_text(text, encoding="utf-8")
     try:
-        _told("uv", "lock")
+        _output("uv", "lock")
         subprocess.run([ROOT / ".ci" / "run"], cwd=ROOT, check=True)
-        _told("uv", "build", "--clear")
+        _output("uv", "build", "--clear")
         _try_wheel(next((ROOT / "dist").glob("*.whl")))
     except BaseException:
-        _told("git", "checkout", "--", ".")
+        _output("git", "checkout", "--", ".")
         raise
-    _told("git", "commit", "--all", "--message", f"Release {version}")
-    _told("git", "tag", "--annotate", f"v{version}", "--message", f"Release {version}")
+    _output("git", "commit", "--all", "--message", f"Release {version}")
+    _output("git", "tag", "--annotate", f"v{version}", "--message", f"Release {version}")
     print(f"released {version} here; to the world: git push --follow-tags && uv publish")
 
 
@@ -68,7 +68,7 @@ def _try_wheel(wheel: Path) -> None:
         subprocess.run([*program, "run", "recipes/quickstart.toml"], cwd=folder, check=True)
 
 
-def _told(*words: str) -> str:
+def _output(*words: str) -> str:
     return subprocess.run(words, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 

@@ -29,7 +29,7 @@ class Endings:
 
     def add(self, columns: Mapping[str, Array]) -> None:
         """Count an episode with these columns, of which `NEEDED` are looked at."""
-        ended = TERMINATED in columns and bool(columns[TERMINATED][-1])
+        ended = is_terminated(columns)
         self.terminated += ended
         self.cut_off += not ended
         if STATE in columns and NEXT_STATE in columns:
@@ -55,6 +55,11 @@ def endings_of(dataset: Dataset) -> Endings:
     for episode in dataset.episodes([name for name in NEEDED if name in dataset.features]):
         found.add(episode.columns)
     return found
+
+
+def is_terminated(columns: Mapping[str, Array]) -> bool:
+    """Return whether an episode with these columns is known to end in success or failure."""
+    return TERMINATED in columns and bool(columns[TERMINATED][-1])
 
 
 def stands_still(state: Array, next_state: Array) -> bool:

@@ -20,7 +20,7 @@ from astra_data.dataset.columns import (
     Column,
     Scalar,
 )
-from astra_data.dataset.endings import Endings
+from astra_data.dataset.endings import Endings, is_terminated
 from astra_data.exchange.conversion import Converter, Mask
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block
@@ -128,7 +128,7 @@ class Cutter:
             return
         episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
         self._pieces = []
-        ended_before, self._ended = self._ended, TERMINATED in episode and bool(episode[TERMINATED][-1])
+        ended_before, self._ended = self._ended, is_terminated(episode)
         if ended_before and self._ended and len(episode[TERMINATED]) == 1 and NEXT_STATE not in episode:
             self.tally.rows_after_end += 1
             return
@@ -148,7 +148,7 @@ class Cutter:
     def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
         """Add the state of the next row to each row, and drop the last or let it stand still."""
         state = episode[STATE]
-        terminated = TERMINATED in episode and bool(episode[TERMINATED][-1])
+        terminated = is_terminated(episode)
         if terminated and self._mapping.terminal == "stand_still":
             return episode | {NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
         self.tally.last_rows += 1

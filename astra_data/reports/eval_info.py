@@ -1,5 +1,6 @@
 """Results in the form of `lerobot-eval`'s eval_info.json, for tools that read those."""
 
+from statistics import fmean
 from typing import Any
 
 from astra_data.reports.schema import Results
@@ -24,7 +25,7 @@ def eval_info(results: Results) -> dict[str, Any]:
             for seed, share, total, steps in zip(row.seeds, row.success, row.returns, row.steps, strict=True)
         ],
         "per_group": {
-            name: _counted(row.success, results.episodes) | {"avg_sum_reward": _mean(row.returns)}
+            name: _counted(row.success, results.episodes) | {"avg_sum_reward": fmean(row.returns)}
             for name, row in results.methods.items()
         },
         "provenance": {
@@ -48,7 +49,3 @@ def _counted(shares: list[float], episodes: int) -> dict[str, Any]:
         "pc_success": 100 * successes / count,
         "pc_success_ci95": [100 * end for end in share_interval(successes, count)],
     }
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)

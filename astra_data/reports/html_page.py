@@ -12,7 +12,7 @@ from astra_data.reports.cost_and_origin import COSTED, dataset_lines, provenance
 from astra_data.reports.files import Found
 from astra_data.reports.formatting import fill_html, inline
 from astra_data.reports.losses import loss_head, losses, remaining_errors, seed_lines
-from astra_data.reports.page import correlation_text, encoder_lines, gap_tables, score_table
+from astra_data.reports.page import correlation_text, encoder_lines, gap_tables, horizon_titles, score_table
 from astra_data.reports.schema import Origin, Results
 from astra_data.reports.sizes import SizesResults, size_head, size_lines
 from astra_data.reports.tested import warning, where
@@ -75,7 +75,7 @@ def render_html(found: Found, images: Mapping[str, bytes], foresight: Sequence[S
         comparisons=_comparisons(results),
         errors=_errors(results),
         gaps=gap_tables(results),
-        horizons=_horizons(results),
+        horizons=horizon_titles(results),
         validity=[
             [name, f"{of.policies}", correlation_text(of.pearson), correlation_text(of.spearman)]
             for name, of in results.predictive_validity.items()
@@ -132,11 +132,6 @@ def _errors(results: Results) -> dict[str, Any] | None:
         return None
     horizon, groundings, lines = remaining_errors(results)
     return {"horizon": horizon, "head": ["quantity", *map(method_title, groundings)], "lines": lines}
-
-
-def _horizons(results: Results) -> list[str]:
-    first = next(iter(results.gaps().values()), None)
-    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in first.horizons] if first else []
 
 
 def _sizes(found: SizesResults) -> dict[str, Any]:

@@ -59,7 +59,6 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         seeds += " (rows have as many of them as the table says)"
     stages = [made for made in results.origins if made.machine and made.stages != ["report"]]
     reference = reference_of(rows)
-    first = next(iter(results.gaps().values()), None)
     return fill(
         "recipe.md.jinja",
         results=results,
@@ -73,9 +72,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         scores=score_table(results),
         has_plus=any(map(is_plus, rows)),
         encoders=encoder_lines(results),
-        horizons=[f"{horizon} step{'s' if horizon > 1 else ''}" for horizon in first.horizons]
-        if first
-        else [],
+        horizons=horizon_titles(results),
         gaps=gap_tables(results),
         correlation=correlation_text,
         grounding=f"{method_title(reference)}'s, of the same seed" if reference else "each row's own",
@@ -140,6 +137,12 @@ def encoder_lines(results: Results) -> list[list[str]]:
         for encoder, values in row.encoders.items()
         if len(row.encoders) > 1
     ]
+
+
+def horizon_titles(results: Results) -> list[str]:
+    """Return the head of the tables of `gap_tables` behind their first column."""
+    first = next(iter(results.gaps().values()), None)
+    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in first.horizons] if first else []
 
 
 def gap_tables(results: Results) -> dict[str, list[list[str]]]:

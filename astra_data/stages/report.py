@@ -66,13 +66,13 @@ def report(
     add_to: Path | None = None,
     config: ReportConfig = DEFAULTS,
 ) -> None:
-    """Write results.json, results.md, results.html and the figures to `root`/report.
+    """Write results.json, .md and .html, the figures and eval_info.json to `root`/report.
 
     Args:
         recipe: names the task, the rows and the seeds.
         root: the recipe's folder of runs.
         command: the command line to print as the results' origin.
-        publish: a folder for copies named after the recipe, of all but results.html, or None.
+        publish: a folder for copies of results.json, .md and the figures, named after the recipe; or None.
         progress: called with the share done and a note.
         add_to: a file of published results to merge with those at `root`, or None.
         config: settings.

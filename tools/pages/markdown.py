@@ -3,13 +3,14 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from astra_data.reports import formatting
+
 _CODE = re.compile(r"(`[^`]*`)")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table; line breaks within cells become spaces."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(map(_cell, line))} |\n" for line in lines)
+    return formatting.table(head, (map(_cell, row) for row in rows), words=len(head)) + "\n"
 
 
 def _cell(text: str) -> str:

@@ -74,9 +74,7 @@ class GivenCommands:
         return [
             Finding(
                 "note",
-                f"commands at the edge of their range in up to {worst:.0%} of steps, {names}".replace(
-                    "%", " %"
-                ),
+                f"commands at the edge of their range in up to {100 * worst:.0f} % of steps, {names}",
                 "what lies between is seen less often: compare the range with what the robot obeys (`clip` "
                 "of a mapping), or record gentler commands",
             )

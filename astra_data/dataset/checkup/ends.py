@@ -6,6 +6,7 @@ import numpy as np
 
 from astra_data.dataset.checkup.finding import Finding
 from astra_data.dataset.columns import TERMINATED, Episode
+from astra_data.dataset.endings import is_terminated
 
 FEW_FAILURES = 10
 """Fewer failures are little for a failure model (docs/failures.md)."""
@@ -25,7 +26,7 @@ class EpisodeEnds:
     def add(self, episode: Episode) -> None:
         """Count the next episode."""
         self._marked |= TERMINATED in episode.columns
-        self._terminated.append(TERMINATED in episode.columns and bool(episode.columns[TERMINATED][-1]))
+        self._terminated.append(is_terminated(episode.columns))
         self._lengths.append(len(episode))
         self._uids.append(episode.uid)
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.dataset.checkup.finding import SHOWN, Finding, channels, deletion
-from astra_data.dataset.columns import REWARD, STATE, TERMINATED, Column, Episode
+from astra_data.dataset.columns import REWARD, STATE, Column, Episode
+from astra_data.dataset.endings import is_terminated
 
 OUTLYING = 8.0
 """Robust standard deviations from the median over episodes above which one is an outlier."""
@@ -37,7 +38,7 @@ class Outliers:
         """Measure the next episode."""
         columns = episode.columns
         success = self._successes is not None and self._successes[len(self._uids)] is True
-        self._ends.append((success, TERMINATED in columns and bool(columns[TERMINATED][-1])))
+        self._ends.append((success, is_terminated(columns)))
         self._uids.append(episode.uid)
         self._lengths.append(len(episode))
         if REWARD in columns:
