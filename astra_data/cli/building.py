@@ -31,6 +31,10 @@ Behavior = Annotated[
     typer.Option(help="random, stress, policy, suboptimal_ppo or suboptimal_sac.", show_default="random"),
 ]
 Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
+LeastSteps = Annotated[
+    int | None,
+    typer.Option(help="Only as many episodes as have these steps together.", show_default="all episodes"),
+]
 MaxSteps = Annotated[int | None, typer.Option(help="Longest episode, in steps.", show_default="500")]
 Start = Annotated[
     str | None, typer.Option(help="Where episodes start: anywhere or task.", show_default="anywhere")
@@ -73,6 +77,7 @@ def collect(
     root: Root = RUNS,
     behavior: Behavior = None,
     episodes: Episodes = None,
+    least_steps: LeastSteps = None,
     max_steps: MaxSteps = None,
     start: Start = None,
     hold_s: Hold = None,
@@ -89,6 +94,7 @@ def collect(
     settings = {
         "behavior": behavior,
         "episodes": episodes,
+        "least_steps": least_steps,
         "max_steps": max_steps,
         "start": start,
         "hold_s": hold_s,

@@ -41,7 +41,7 @@ class StagedWriter:
     the episodes stay staged, and a writer with `resume` continues with them.
 
     Attributes:
-        staged: metadata of the staged episodes, by their position in the dataset.
+        staged: metadata of the staged episodes, by their position in the dataset. lengths: their steps.
         made, policy: as in `DatasetWriter`.
         folder: the folder of the staged episodes, and of what else the recording needs to resume.
 
@@ -89,6 +89,7 @@ class StagedWriter:
         self.made: dict[str, Any] = {}
         self.policy: Path | None = None
         self.staged: dict[int, Mapping[str, Scalar]] = {}
+        self.lengths: dict[int, int] = {}
         self.folder = root.with_name(f".{root.name}.staged")
         self._columns = list(columns)
         self._schema = layout.data_schema(columns)
@@ -128,7 +129,8 @@ class StagedWriter:
                 self._refuse_root()
             self._agree_on_the_plan()
             for path in sorted(self.folder.glob("*.arrow")):
-                self.staged[int(path.stem)] = self._restore(path).metadata
+                episode = self._restore(path)
+                self.staged[int(path.stem)], self.lengths[int(path.stem)] = episode.metadata, len(episode)
             self._exit = stack.pop_all()
         self._is_open = True
         return self
@@ -194,7 +196,17 @@ class StagedWriter:
             sync(partial)
             move(partial, path)
         self._admission.admit(episode)
-        self.staged[place] = episode.metadata
+        self.staged[place], self.lengths[place] = episode.metadata, len(episode)
+
+    def drop(self, position: int) -> None:
+        """Leave out the staged episode at `position`; its uid stays taken.
+
+        Raises:
+            DiskError: it cannot be removed.
+        """
+        with writing(self._path(position)):
+            self._path(position).unlink()
+        del self.staged[position], self.lengths[position]
 
     def _holds_work(self) -> bool:
         """Return whether there is anything to resume beside the plan."""

@@ -48,7 +48,10 @@ class CollectConfig(Config):
     reversed, to see failures. "policy": a saved policy; "suboptimal_ppo" and "suboptimal_sac": one trained in
     the target and stopped early. Policies draw actions as in training."""
     episodes: Count = 200
-    """Episodes in all."""
+    """Episodes in all; with `least_steps` at most."""
+    least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
+    """Only as many episodes as have these steps together, so that datasets of different behaviours are of one
+    size."""
     max_steps: Count = 500
     """Longest episode, in control steps; longer ones are truncated."""
     num_envs: AtOnce = 200
@@ -155,6 +158,8 @@ def collect(
         steps = 0
         for first in range(0, config.episodes, config.num_envs):
             rows = range(first, min(first + config.num_envs, config.episodes))
+            if config.least_steps and _steps_before(first, writer) >= config.least_steps:
+                break
             if writer.staged.keys() >= set(rows):
                 continue
             batch_seed = derive(seed, f"episodes from {first}") if first else seed
@@ -177,6 +182,8 @@ def collect(
                 seed=seed,
                 progress=batch,
             )
+        if config.least_steps:
+            _keep(config.least_steps, writer)
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
         metadata |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
@@ -187,8 +194,27 @@ def collect(
             "machine": machine(),
         }
     note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
-    progress(1.0, f"{config.episodes} episodes, {note}, {rate:,.0f} target steps/s")
+    progress(1.0, f"{len(returns)} episodes, {note}, {rate:,.0f} target steps/s")
     return folder
+
+
+def _steps_before(position: int, writer: StagedWriter) -> int:
+    return sum(steps for staged, steps in writer.lengths.items() if staged < position)
+
+
+def _keep(least_steps: int, writer: StagedWriter) -> None:
+    """Keep the first episodes that have `least_steps` together."""
+    kept = _steps_before(len(writer.staged), writer)
+    if kept < least_steps:
+        raise BadInputError(
+            f"least_steps: expected {least_steps}, got {kept} in {len(writer.staged)} episodes: "
+            f"take more episodes, and delete {writer.folder}"
+        )
+    for position in reversed(sorted(writer.staged)):
+        kept -= writer.lengths[position]
+        if kept < least_steps:
+            break
+        writer.drop(position)
 
 
 def _behavior(

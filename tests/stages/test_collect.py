@@ -3,6 +3,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.doctor.check import check
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.training import suboptimal
+from astra_data.training.recording import record
 from astra_data.worlds.registry import TASKS
 
 TINY = CollectConfig(episodes=3, max_steps=15)
@@ -176,6 +178,61 @@ def test_a_part_of_a_policys_episodes_may_have_random_commands(task: str, tmp_pa
         same, other = ("random", "policy") if index % 2 else ("policy", "random")
         np.testing.assert_array_equal(command, first[same][index])
         assert (command != first[other][index]).all()
+
+
+def test_only_as_many_episodes_are_kept_as_have_the_steps(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = TINY.model_copy(update={"episodes": 6, "num_envs": 2})
+    collect(task, every, seed=0, out=tmp_path / "all", progress=silent)
+    whole = Dataset.open(tmp_path / "all")
+    lengths = [len(episode) for episode in whole.episodes([ACTION])]
+    steps = sum(lengths[:2]) + 1  # the third episode is needed, the fourth of its batch is not
+    some = CollectConfig(**every.model_dump() | {"least_steps": steps})
+    batches: list[range] = []
+
+    def counted(*args: Any, **keywords: Any) -> int:  # noqa: ANN401 - handed on as they are
+        batches.append(args[3])
+        return record(*args, **keywords)
+
+    monkeypatch.setattr("astra_data.stages.collect.record", counted)
+    collect(task, some, seed=0, out=tmp_path / "some", progress=silent)
+    kept = Dataset.open(tmp_path / "some")
+    assert batches == [range(2), range(2, 4)]
+    assert [len(episode) for episode in kept.episodes([ACTION])] == lengths[:3]
+    for one, other in zip(whole.episodes([ACTION]), kept.episodes([ACTION]), strict=False):
+        np.testing.assert_array_equal(one.columns[ACTION], other.columns[ACTION])
+    assert kept.description["config"]["least_steps"] == steps
+    assert "least_steps" not in whole.description["config"]
+    exactly = some.model_copy(update={"least_steps": sum(lengths[:2])})
+    collect(task, exactly, seed=0, out=tmp_path / "exactly", progress=silent)
+    assert len(Dataset.open(tmp_path / "exactly")) == 2
+
+
+def test_an_episode_that_an_interruption_cut_off_counts_before_later_ones(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TINY.model_copy(update={"episodes": 4, "num_envs": 2, "least_steps": 15})
+    add = StagedWriter.add
+
+    def failing(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        if position == 1:
+            add(writer, episode, position)
+            raise KeyboardInterrupt  # while episode 0 still goes on
+
+    monkeypatch.setattr(StagedWriter, "add", failing)
+    with pytest.raises(KeyboardInterrupt):
+        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    monkeypatch.setattr(StagedWriter, "add", add)
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    assert Dataset.open(tmp_path / "out").uids.tolist() == [0]
+
+
+def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"episodes": 2, "max_steps": 5, "least_steps": 11})
+    with pytest.raises(BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: take more"):
+        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "out").exists()
 
 
 class Stopped(Exception):  # noqa: N818 - stands for a kill
