@@ -25,6 +25,7 @@ from astra_data.experiments.recipe import Recipe
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
 SCHEMA: dict[str, Any] = Recipe.model_json_schema()
 TABLES = [name for name in SCHEMA["properties"] if name not in {"plus", "own_methods"}]
@@ -119,6 +120,22 @@ def test_every_page_is_in_the_navigation_and_shows_what_github_shows(site: Path,
     markdown = MarkdownIt("commonmark").enable("table").render((ROOT / f"docs/{name}.md").read_text())
     shown, expected = page(site / place / "index.html").tags, Page(markdown).tags
     assert {tag: shown[tag] for tag in COUNTED} == {tag: expected[tag] for tag in COUNTED}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
+def test_notebooks_are_pages_with_what_they_printed_and_drew(site: Path, path: Path) -> None:
+    navigation = (site / "404.html").read_text()
+    assert f'href="/notebooks/{path.stem}/"' in navigation
+    found = page(site / f"notebooks/{path.stem}/index.html")
+    code = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+    printed = [output for cell in code for output in cell["outputs"]]
+    pictures = [output["data"]["image/png"] for output in printed if "image/png" in output.get("data", {})]
+    assert found.pictures == {f"data:image/png;base64,{picture}" for picture in pictures}
+    assert found.tags["pre"] == len(code) + len(printed) - len(pictures)
+    text = " ".join(unescape(re.sub(r"<[^>]+>", "", found.text)).split())
+    for output in printed:
+        assert " ".join("".join(output.get("text", [])).split()) in text
+    assert (site / f"notebooks/{path.name}").read_bytes() == path.read_bytes()
 
 
 def test_pictures_of_a_page_are_in_the_site(site: Path) -> None:
