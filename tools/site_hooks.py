@@ -35,6 +35,17 @@ class RepositoryFile(File):
         """Tell whether this becomes a page."""
         return Path(self.src_uri).suffix not in PICTURES
 
+    @property
+    def edit_uri(self) -> str | None:
+        """The path to edit it at; None for what is in no file."""
+        return None if self.src_uri in GENERATED or (ROOT / self.src_uri).is_dir() else self.src_uri
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """Let pages lead to where they are edited, from the repository's root, if its address is known."""
+    if config.repo_url:
+        config.edit_uri = "edit/main/"
+
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Rename the pages of `docs/`, and add the reference and all that pages link to."""
