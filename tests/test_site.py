@@ -17,6 +17,9 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from markdown_it import MarkdownIt
+from mkdocs.config import load_config
+from mkdocs.structure.files import get_files
+from mkdocs.structure.pages import Page as SitePage
 from typer.testing import CliRunner
 
 import astra_data
@@ -25,6 +28,7 @@ from astra_data.experiments.recipe import Recipe
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
 SCHEMA: dict[str, Any] = Recipe.model_json_schema()
 TABLES = [name for name in SCHEMA["properties"] if name not in {"plus", "own_methods"}]
@@ -119,6 +123,22 @@ def test_every_page_is_in_the_navigation_and_shows_what_github_shows(site: Path,
     markdown = MarkdownIt("commonmark").enable("table").render((ROOT / f"docs/{name}.md").read_text())
     shown, expected = page(site / place / "index.html").tags, Page(markdown).tags
     assert {tag: shown[tag] for tag in COUNTED} == {tag: expected[tag] for tag in COUNTED}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
+def test_notebooks_are_pages_with_what_they_printed_and_drew(site: Path, path: Path) -> None:
+    navigation = (site / "404.html").read_text()
+    assert f'href="/notebooks/{path.stem}/"' in navigation
+    found = page(site / f"notebooks/{path.stem}/index.html")
+    code = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+    printed = [output for cell in code for output in cell["outputs"]]
+    pictures = [output["data"]["image/png"] for output in printed if "image/png" in output.get("data", {})]
+    assert found.pictures == {f"data:image/png;base64,{picture}" for picture in pictures}
+    assert found.tags["pre"] == len(code) + len(printed) - len(pictures)
+    text = " ".join(unescape(re.sub(r"<[^>]+>", "", found.text)).split())
+    for output in printed:
+        assert " ".join("".join(output.get("text", [])).split()) in text
+    assert (site / f"notebooks/{path.name}").read_bytes() == path.read_bytes()
 
 
 def test_pictures_of_a_page_are_in_the_site(site: Path) -> None:
@@ -226,6 +246,27 @@ def test_every_public_name_is_in_the_reference_with_its_docstring(site: Path) ->
         public = getattr(astra_data, name)
         about = (inspect.getdoc(public) or "").partition("\n")[0].replace("`", "")
         assert isinstance(public, dict) or about in text
+
+
+def test_pages_have_no_links_to_edit_them_until_an_address_is_set(site: Path) -> None:
+    assert 'rel="edit"' not in (site / "cart/index.html").read_text()
+    edited = {
+        "docs/cart.md": "edit/main/docs/cart.md",
+        "docs/notebooks/csv_to_card.ipynb": "edit/main/docs/notebooks/csv_to_card.ipynb",
+        "CONTRIBUTING.md": "edit/main/CONTRIBUTING.md",
+        "docs/reference/python.md": None,
+        "recipes/examples/cart": None,
+    }
+    address = "https://github.com/somebody/astra-data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NO_MKDOCS_2_WARNING", "1")
+        config = load_config(str(ROOT / "mkdocs.yml"), repo_url=address)
+        config = config.plugins.on_config(config)
+        files = config.plugins.on_files(get_files(config), config=config)
+    for name, place in edited.items():
+        file = files.get_file_from_path(name)
+        assert file is not None, name
+        assert SitePage(None, file, config).edit_url == (place and f"{address}/{place}")
 
 
 def test_the_glossary_has_the_words_of_the_house() -> None:

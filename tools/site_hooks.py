@@ -2,7 +2,8 @@
 
 In the site each page is known by its path from the repository's root, so that links which work on GitHub,
 such as `../recipes/results/x.png` or `../SECURITY.md`, lead to the same files here. Pages of `docs/` have
-addresses without that folder; everything else lies under `repository/`.
+addresses without that folder; everything else lies under `repository/`. Notebooks become pages, with what
+their cells printed and drew when they were last run.
 """
 
 from pathlib import Path
@@ -11,6 +12,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from pages.command_line import command_line
 from pages.links import linked
+from pages.notebooks import notebook_page
 from pages.python_names import python_names
 from pages.recipe_keys import recipe_keys
 from pages.sources import listing, shown
@@ -32,6 +34,17 @@ class RepositoryFile(File):
     def is_documentation_page(self) -> bool:
         """Tell whether this becomes a page."""
         return Path(self.src_uri).suffix not in PICTURES
+
+    @property
+    def edit_uri(self) -> str | None:
+        """The path to edit it at; None for what is in no file."""
+        return None if self.src_uri in GENERATED or (ROOT / self.src_uri).is_dir() else self.src_uri
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """Let pages lead to where they are edited, from the repository's root, if its address is known."""
+    if config.repo_url:
+        config.edit_uri = "edit/main/"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -62,6 +75,8 @@ def _content(name: str) -> str | bytes:
     path = ROOT / name
     if path.is_dir():
         return listing(path)
+    if path.suffix == ".ipynb":
+        return notebook_page(path)
     if path.suffix in PICTURES:
         return path.read_bytes()
     return path.read_text() if path.suffix == ".md" else shown(path)
@@ -71,6 +86,6 @@ def _file(name: str, content: str | bytes, config: MkDocsConfig) -> File:
     file = RepositoryFile.generated(config, name, content=content)
     place = name.removeprefix(DOCS) if name.startswith(DOCS) else f"repository/{name}"
     if file.is_documentation_page():
-        place = f"{place.removesuffix('.md')}/index.html"
+        place = f"{place.removesuffix('.md').removesuffix('.ipynb')}/index.html"
     file.dest_uri = "index.html" if place == "index/index.html" else place
     return file

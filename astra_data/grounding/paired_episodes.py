@@ -53,6 +53,7 @@ class PairedEpisodes:
         dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
         commands: the bounds of the commands, where these are not ±1 in their own units.
         has_rewards: whether rewards were recorded; otherwise they are 0 here.
+        uids: of the episodes, (E,) int64; None if they are from no dataset.
     """
 
     target_state: Tensor
@@ -65,6 +66,7 @@ class PairedEpisodes:
     dropped_place: tuple[int, ...] = ()
     commands: Commands | None = None
     has_rewards: bool = True
+    uids: Tensor | None = None
 
     @property
     def named(self) -> dict[str, str]:
@@ -88,9 +90,12 @@ class PairedEpisodes:
         names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
         columns = dataset.columns(names)
         lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
+        uids = dataset.uids
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
-            held_out, lengths = held_out[lengths > 0] if len(held_out) else held_out, lengths[lengths > 0]
+            left = lengths > 0
+            held_out = held_out[left] if len(held_out) else held_out
+            uids, lengths = uids[left], lengths[left]
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
@@ -127,6 +132,7 @@ class PairedEpisodes:
             dropped_place=_dropped_place(dataset),
             commands=commands,
             has_rewards=REWARD in padded,
+            uids=torch.tensor(uids, device=device),
         )
 
     def check(self, commands: Commands) -> None:
@@ -159,6 +165,7 @@ class PairedEpisodes:
             terminated=self.terminated[episodes],
             windows=_gather(self.windows, episodes),
             held_out=None if self.held_out is None else self.held_out[episodes],
+            uids=None if self.uids is None else self.uids[episodes],
         )
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:

@@ -16,6 +16,6 @@ page          Results → Markdown
 sizes         Results at each dataset size, and their page
 cost_and_origin   text on cost and origin
 formatting    numbers, tables and templates of the pages
-rerun_view    episodes of a dataset in Rerun
+rerun_view    episodes of a dataset in Rerun, with replays
 files         results, page and figures → a folder
 """

@@ -1,6 +1,7 @@
 """Episodes of a dataset in Rerun (https://rerun.io): paths, commands and rewards over steps and seconds."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +28,42 @@ _TARGET, _SIMULATOR = (31, 119, 180), (255, 127, 14)
 _RADIUS_PIXELS = 3.0
 
 
-def view(dataset: Dataset, uids: Sequence[int] = (), *, save: Path | None = None) -> None:
+@dataclass(frozen=True)
+class ReplayedEpisode:
+    """An episode of T steps that was replayed open loop in a simulator.
+
+    Attributes:
+        simulator: its name. color: of its path, red, green and blue up to 255.
+        state: φ(s_0), and where each step ended, (T + 1, X).
+        measures: further values of each step, (T,), by name.
+    """
+
+    simulator: str
+    color: tuple[int, int, int]
+    state: Array
+    measures: Mapping[str, Array]
+
+
+def view(
+    dataset: Dataset,
+    uids: Sequence[int] = (),
+    *,
+    save: Path | None = None,
+    replays: Mapping[int, Sequence[ReplayedEpisode]] | None = None,
+) -> None:
     """Show episodes of `dataset` in Rerun's viewer, or write them to a recording, which is made in memory.
 
     Of each episode there are, below `episode_<uid>/`: `target`, the path of φ(s) on the plane, or of the
     state in a dataset without abstract states; `simulator`, where the raw simulator lands from each of these
     states, in a paired dataset; and every value of the abstract states, the simulator's next states, the
     commands and the reward. They stand at their `step`, and at their `time` in s; next states at the step
-    after.
+    after. Below `open_loop/<simulator>` are the path, values and measures of each of its `replays`.
 
     Args:
         dataset: any.
         uids: of the episodes, by default all.
         save: the recording, an `.rrd` file, in place of the viewer.
+        replays: of episodes, by their uids.
 
     Raises:
         BadInputError: Rerun is not installed, its viewer does not open, or there is no such episode.
@@ -48,23 +72,32 @@ def view(dataset: Dataset, uids: Sequence[int] = (), *, save: Path | None = None
     """
     rerun = optional("rerun", "view")
     known = {int(uid): index for index, uid in enumerate(dataset.uids)}
-    unknown = [str(uid) for uid in uids if uid not in known]
-    if unknown:
-        raise BadInputError(
-            f"{dataset.reference} has no episode {', '.join(unknown)}; its {len(known)} uids lie between "
-            f"{min(known)} and {max(known)}"
-        )
+    check_episodes(dataset, uids)
     chosen = sorted({known[uid] for uid in uids}) if uids else None
     stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
     if save is None:
         _open_viewer(stream)
-        _send(rerun, stream, dataset, chosen)
+        _send(rerun, stream, dataset, chosen, replays or {})
         stream.flush()
         return
     # Rerun writes its own files in a thread that does not say why a disk refused them.
     recorded = stream.binary_stream()
-    _send(rerun, stream, dataset, chosen)
+    _send(rerun, stream, dataset, chosen, replays or {})
     write_file(save, recorded.read())
+
+
+def check_episodes(dataset: Dataset, uids: Sequence[int]) -> None:
+    """Check that `dataset` has the episodes `uids`.
+
+    Raises:
+        BadInputError: it lacks some.
+    """
+    known = set(dataset.uids.tolist())
+    if unknown := [str(uid) for uid in uids if uid not in known]:
+        raise BadInputError(
+            f"{dataset.reference} has no episode {', '.join(unknown)}; its {len(known)} uids lie between "
+            f"{min(known)} and {max(known)}"
+        )
 
 
 def _open_viewer(stream: Any) -> None:  # noqa: ANN401
@@ -78,7 +111,13 @@ def _open_viewer(stream: Any) -> None:  # noqa: ANN401
         ) from error
 
 
-def _send(rerun: Any, stream: Any, dataset: Dataset, chosen: list[int] | None) -> None:  # noqa: ANN401
+def _send(
+    rerun: Any,  # noqa: ANN401
+    stream: Any,  # noqa: ANN401
+    dataset: Dataset,
+    chosen: list[int] | None,
+    replays: Mapping[int, Sequence[ReplayedEpisode]],
+) -> None:
     """Send the episodes of indices `chosen`, one at a time."""
     fps = int(dataset.info["fps"])
     stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -88,19 +127,45 @@ def _send(rerun: Any, stream: Any, dataset: Dataset, chosen: list[int] | None) -
     for episode in dataset.episodes(names or list(schema), chosen):
         root = f"episode_{episode.uid}"
         for path, points, after, color in _paths(schema, episode):
-            entity = f"{root}/{path}"
-            style = {"colors": color, "radii": -_RADIUS_PIXELS}  # negative: in pixels
-            stream.log(f"{entity}/path", rerun.LineStrips3D([points], colors=color), static=True)
-            stream.log(entity, rerun.Points3D.from_fields(**style), static=True)
-            times = _times(rerun, len(points), after, fps)
-            stream.send_columns(entity, times, rerun.Points3D.columns(positions=points))
+            _send_path(rerun, stream, f"{root}/{path}", points, _times(rerun, len(points), after, fps), color)
         for name in shown:
             if name in episode.columns:
                 times = _times(rerun, len(episode), name == ABSTRACT_SIMULATED_NEXT_STATE, fps)
                 table = episode.columns[name].reshape(len(episode), -1)
                 for label, values in zip(_labels(schema[name]), table.T, strict=True):
-                    scalars = rerun.Scalars.columns(scalars=values.astype(np.float64))
-                    stream.send_columns(f"{root}/{label}", times, scalars)
+                    _send_values(rerun, stream, f"{root}/{label}", values, times)
+        for replay in replays.get(episode.uid, ()):
+            entity = f"{root}/open_loop/{replay.simulator}"
+            times = _times(rerun, len(replay.state), False, fps)
+            plane = _plane(schema[ABSTRACT_STATE])
+            if plane is not None:
+                points = _lifted(replay.state[:, plane])
+                _send_path(rerun, stream, entity, points, times, replay.color)
+            for label, values in zip(_labels(schema[ABSTRACT_STATE]), replay.state.T, strict=True):
+                _send_values(rerun, stream, f"{entity}/{label}", values, times)
+            for label, values in replay.measures.items():
+                _send_values(
+                    rerun, stream, f"{entity}/{label}", values, _times(rerun, len(values), False, fps)
+                )
+
+
+def _send_path(
+    rerun: Any,  # noqa: ANN401
+    stream: Any,  # noqa: ANN401
+    entity: str,
+    points: Array,
+    times: list[Any],
+    color: tuple[int, int, int],
+) -> None:
+    """Send points (n, 3) at `times`, and the line through them."""
+    style = {"colors": color, "radii": -_RADIUS_PIXELS}  # negative: in pixels
+    stream.log(f"{entity}/path", rerun.LineStrips3D([points], colors=color), static=True)
+    stream.log(entity, rerun.Points3D.from_fields(**style), static=True)
+    stream.send_columns(entity, times, rerun.Points3D.columns(positions=points))
+
+
+def _send_values(rerun: Any, stream: Any, entity: str, values: Array, times: list[Any]) -> None:  # noqa: ANN401
+    stream.send_columns(entity, times, rerun.Scalars.columns(scalars=values.astype(np.float64)))
 
 
 def _paths(

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rerun.experimental import RrdReader
+from recordings_of_rerun import points, read, scalars
 from toy_logs import COLUMNS, FPS, toy_columns, write_logs
 from typer.testing import CliRunner
 
@@ -41,24 +41,6 @@ def paired(root: Path) -> Dataset:
             columns |= dict(zip(names, [*turned, turned[1] + np.float32(0.25)], strict=True))
             writer.add(Episode(uid, columns))
     return Dataset.open(root)
-
-
-def read(path: Path) -> dict[str, dict[str, Any]]:
-    """Return what a recording holds: entity to component, "step" and "time" (in ns) to its rows."""
-    found: dict[str, dict[str, Any]] = {}
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        for name, column in zip(batch.schema.names, batch.columns, strict=True):
-            found.setdefault(str(chunk.entity_path), {})[name] = column
-    return found
-
-
-def points(table: dict[str, Any]) -> np.ndarray[Any, Any]:
-    return np.array(table["Points3D:positions"].to_pylist())[:, 0]
-
-
-def scalars(table: dict[str, Any]) -> np.ndarray[Any, Any]:
-    return np.array(table["Scalars:scalars"].to_pylist())[:, 0]
 
 
 def test_a_recording_holds_paths_commands_and_rewards_of_the_chosen_episode(tmp_path: Path) -> None:

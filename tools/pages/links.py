@@ -5,6 +5,8 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from pages.notebooks import notebook_text
+
 _FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)")
 
@@ -32,8 +34,9 @@ def linked(root: Path, pages: Iterable[str]) -> list[str]:
         found[name] = None
         if path.is_dir():
             waiting += [f"{name}/{file.relative_to(path).as_posix()}" for file in files_of(path)]
-        elif path.suffix == ".md":
-            waiting += [os.path.normpath(Path(name).parent / link) for link in links(path.read_text())]
+        elif path.suffix in {".md", ".ipynb"}:
+            text = path.read_text() if path.suffix == ".md" else notebook_text(path)
+            waiting += [os.path.normpath(Path(name).parent / link) for link in links(text)]
     return list(found)
 
 

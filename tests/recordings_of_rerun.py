@@ -1,0 +1,25 @@
+"""What recordings of Rerun hold."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rerun.experimental import RrdReader
+
+
+def read(path: Path) -> dict[str, dict[str, Any]]:
+    """Return what a recording holds: entity to component, "step" and "time" (in ns) to its rows."""
+    found: dict[str, dict[str, Any]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        for name, column in zip(batch.schema.names, batch.columns, strict=True):
+            found.setdefault(str(chunk.entity_path), {})[name] = column
+    return found
+
+
+def points(table: dict[str, Any]) -> np.ndarray[Any, Any]:
+    return np.array(table["Points3D:positions"].to_pylist())[:, 0]
+
+
+def scalars(table: dict[str, Any]) -> np.ndarray[Any, Any]:
+    return np.array(table["Scalars:scalars"].to_pylist())[:, 0]
