@@ -75,6 +75,7 @@ def trained(run: Path, row: str, seed: int, changes: dict[str, Any], policy: int
     torch.set_num_threads(1)
     recorded, table = settings_of(run), "plus" if is_plus(row) else "train"
     changed = recorded | {"methods": [row], "seeds": [seed], table: recorded.get(table, {}) | changes}
+    changed.pop("select", None)  # one row of one seed leaves nothing to choose from
     items = plan(validated(changed, Recipe, f"{run}"), Path(f"{run}.toml"), run)
     call: Any = next(item.call for item in items if item.key == f"train/{row}/seed_{seed}")
     given, learn = call.keywords, method_named(row).learn
