@@ -45,7 +45,7 @@ class Committee:
         task: the task.
         models: that correct.
         failures: the failure models, which say how probably a rollout has ended; may be none.
-        covariance: of the target's scatter around the corrections, (X, X).
+        covariance: of the target's scatter around the corrections, (X, X) float64.
         clearance_m: how close to walls corrections may end; None for as close as the simulator itself.
     """
 
@@ -71,7 +71,8 @@ class Committee:
                 "expected corrections that can disagree, got a single one: give `[ground]` members = 4, or "
                 "the recipe a second seed, and run it until ground again"
             )
-        factors = torch.stack([made.model.residual_factor for made in known])
+        # In float64 the product keeps its tiny eigenvalues, which the factor of the scatter has.
+        factors = torch.stack([made.model.residual_factor for made in known]).double()
         kept = [made.clearance_m for made in known if made.clearance_m is not None]
         return cls(
             task,
@@ -136,11 +137,11 @@ class Committee:
         distribution: ½ log |I + Σ⁻¹ C|, with C the covariance of the predictions and Σ that of the scatter
         (MacKay, 1992, "Information-based objective functions for active data selection").
         """
-        apart = predictions - predictions.mean(0)
+        apart = (predictions - predictions.mean(0)).double()
         factor = torch.linalg.cholesky(self.covariance)
         white = torch.linalg.solve_triangular(factor, apart.flatten(0, -2).T, upper=False).T.view_as(apart)
         members = white.movedim(0, -2)
         identity = torch.eye(len(predictions), dtype=white.dtype)
         gram = identity + members @ members.mT / (len(predictions) - 1)
         half: Tensor = torch.linalg.cholesky(gram).diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        return half
+        return half.to(predictions.dtype)
