@@ -110,7 +110,11 @@ def compared(found: Sequence[dict[str, Any]], fresh: str) -> str:
     for at, horizon in enumerate(found[0]["horizons"]):
         errors = {arm: np.array([one[fresh][arm][at] for one in found]) for arm in ("before", *ARMS)}
         logs = np.log(errors["suggested"] / errors["random"])
-        half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / math.sqrt(len(logs)) if len(logs) > 1 else 0
+        half = (
+            stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / math.sqrt(len(logs))
+            if len(logs) > 1
+            else 0
+        )
         ratio = (math.exp(logs.mean() + off) for off in (0.0, -half, half))
         lines.append([f"{horizon}", *(f"{errors[arm].mean():.4f}" for arm in errors), interval(*ratio)])
     return table(["steps", "before", *ARMS, "suggested / random [95 %]"], lines)
@@ -146,11 +150,14 @@ def measured(setting: Setting, folder: Path, seed: int) -> dict[str, Any]:
         drawn = delete(pool, pool.uids[count:].tolist(), out=drawn)
     more["random"] = Dataset.open(drawn)
     groundings = {"before": before} | {
-        arm: grounded(setting, [first, more[arm]], home, arm, seed, members=0, failure_members=0) for arm in ARMS
+        arm: grounded(setting, [first, more[arm]], home, arm, seed, members=0, failure_members=0)
+        for arm in ARMS
     }
     told: dict[str, Any] = {
         "steps": {"first": int(first.lengths.sum())} | {a: int(d.lengths.sum()) for a, d in more.items()},
-        "falls": {a: int(np.sum(np.array(d.metadata["failed"]))) for a, d in ({"first": first} | more).items()},
+        "falls": {
+            a: int(np.sum(np.array(d.metadata["failed"]))) for a, d in ({"first": first} | more).items()
+        },
     }
     for fresh in ("random", "stress"):
         source = collected(

@@ -69,6 +69,18 @@ def test_the_same_seed_gives_the_same_bytes_and_replaces_what_was_there(folder: 
         suggest(folder, seed=1, out=tmp_path / "again", **FEW)
 
 
+def test_from_logs_alone_it_says_what_to_do_on_the_robot(folder: Path) -> None:
+    recipe = json.loads((folder / "recipe.json").read_text())
+    alone = {"task": recipe["task"].replace(":TASK", ":LOGS_ALONE"), "data": "logs", "collect": None}
+    (folder / "recipe.json").write_text(json.dumps(recipe | alone))
+    shown = CliRunner().invoke(app, ["suggest", str(folder), "--episodes", "2", "--proposals", "9"])
+    assert shown.exit_code == 0 and "record them" not in shown.output
+    page = (folder / "suggest/suggest.md").read_text()
+    assert "bring it to each start" in page and "| episode | from | for | v |" in page
+    config = json.loads((folder / "suggest/config.json").read_text())["suggest"]
+    assert (config["max_steps"], config["start"]) == (40, "task")
+
+
 def test_what_cannot_disagree_is_refused_and_nothing_is_written(folder: Path) -> None:
     recipe = json.loads((folder / "recipe.json").read_text())
     (folder / "recipe.json").write_text(json.dumps(recipe | {"seeds": [1]}))
