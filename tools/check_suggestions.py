@@ -102,10 +102,12 @@ def main(
             print(f"  {fresh}: {found[one][fresh]}", flush=True)
     for fresh in ("random", "stress"):
         print(f"\nfresh episodes: {fresh}\n\n{compared(list(found.values()), fresh)}", flush=True)
+        ranks = [foreseen(setting, folder, one, fresh) for one in found]
+        print(f"\nrank correlation of information and error: {', '.join(f'{rank:.2f}' for rank in ranks)}")
 
 
 def compared(found: Sequence[dict[str, Any]], fresh: str) -> str:
-    """Return the errors by horizon, means over seeds, and ratios with 95 % t intervals over their logarithms."""
+    """Return mean errors by horizon, and their ratios with 95 % t intervals over logarithms, in Markdown."""
     lines = []
     for at, horizon in enumerate(found[0]["horizons"]):
         errors = {arm: np.array([one[fresh][arm][at] for one in found]) for arm in ("before", *ARMS)}
@@ -115,9 +117,29 @@ def compared(found: Sequence[dict[str, Any]], fresh: str) -> str:
             if len(logs) > 1
             else 0
         )
-        ratio = (math.exp(logs.mean() + off) for off in (0.0, -half, half))
-        lines.append([f"{horizon}", *(f"{errors[arm].mean():.4f}" for arm in errors), interval(*ratio)])
+        value, low, high = (math.exp(logs.mean() + off) for off in (0.0, -half, half))
+        means = (f"{values.mean():.4f}" for values in errors.values())
+        lines.append([f"{horizon}", *means, interval(value, low, high)])
     return table(["steps", "before", *ARMS, "suggested / random [95 %]"], lines)
+
+
+@torch.no_grad()
+def foreseen(setting: Setting, folder: Path, seed: int, fresh: str) -> float:
+    """Return Spearman's correlation over fresh steps: what one would teach, and how wrong its prediction is.
+
+    The latter is the distance of the committee's mean from the recorded next state, in units of the scatter.
+    """
+    made = load_grounding(folder / place(seed) / "before" / "grounding.safetensors")
+    committee = Committee.of(task_named(setting.task), [made])
+    pairs = PairedEpisodes.load(folder / f"fresh_{fresh}_pairs")
+    windows, predictions = pairs.windows, []
+    for model in committee.models:
+        latent, _ = model.encode(windows)
+        predictions.append(model.ensemble_predictions(latent, windows.action, windows.simulated_next))
+    asked = torch.cat(predictions)
+    error = pairs.steps(windows.next_state - asked.mean(0)).double()
+    white = torch.linalg.solve_triangular(torch.linalg.cholesky(committee.covariance), error.T, upper=False)
+    return float(stats.spearmanr(pairs.steps(committee.information(asked)), white.norm(dim=0)).statistic)
 
 
 def measured(setting: Setting, folder: Path, seed: int) -> dict[str, Any]:
