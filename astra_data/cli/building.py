@@ -28,7 +28,9 @@ SeedOrSeeds = Annotated[
 ]
 Behavior = Annotated[
     str | None,
-    typer.Option(help="random, stress, policy, suboptimal_ppo or suboptimal_sac.", show_default="random"),
+    typer.Option(
+        help="random, stress, policy, suboptimal_ppo, suboptimal_sac or planned.", show_default="random"
+    ),
 ]
 Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
 LeastSteps = Annotated[
@@ -64,6 +66,10 @@ Grounding = Annotated[
 Encoder = Annotated[
     str | None, typer.Option(help="Folder of the policy's target encoder, if it has one.", show_default=False)
 ]
+Plan = Annotated[
+    str | None,
+    typer.Option(help="Planned episodes to record: plan.json of `astra-data suggest`.", show_default=False),
+]
 Name = Annotated[
     str | None, typer.Option(help="Name of the dataset.", show_default="task, behaviour and seed")
 ]
@@ -86,6 +92,7 @@ def collect(
     policy: Policy = None,
     grounding: Grounding = None,
     target_encoder: Encoder = None,
+    plan: Plan = None,
     name: Name = None,
     out: Out = None,
     resume: Resume = False,
@@ -103,7 +110,10 @@ def collect(
         "policy": policy,
         "grounding": grounding,
         "target_encoder": target_encoder,
+        "plan": plan,
     }
+    if plan is not None and behavior is None:
+        settings["behavior"] = "planned"
     given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
     if task.endswith(".toml"):
         refuse(given | _given(name=name, out=out, resume=resume), "collect")

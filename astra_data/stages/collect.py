@@ -28,6 +28,7 @@ from astra_data.training.behaviors import (
     StressCommands,
     WallWatch,
 )
+from astra_data.training.plan import Plan, PlannedCommands
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.training.recording import record
 from astra_data.worlds.registry import task_named
@@ -43,17 +44,17 @@ MOST_STEPS = 10**10
 class CollectConfig(Config):
     """What to collect; the paper uses 200 episodes of random behaviour of up to 500 steps."""
 
-    behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
+    behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac", "planned"] = "random"
     """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": at the bounds, often
     reversed, to see failures. "policy": a saved policy; "suboptimal_ppo" and "suboptimal_sac": one trained in
-    the target and stopped early. Policies draw actions as in training."""
+    the target and stopped early. Policies draw actions as in training. "planned": what a `plan` says."""
     episodes: Count = 200
-    """Episodes in all; with `least_steps` at most."""
+    """Episodes in all; with `least_steps` at most; of a plan at most as many as it has, its first ones."""
     least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
     """Only as many episodes as have these steps together, so that datasets of different behaviours are of one
     size."""
     max_steps: Count = 500
-    """Longest episode, in control steps; longer ones are truncated."""
+    """Longest episode, in control steps; longer ones are truncated. A plan has its own."""
     num_envs: AtOnce = 200
     """Episodes recorded in one batch; also decides which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
@@ -77,16 +78,22 @@ class CollectConfig(Config):
     """Folder of the grounding that the saved policy's latent comes from, if it has one."""
     target_encoder: str | None = None
     """Folder of the aligned target encoder; by default the grounding's own encoder is used."""
+    plan: str | None = Field(default=None, exclude_if=lambda plan: plan is None)
+    """File of planned episodes, as `astra-data suggest` writes it: where each starts and what it commands."""
 
     @model_validator(mode="after")
     def _fits_the_behavior(self) -> Self:
         if self.behavior == "policy" and self.policy is None:
             raise ValueError('behavior "policy": expected the folder of a trained policy as policy, got none')
+        if (self.behavior == "planned") != (self.plan is not None):
+            raise ValueError(
+                f'plan: expected with behavior "planned" and only then, got "{self.behavior}" and {self.plan}'
+            )
         artefacts = ("policy", "grounding", "target_encoder")
         given = [name for name in artefacts if getattr(self, name) is not None]
         if self.behavior != "policy" and given:
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
-        if self.random_share and self.behavior in {"random", "stress"}:
+        if self.random_share and self.behavior in {"random", "stress", "planned"}:
             raise ValueError(f'random_share: expected the behavior of a policy, got "{self.behavior}"')
         if self.hold_s[0] > self.hold_s[1]:
             raise ValueError(f"hold_s: expected the shorter time first, got {list(self.hold_s)}")
@@ -127,8 +134,11 @@ def collect(
         BadInputError: the task is unknown, `out` exists, or an artefact of the behaviour is missing.
     """
     world = task_named(task)
+    plan = None if config.plan is None else Plan.load(config.plan, world)
+    episodes = config.episodes if plan is None else min(config.episodes, len(plan.episodes))
     files = _saved_files(config).items()
     saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
+    saved |= {"plan_sha256": file_digest(Path(config.plan))} if config.plan is not None else {}
     behaviors = config.behavior + ("-and-random" if config.random_share else "")
     description = {
         "name": name or f"{world.name}-{behaviors}-seed{seed}".replace("_", "-"),
@@ -149,15 +159,16 @@ def collect(
         resume=resume,
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
-        behavior, metadata = _behavior(world, config, seed, writer, num_threads, part(progress, 0.0, share))
+        training = part(progress, 0.0, share)
+        behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
         if config.random_share:
             behavior = MixedBehavior(behavior, _random(world, config, RandomCommands), config.random_share)
         stopwatch = Stopwatch(metadata.get("spent"))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
         steps = 0
-        for first in range(0, config.episodes, config.num_envs):
-            rows = range(first, min(first + config.num_envs, config.episodes))
+        for first in range(0, episodes, config.num_envs):
+            rows = range(first, min(first + config.num_envs, episodes))
             if config.least_steps and _steps_before(first, writer) >= config.least_steps:
                 break
             if writer.staged.keys() >= set(rows):
@@ -168,17 +179,19 @@ def collect(
                 seed=derive(batch_seed, "collect"),
                 start_anywhere=config.start == "anywhere",
                 num_threads=num_threads,
+                **({} if plan is None else {"starts": plan.starts[rows.start : rows.stop]}),
             )
             env.reset()
-            behavior.start(len(rows), batch_seed)
-            batch = part(recording, rows.start / config.episodes, rows.stop / config.episodes)
+            acting = behavior.of(rows) if isinstance(behavior, PlannedCommands) else behavior
+            acting.start(len(rows), batch_seed)
+            batch = part(recording, rows.start / episodes, rows.stop / episodes)
             steps += record(
                 world,
                 env,
-                behavior,
+                acting,
                 rows,
                 writer,
-                max_steps=config.max_steps,
+                max_steps=config.max_steps if plan is None else plan.longest,
                 seed=seed,
                 progress=batch,
             )
@@ -228,6 +241,8 @@ def _behavior(
     """Return the behaviour and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         return _random(task, config, commands), {}
+    if config.plan is not None:
+        return PlannedCommands(Plan.load(config.plan, task).actions(task)), {}
     if config.behavior.startswith("suboptimal"):
         from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - TorchRL is slow to import
 

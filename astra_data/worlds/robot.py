@@ -20,7 +20,11 @@ State = NDArray[np.floating[Any]] | Sequence[float]
 
 
 class Robot(Protocol):
-    """One robot, real or simulated. `reset` may take a keyword `seed`, for what is random about it."""
+    """One robot, real or simulated.
+
+    `reset` may take a keyword `seed`, for what is random about it, and a keyword `start`: the abstract state
+    (X,) that a planned episode starts at.
+    """
 
     def reset(self) -> State:
         """Bring the robot to where an episode starts; return its state (S,)."""
@@ -52,6 +56,7 @@ class RobotEnv:
         seed: int,
         num_threads: int | None = None,
         start_anywhere: bool = False,
+        starts: NDArray[np.float64] | None = None,
     ) -> None:
         """Build B robots.
 
@@ -65,12 +70,14 @@ class RobotEnv:
             seed: of goals, and of the robots if they take one.
             num_threads: without effect.
             start_anywhere: without effect: a robot starts where it is put.
+            starts: abstract states (B, X) to start at, for robots that can be told.
         """
         self.num_envs, self.action_size = num_envs, len(commands)
         self._objective, self._column, self._commands = objective, state, commands
         self._abstraction = abstraction
         self._robots = [robot() for _ in range(num_envs)]
-        self._takes_seed = "seed" in inspect.signature(self._robots[0].reset).parameters
+        takes = inspect.signature(self._robots[0].reset).parameters
+        self._takes_seed, self._starts = "seed" in takes, starts if "start" in takes else None
         self.goal = torch.zeros(num_envs, objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
@@ -98,7 +105,8 @@ class RobotEnv:
         for row in rows:
             episode = f"episode {self._episodes}"
             self._episodes += 1
-            options = {"seed": derive(self._seed, episode)} if self._takes_seed else {}
+            options: dict[str, Any] = {"seed": derive(self._seed, episode)} if self._takes_seed else {}
+            options |= {} if self._starts is None else {"start": self._starts[row]}
             self._state[row] = self._checked(self._robots[row].reset(**options), "reset")
             goal = self._objective.draw_goals(generator(self._seed, f"goal of {episode}"), 1)
             self.goal[row] = torch.from_numpy(goal[0]).float()

@@ -65,7 +65,7 @@ def trajectories(maze: Maze, panels: Sequence[Panel]) -> Figure:
         figure = Figure(figsize=(max(4.2, PANEL_INCHES * columns), height), layout="constrained")
         for place, panel in enumerate(panels):
             axes = figure.add_subplot(rows, columns, place + 1)
-            _walls(axes, maze)
+            draw_walls(axes, maze)
             _paths(axes, panel.target, panel.target_success, DEPLOYED, "-")
             _paths(axes, panel.simulated, panel.simulated_success, SIMULATED, "--")
             for x, y in _goals(maze, panel.goal):
@@ -149,7 +149,8 @@ def _goals(maze: Maze, goals: Floats) -> list[Floats]:
     return [goals[(cells == cell).all(axis=1)].mean(axis=0) for cell in np.unique(cells, axis=0)]
 
 
-def _walls(axes: Axes, maze: Maze) -> None:
+def draw_walls(axes: Axes, maze: Maze) -> None:
+    """Draw the walls of a maze, and show no more than it."""
     corner = maze.scale / 2
     cells = []
     for row, column in maze.wall_cells():

@@ -42,6 +42,7 @@ class AntMazeEnv:
         seed: int,
         leg_scale: float = 1.0,
         start_anywhere: bool = False,
+        starts: Floats | None = None,
         controller: VelocityController | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -53,13 +54,14 @@ class AntMazeEnv:
             seed: of starts, goals and headings.
             leg_scale: factor on the legs' length.
             start_anywhere: start anywhere in the free space, not at the task's start (for data collection).
+            starts: abstract states (B, X) to start at in place of drawn ones.
             controller: the low-level controller, by default the one shipped.
             num_threads: physics threads, by default one per core.
         """
         self.objective = objective
         self.num_envs = num_envs
         self.leg_scale = leg_scale
-        self.start_anywhere = start_anywhere
+        self.start_anywhere, self.starts = start_anywhere, starts
         self.controller = controller or VelocityController.load()
         model = ant_model(objective.maze, leg_scale=leg_scale)
         self.physics = BatchedPhysics(
@@ -99,7 +101,7 @@ class AntMazeEnv:
         objective = self.objective
         draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
         qpos = standing_pose(count)
-        qpos[:, :2] = draw(self._rng, count)[:, :2]
+        qpos[:, :2] = (draw(self._rng, count) if self.starts is None else self.starts[rows])[:, :2]
         yaw = self._rng.uniform(-np.pi, np.pi, count)
         qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
         self.goal[rows] = torch.from_numpy(objective.draw_goals(self._rng, count)).float()

@@ -34,6 +34,7 @@ class HumanoidEnv:
         seed: int,
         leg_scale: float = 1.0,
         start_anywhere: bool = False,
+        starts: Floats | None = None,
         ranges: CommandRanges | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -45,6 +46,7 @@ class HumanoidEnv:
             seed: of starts.
             leg_scale: 1, for a humanoid's legs cannot be scaled.
             start_anywhere: false, for there is no maze.
+            starts: without effect: a humanoid starts upright.
             ranges: joint angles of commands.
             num_threads: physics threads, by default one per core.
 

@@ -60,6 +60,7 @@ class NaoEnv:
         ball: bool = False,
         leg_scale: float = 1.0,
         start_anywhere: bool = False,
+        starts: Floats | None = None,
         errors: PerceptionErrors | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -72,6 +73,7 @@ class NaoEnv:
             ball: whether there is a ball.
             leg_scale: 1, for a NAO's legs cannot be scaled.
             start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
+            starts: abstract states (B, X) to start at in place of drawn ones.
             errors: of the estimates.
             num_threads: of the physics, by default one per core.
 
@@ -81,6 +83,7 @@ class NaoEnv:
         if leg_scale != 1.0:
             raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
         self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
+        self.starts = starts
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
         errors = errors or PerceptionErrors()
@@ -137,7 +140,7 @@ class NaoEnv:
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
         objective, rng = self.objective, self._rng
         draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
-        start = draw(rng, len(rows))
+        start = draw(rng, len(rows)) if self.starts is None else self.starts[rows]
         self.goal[rows] = torch.from_numpy(objective.draw_goals(rng, len(rows))).float()
         yaw = rng.uniform(-np.pi, np.pi, len(rows))
         self._stand(rows, np.column_stack([start[:, :2], yaw]), start[:, 4:6] if self.has_ball else None)

@@ -1,0 +1,118 @@
+"""Planned episodes: where to start and what to command, in files that `astra-data collect` takes."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+from torch import Tensor
+
+from astra_data.core.config import AtOnce, Config
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.task import Task
+
+
+class PlannedEpisode(Config):
+    """One episode: its start, and its commands, which need no look at the robot."""
+
+    start: tuple[float, ...]
+    """Abstract state, (X,), at rest."""
+    commands: tuple[tuple[float, ...], ...] = Field(min_length=1)
+    """One after another, in the units of the robot, (K, A)."""
+    hold_steps: tuple[AtOnce, ...] = Field(min_length=1)
+    """For how many steps each is held, (K,)."""
+    information: float = 0.0
+    """What it is expected to teach, in nats, given those before it in the plan."""
+
+
+class Plan(Config):
+    """Episodes to record, those that teach most first."""
+
+    task: str
+    """Its name."""
+    timestep_s: float
+    """Its control period."""
+    start_names: tuple[str, ...]
+    """The entries of a start."""
+    command_names: tuple[str, ...]
+    """The axes of a command."""
+    episodes: tuple[PlannedEpisode, ...] = Field(min_length=1)
+
+    @classmethod
+    def load(cls, path: Path | str, task: Task) -> Self:
+        """Read a plan of episodes of `task`.
+
+        Raises:
+            BadInputError: it is missing, no plan, or of a robot with other states or commands.
+        """
+        try:
+            plan = cls.model_validate_json(Path(path).read_bytes())
+        except (OSError, ValidationError) as error:
+            first = str(error).splitlines()[0]
+            raise BadInputError(
+                f"{path}: expected a plan as `astra-data suggest` writes it: {first}"
+            ) from None
+        expected = names_of(task)
+        if (plan.start_names, plan.command_names) != expected or plan.timestep_s != task.timestep_s:
+            raise BadInputError(
+                f"{path} is a plan for {plan.task}, with {plan.start_names}, {plan.command_names}, each "
+                f"{plan.timestep_s} s: expected {expected[0]}, {expected[1]}, {task.timestep_s} s of "
+                f"{task.name}"
+            )
+        starts, axes = map(len, expected)
+        for number, one in enumerate(plan.episodes):
+            sizes = {len(one.start) - starts, *(len(command) - axes for command in one.commands)}
+            if sizes != {0} or len(one.commands) != len(one.hold_steps):
+                raise BadInputError(
+                    f"{path}: episode {number}: expected a start of {starts} values, commands of {axes}, and "
+                    "how long each is held"
+                )
+        return plan
+
+    @property
+    def starts(self) -> NDArray[np.float64]:
+        """The starts of all episodes, (E, X)."""
+        return np.array([one.start for one in self.episodes])
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest episode."""
+        return max(sum(one.hold_steps) for one in self.episodes)
+
+    def actions(self, task: Task) -> Tensor:
+        """Return the commands as multiples of ±1, (T, E, A); after its last one an episode holds it."""
+        played = np.zeros((self.longest, len(self.episodes), len(self.command_names)), np.float32)
+        for number, one in enumerate(self.episodes):
+            commands = np.repeat(one.commands, one.hold_steps, axis=0)
+            played[: len(commands), number] = commands
+            played[len(commands) :, number] = commands[-1]
+        return task.limits.normal(torch.from_numpy(played))
+
+
+class PlannedCommands:
+    """A behaviour that plays commands whatever the robot does."""
+
+    def __init__(self, action: Tensor) -> None:
+        """Play `action` (T, B, A) of ±1."""
+        self._action = action
+
+    def of(self, rows: range) -> "PlannedCommands":
+        """Return the behaviour of the episodes `rows` alone."""
+        return PlannedCommands(self._action[:, rows.start : rows.stop])
+
+    def start(self, count: int, seed: int) -> None:
+        """Begin again; there is nothing random."""
+        self._left: Iterator[Tensor] = iter(self._action)
+
+    def act(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return the actions (B, A) of the next step."""
+        return next(self._left)
+
+
+def names_of(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the entries of an abstract state, and of the axes of a command."""
+    column = task.abstract_state
+    return column.names or tuple(map(str, range(column.size))), tuple(task.limits)

@@ -1,0 +1,88 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from small_cart import TASK
+from toy_corrections import OFFSETS_M, SCATTER_M, shifted
+
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.committee import Committee
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.parameters import IdentifiedParameters
+from astra_data.learning.networks.failure import FailureModel, FailureShape
+
+
+def committee(failures: FailureModel | None = None) -> Committee:
+    first, *others = map(shifted, OFFSETS_M)
+    return Committee.of(TASK, [HistoryGrounding(first, failures, tuple(others))])
+
+
+def follow(of: Committee, speed: float = 1.0, steps: int = 12, goal: float = 9.0) -> list[np.ndarray]:  # type: ignore[type-arg]
+    action = TASK.limits.normal(torch.full((steps, 2, 1), speed))
+    found = of.follow(torch.tensor([[0.0], [5.0]]), torch.full((2, 1), goal), action)
+    return [values.numpy() for values in (found.state, found.information, found.reached)]
+
+
+def test_a_step_teaches_as_much_as_a_normal_outcome_tells_of_its_mean() -> None:
+    """With one value, that is ½ log(1 + variance between members / variance of the scatter)."""
+    _, information, _ = follow(committee())
+    expected = 0.5 * math.log(1 + np.var(OFFSETS_M, ddof=1) / SCATTER_M**2)
+    np.testing.assert_allclose(information, expected, rtol=1e-4)
+
+
+def test_with_several_values_it_is_the_log_determinant() -> None:
+    rng = np.random.default_rng(0)
+    mixed = rng.normal(size=(3, 3))
+    of = Committee(TASK, (), (), torch.from_numpy(mixed @ mixed.T))
+    predictions = rng.normal(size=(4, 7, 3))
+    expected = [
+        0.5 * np.log(np.linalg.det(np.eye(3) + np.linalg.solve(mixed @ mixed.T, np.cov(one.T))))
+        for one in predictions.transpose(1, 0, 2)
+    ]
+    np.testing.assert_allclose(of.information(torch.from_numpy(predictions)), expected)
+
+
+def test_the_members_share_one_path_which_is_that_of_their_mean() -> None:
+    state, _, _ = follow(committee())
+    way = 0.1 * 1.0 + np.mean(OFFSETS_M)
+    np.testing.assert_allclose(state[:, :, 0], np.array([0.0, 5.0]) + way * np.arange(12)[:, None], atol=1e-5)
+
+
+def test_after_the_goal_nothing_is_reached() -> None:
+    state, _, reached = follow(committee(), goal=0.55)
+    before = np.cumsum(state[:, 0, 0] >= 0.55) > 0
+    np.testing.assert_array_equal(reached[:, 0], ~before)
+    assert before.any() and reached[0, 1] == 1.0 and not reached[1:, 1].any()
+
+
+def test_failures_make_later_steps_less_likely() -> None:
+    shape = FailureShape(state_size=1, action_size=1, timestep_s=0.1, members=2)
+    failures = FailureModel(shape).eval()
+    for member in failures.members:
+        torch.nn.init.zeros_(member[-1].weight)  # type: ignore[index]
+        torch.nn.init.zeros_(member[-1].bias)  # type: ignore[index]
+    _, _, reached = follow(committee(failures=failures))
+    np.testing.assert_allclose(reached[:, 0], (1 - 0.5 / 20) ** np.arange(12), rtol=1e-5)
+
+
+def test_heads_disagree_as_members_do() -> None:
+    both = shifted(*OFFSETS_M)
+    _, information, _ = follow(Committee.of(TASK, [HistoryGrounding(both)]))
+    np.testing.assert_allclose(information, follow(committee())[1], rtol=1e-5)
+
+
+def test_groundings_of_several_seeds_are_one_committee() -> None:
+    made = [HistoryGrounding(shifted(offset)) for offset in OFFSETS_M]
+    of = Committee.of(TASK, made)
+    np.testing.assert_allclose(follow(of)[1], follow(committee())[1], rtol=1e-5)
+    assert of.covariance.item() == pytest.approx(SCATTER_M**2)
+
+
+def test_one_correction_alone_cannot_disagree() -> None:
+    with pytest.raises(BadInputError, match="got a single one: give `\\[ground\\]` members = 4"):
+        Committee.of(TASK, [HistoryGrounding(shifted(0.1))])
+    with pytest.raises(BadInputError, match="expected groundings by history models"):
+        Committee.of(
+            TASK, [HistoryGrounding(shifted(0.1)), IdentifiedParameters.__new__(IdentifiedParameters)]
+        )

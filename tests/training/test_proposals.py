@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+import torch
+from small_cart import TASK
+from toy_corrections import OFFSETS_M, shifted
+
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.committee import Committee
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.training.proposals import SuggestConfig, chosen, drawn, planned, suggested
+from astra_data.worlds.registry import TASKS
+
+CONFIG = SuggestConfig(episodes=3, max_steps=10, start="task", hold_s=(0.2, 0.4), proposals=16)
+
+
+def test_the_most_instructive_is_taken_first_and_the_next_one_elsewhere() -> None:
+    """The second best passes where the best does, the third does not; one far away teaches in full."""
+    information = torch.tensor([[1.0, 1.0], [3.0, 3.0], [2.9, 2.9], [2.0, 2.0]])
+    places = torch.tensor([[0.0, 0.1], [5.0, 5.1], [5.0, 5.1], [90.0, 90.0]])[..., None]
+    taken, gained = chosen(information, places, 3, reach=0.5)
+    assert taken.tolist() == [1, 3, 0]
+    assert gained == pytest.approx([6.0, 4.0, 2.0])
+
+
+def test_at_its_reach_a_step_teaches_two_fifths() -> None:
+    _, gained = chosen(torch.ones(2, 4), torch.tensor([[0.0, 0.0], [0.7, 0.7]])[..., None], 2, reach=0.7)
+    assert gained == pytest.approx([4.0, 4.0 * (1 - np.exp(-0.5))])
+
+
+def test_steps_between_those_that_are_compared_count_with_them() -> None:
+    information = torch.tensor([[1.0, 1.0, 1.0, 1.0, 9.0], [3.0, 3.0, 3.0, 3.0, 0.0]])
+    places = torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, 0.0]])[..., None]
+    taken, gained = chosen(information, places, 2, reach=0.1)
+    assert taken.tolist() == [0, 1] and gained == pytest.approx([13.0, 0.0])
+
+
+def test_equal_commands_in_a_row_are_held() -> None:
+    action = torch.tensor([[-1.0], [-1.0], [1.0], [-1.0]])
+    one = planned(TASK, torch.tensor([0.5]), action, 2.0)
+    assert one.start == (0.5,) and one.information == 2.0
+    assert one.commands == ((-1.0,), (4.0,), (-1.0,)) and one.hold_steps == (2, 1, 1)
+
+
+def test_proposals_are_drawn_as_episodes_are_collected() -> None:
+    first, again, other = (drawn(TASK, CONFIG, seed) for seed in (1, 1, 2))
+    assert first.action.shape == (10, 16, 1) and first.start.tolist() == [[0.0]] * 16
+    assert (first.goal >= 1.0).all() and (first.goal <= 2.0).all()
+    torch.testing.assert_close(first.action, again.action)
+    assert (first.action != other.action).any()
+    for commands in first.action[..., 0].T:
+        held = np.diff(np.flatnonzero(np.diff(commands, prepend=np.nan, append=np.nan) != 0))
+        assert set(held[:-1]) <= {2, 3, 4}
+
+
+def test_starts_are_anywhere_in_a_maze_and_only_there() -> None:
+    maze = TASKS["antmaze-umaze"]
+    anywhere = drawn(maze, CONFIG.model_copy(update={"start": "anywhere"}), 0).start
+    usual = drawn(maze, CONFIG, 0).start
+    assert anywhere[:, :2].std(0).min() > 2 * usual[:, :2].std(0).max()
+    with pytest.raises(BadInputError, match="expected a task in a maze"):
+        drawn(TASK, CONFIG.model_copy(update={"start": "anywhere"}), 0)
+
+
+def test_a_suggestion_is_what_was_taken_of_the_proposals() -> None:
+    committee = Committee.of(TASK, [HistoryGrounding(shifted(*OFFSETS_M))])
+    made = suggested(TASK, committee, CONFIG, seed=1)
+    torch.testing.assert_close(
+        made.plan.actions(TASK), made.proposals.action[:, made.taken], atol=1e-6, rtol=0
+    )
+    assert made.plan.task == "rail-cart" and len(set(made.taken.tolist())) == 3
+    worth = (made.rollouts.information * made.rollouts.reached).sum(0)
+    assert made.taken[0] == worth.argmax() and made.information[0] == pytest.approx(float(worth.max()))
+    assert (np.diff(made.information) <= 0).all()
+    with pytest.raises(BadInputError, match="expected at most 16, the proposals, got 17"):
+        suggested(TASK, committee, CONFIG.model_copy(update={"episodes": 17}), seed=1)
