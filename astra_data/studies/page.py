@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from astra_data.reports.figures import walk_prediction
 from astra_data.reports.formatting import fill
-from astra_data.studies.errors import AXES, BODY_AXES
 from astra_data.studies.models import MODELS
+from astra_data.studies.walking import AXES, BODY_AXES
 
 SHOWN_S = 1.0
 """The horizon of the first table."""

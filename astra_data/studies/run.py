@@ -76,8 +76,8 @@ def measure_gap(
     name = recipe_path.stem
     home, mapping = root / name, recipe_path.parent / recipe.mapping
     imported = home / "recordings"
-    tested = read_recordings(data, mapping, imported, recipe.walking)
-    learned = [] if train is None else read_recordings(train, mapping, imported, recipe.walking)
+    tested = read_recordings(data, mapping, imported, recipe.reading)
+    learned = [] if train is None else read_recordings(train, mapping, imported, recipe.reading)
     both = {recording.content_hash for recording in tested} & {
         recording.content_hash for recording in learned
     }

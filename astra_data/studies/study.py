@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -19,9 +19,11 @@ from astra_data.core.progress import Progress, part
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import generator
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.studies.errors import AXES, Trial, summary
-from astra_data.studies.recordings import Piece, Recording, WalkingConfig
+from astra_data.studies.errors import Trial, summary
+from astra_data.studies.joints import JointsConfig
+from astra_data.studies.recordings import Piece, Recording
 from astra_data.studies.rollouts import MODELS, FitConfig, fit
+from astra_data.studies.walking import WalkingConfig
 from astra_data.studies.walks import StepsConfig, Walks
 
 LEARNED = ("mlp", "nas", "astra")
@@ -29,7 +31,7 @@ LEARNED = ("mlp", "nas", "astra")
 
 
 class GapRecipe(Config):
-    """How well models of a robot's walk predict recordings of it."""
+    """How well models of a robot's walk, or of its joints, predict recordings of it."""
 
     mapping: str
     """How logs become columns: a file of `astra-data import`, relative to the recipe."""
@@ -45,8 +47,12 @@ class GapRecipe(Config):
     """Share of each recording's pieces held out for testing, if no other recordings are given."""
     notes: tuple[str, ...] = ()
     """Paragraphs for the page, such as which data was used for tuning."""
+    simulator: Literal["planar_walker", "joints"] = "planar_walker"
+    """The abstract simulator, and so what is predicted: a walk in the plane, or joints sent to targets."""
     walking: WalkingConfig = WalkingConfig()
     """When a robot counts as walking."""
+    joints: JointsConfig = JointsConfig()
+    """How the joints' simulator responds."""
     steps: StepsConfig = StepsConfig()
     """How rows become control steps."""
     fit: FitConfig = FitConfig()
@@ -59,6 +65,11 @@ class GapRecipe(Config):
             if name not in MODELS:
                 raise ValueError(f"unknown model '{name}'{did_you_mean(name, MODELS)}")
         return ("raw", *(name for name in dict.fromkeys(models) if name != "raw"))
+
+    @property
+    def reading(self) -> WalkingConfig | JointsConfig:
+        """How recordings are read."""
+        return self.joints if self.simulator == "joints" else self.walking
 
 
 @dataclass(frozen=True)
@@ -125,7 +136,8 @@ def shortened(pieces: Sequence[Piece], rows: int, seed: int) -> tuple[Piece, ...
         piece, room = pieces[number], rows - sum(map(len, kept))
         if room <= 0:
             break
-        kept.append(Piece(piece.recording, piece.state[: room + 1], piece.action[:room], piece.broken[:room]))
+        columns = (piece.state[: room + 1], piece.action[:room], piece.broken[:room])
+        kept.append(Piece(piece.recording, *columns, piece.body))
     return tuple(kept)
 
 
@@ -144,9 +156,14 @@ def run_study(
         raise BadInputError(
             f"expected recordings of one rate, got {', '.join(map(str, sorted(rates)))} per second"
         )
+    bodies = [recording.pieces[0].body for recording in every]
+    if any(body != bodies[0] for body in bodies):
+        raise BadInputError("expected recordings of the same joints, with targets in all or in none")
     fps = rates.pop()
+    free = {"notes", "models", "seeds", "minutes"}
+    free |= {"walking"} if recipe.simulator == "joints" else {"joints", "simulator"}
     settings = {
-        "recipe": recipe.model_dump(mode="json", exclude={"notes", "models", "seeds", "minutes"}),
+        "recipe": recipe.model_dump(mode="json", exclude=free),
         "data": [recording.content_hash for recording in data],
         "train": [recording.content_hash for recording in train],
     }
@@ -211,6 +228,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     horizons = (1, *(round(seconds / step_s) for seconds in recipe.horizons_s))
     horizons_s = [horizon * step_s for horizon in horizons]
     trial = Trial.of(Walks.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
+    body = trial.stretch.body
     fits = list(_fits(recipe, case, fps))
     squared: dict[float, dict[str, list[Any]]] = {}
     walks: dict[tuple[float, int], Walks] = {}
@@ -242,7 +260,11 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         {
             "minutes": minutes,
             "models": summary(
-                {name: np.stack(values) for name, values in models.items()}, trial.piece, horizons_s
+                {name: np.stack(values) for name, values in models.items()},
+                trial.piece,
+                horizons_s,
+                axes=body.axes,
+                judged=body.judged,
             ),
         }
         for minutes, models in sorted(squared.items())
@@ -251,7 +273,8 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     return {
         "name": case.name,
         "title": case.title,
-        "axes": list(AXES),
+        "axes": list(body.axes),
+        "judged": list(body.judged),
         "horizons_s": horizons_s,
         "starts": walked.sum(0).tolist(),
         "pieces": len(np.unique(trial.piece)),
