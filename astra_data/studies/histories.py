@@ -65,7 +65,7 @@ class HistoryModel(Predictor):
         model.set_reward_scales(rewards, torch.ones_like(rewards[:, 0]))
         model.state_mean *= model.state_mean.new_tensor(self.body.usual_motion)
         model.goal_mean *= model.goal_mean.new_tensor(self.body.usual_seen)
-        if self.body.is_scaled:
+        if self.body.is_scaled and self.body.given_size:
             self.given_std.copy_(stretch.past_action.flatten(0, 1).std(0).clamp_min(_LEAST))
 
     def begin(self, stretch: Stretch) -> Tensor:

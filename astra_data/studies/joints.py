@@ -63,7 +63,8 @@ class Joints(Body):
     def steps(self, state: Floats, action: Floats, rows: int, fps: int) -> dict[str, Tensor]:
         """Take the mean target of each step; see `Body.steps`."""
         seen = torch.from_numpy(state[::rows])
-        targets = torch.from_numpy(action).reshape(-1, rows, action.shape[1]).mean(1)
+        steps = len(seen) - 1
+        targets = torch.from_numpy(action).reshape(steps, rows, action.shape[1]).mean(1)
         motion = seen.diff(dim=0)
         return {
             "motion": motion.float(),

@@ -10,8 +10,9 @@ from astra_data.core.config import load_recipe, load_tables
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.display import shown
+from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import place_name, read_recordings
-from astra_data.studies.study import GapRecipe, run_study
+from astra_data.studies.study import run_study
 
 RUNS = Path("runs")
 

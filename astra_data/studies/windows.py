@@ -58,7 +58,8 @@ class WindowModel(Predictor):
             self.correction_std.copy_(self.base.residuals(stretch).std(0).clamp_min(_LEAST))
         if self.body.is_scaled:
             seen, given, _ = stretch.first()
-            self.given_std.copy_(given.std(0).clamp_min(_LEAST))
+            if given.numel():
+                self.given_std.copy_(given.std(0).clamp_min(_LEAST))
             self.seen_mean.copy_(seen.mean(0))
             self.seen_std.copy_(seen.std(0).clamp_min(_LEAST))
 
