@@ -120,7 +120,7 @@ def test_what_unpacks_to_far_more_than_its_size_is_refused(
     with ZipFile(tmp_path / "plain.pt") as plain, ZipFile(tmp_path / "log.pt", "w", ZIP_DEFLATED) as packed:
         for name in plain.namelist():
             packed.writestr(name, plain.read(name))
-    with pytest.raises(BadInputError, match="holds values of 24.* --max-bytes"):
+    with pytest.raises(BadInputError, match=r"holds values of 24.* --max-bytes"):
         import_dataset([tmp_path / "log.pt"], PACE, out=tmp_path / "out")
     # A tensor may claim more rows than it stores.
     torch.save({name: torch.zeros(1, 2).expand(10**9, 2) for name in log}, tmp_path / "claims.pt")
