@@ -19,7 +19,8 @@ from torch import Tensor
 
 from astra_data.studies.motion import between
 from astra_data.studies.planar_walker import PlanarWalker, walk_command
-from astra_data.studies.recordings import Piece, WalkingConfig, read_recordings
+from astra_data.studies.recordings import Piece, read_recordings
+from astra_data.studies.walking import WalkingConfig
 from astra_data.worlds.nao import BatchedNao
 from astra_data.worlds.nao.robot import CONTROL_STEP_S
 

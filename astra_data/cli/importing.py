@@ -23,7 +23,7 @@ FileFormat = Annotated[
     str | None,
     typer.Option(
         "--format",
-        help="csv, hdf5, json, mcap, minari, npz or parquet.",
+        help="csv, hdf5, json, mcap, minari, npz, parquet or torch.",
         show_default="inferred from the files' names",
     ),
 ]

@@ -20,7 +20,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter, Tally
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.import_report import ImportReport, losses
-from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz, parquet
+from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import (
     VALUE_BYTES,
@@ -41,6 +41,7 @@ FORMATS: Mapping[str, ModuleType] = {
     "minari": minari,
     "npz": npz,
     "parquet": parquet,
+    "torch": torch,
 }
 IN_ARCHIVES = ("csv", "json")
 """Formats that are read sequentially, so that they can be read inside archives."""
@@ -168,6 +169,12 @@ def _format_of(recording: Path) -> str:
 
 def _suffixes(module: ModuleType) -> tuple[str, ...]:
     return tuple(getattr(module, "SUFFIXES", ()))
+
+
+def log_suffixes(mapping: ImportMapping) -> tuple[str, ...]:
+    """Return the endings of the names of logs that `mapping` may describe."""
+    modules = FORMATS.values() if mapping.format is None else [FORMATS[mapping.format]]
+    return tuple(suffix for module in modules for suffix in _suffixes(module))
 
 
 def _sources(recording: Path, file_format: str) -> list[Source]:

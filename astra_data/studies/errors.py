@@ -9,18 +9,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.seeding import generator
-from astra_data.studies.motion import chained
 from astra_data.studies.predictors import Predictor
 from astra_data.studies.rollouts import predict
+from astra_data.studies.walking import AXES, BODY_AXES
 from astra_data.studies.walks import Stretch, Walks
-from astra_data.worlds.plane.geometry import turned, wrapped
 
 Floats = NDArray[np.float64]
 
-AXES = ("forward_m", "left_m", "turn_rad", "field_x_m", "field_y_m")
-"""Displacement and turn in the body's frame at the start; and the displacement in the field's frame."""
-
-BODY_AXES = AXES[:3]
 MOST_STARTS = 4000
 REPLICATES = 1000
 
@@ -51,30 +46,36 @@ class Trial:
 
     @torch.no_grad()
     def squared_errors(self, model: Predictor) -> Tensor:
-        """Return squared errors (N, K, 5); NaN where the robot stops walking before the horizon."""
+        """Return squared errors (N, K, E); NaN where the robot stops walking before the horizon."""
         stretch, chosen = self.stretch, [horizon - 1 for horizon in self.horizons]
-        wrong = predict(model, stretch)[:, chosen] - chained(stretch.motion)[:, chosen]
-        field = turned(wrong[..., :2], stretch.heading[:, None].expand(wrong.shape[:2]))
-        errors = torch.cat([wrong[..., :2], wrapped(wrong[..., 2:]), field], dim=-1).square()
+        predicted, true = predict(model, stretch)[:, chosen], stretch.body.chained(stretch.motion)[:, chosen]
+        errors = stretch.body.wrong(predicted, true, stretch.heading).square()
         walked = stretch.is_walking.long().cumprod(1)[:, chosen].bool()
         return errors.masked_fill(~walked[..., None], torch.nan)
 
 
 def summary(
-    squared: Mapping[str, Floats], piece: NDArray[np.int64], horizons_s: Sequence[float], seed: int = 0
+    squared: Mapping[str, Floats],
+    piece: NDArray[np.int64],
+    horizons_s: Sequence[float],
+    seed: int = 0,
+    axes: Sequence[str] = AXES,
+    judged: Sequence[str] = BODY_AXES,
 ) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
     """Summarise the errors of several models by model, horizon and axis.
 
     Args:
-        squared: squared errors of each model, (seeds, N, K, 5), at the same N starts; "raw" among them.
+        squared: squared errors of each model, (seeds, N, K, E), at the same N starts; "raw" among them.
         piece: index of the piece of each start, (N,).
         horizons_s: the K horizons.
         seed: of the bootstrap, which resamples pieces: starts within a piece are not independent.
+        axes: names of the E errors.
+        judged: those that are averaged, the first of them.
 
     Returns:
         For each axis "rmse" with "low" and "high"; "less_than_raw", the reduction of RMSE relative to the raw
         simulator, with "_low" and "_high"; and "less_than_ridge" likewise, if ridge regression is among the
-        models. The axis "mean" holds the means of these reductions over the three axes of the body.
+        models. The axis "mean" holds the means of these reductions over `judged`.
     """
     pieces, number = np.unique(piece, return_inverse=True)
     rng = generator(seed, "walk bootstrap")
@@ -89,20 +90,20 @@ def summary(
         found[name] = {}
         for k, horizon in enumerate(horizons_s):
             rows: dict[str, dict[str, float]] = {}
-            for a, axis in enumerate(AXES):
+            for a, axis in enumerate(axes):
                 rows[axis] = _interval(values[:, k, a], "rmse", "low", "high")
                 for reference in references:
                     rows[axis] |= _less(reference, less[reference][:, k, a])
             rows["mean"] = {}
             for reference in references:
-                body = less[reference][:, k, : len(BODY_AXES)].mean(-1)
+                body = less[reference][:, k, : len(judged)].mean(-1)
                 rows["mean"] |= _less(reference, body)
             found[name][f"{horizon:.3g}"] = rows
     return found
 
 
 def _rmse(squared: Floats, number: NDArray[np.intp], weight: Floats) -> Floats:
-    """Return the root of the mean of `squared` (N, K, 5) for each row of piece weights (R, P), (R, K, 5)."""
+    """Return the root of the mean of `squared` (N, K, E) for each row of piece weights (R, P), (R, K, E)."""
     count, total = (
         np.stack([values[number == piece].sum(0) for piece in range(weight.shape[1])])
         for values in (np.isfinite(squared).astype(float), np.nan_to_num(squared))

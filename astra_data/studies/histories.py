@@ -1,4 +1,4 @@
-"""ASTRA and NAS on a walk: the grounding model, with motions in the body's frame as states."""
+"""ASTRA and NAS on recordings: the grounding model, with the motions of steps as states."""
 
 from dataclasses import replace
 
@@ -7,62 +7,87 @@ from torch import Tensor
 
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
 from astra_data.learning.networks.paired_windows import PairedWindows
-from astra_data.studies.predictors import Predictor, bounded
+from astra_data.studies.body import Body
+from astra_data.studies.predictors import Predictor
+from astra_data.studies.walking import WALKER
 from astra_data.studies.walks import Stretch
+from astra_data.studies.windows import WindowModel
 
 
 class HistoryModel(Predictor):
-    """A `GroundingModel` whose state is the last step's motion and whose goal is the ball.
+    """A `GroundingModel` whose state is the last step's motion and whose goal is what is seen.
 
-    Motions in the body's frame do not depend on position and heading in the field, so neither does the model.
-    The logs hold no reward: instead, L_rew predicts the decrease of the ball's bounded distance.
+    Of a walk these are in the body's frame and depend neither on position nor on heading in the field.
+    The logs hold no reward: instead, L_rew predicts how much nearer the ball comes, or joints to targets.
+    With a `base`, f_abs corrects that model's motion instead of the simulator's.
     """
 
-    def __init__(self, latent_size: int, head_sizes: tuple[int, ...], weights: LossWeights) -> None:
+    def __init__(
+        self,
+        latent_size: int,
+        head_sizes: tuple[int, ...],
+        weights: LossWeights,
+        body: Body = WALKER,
+        base: WindowModel | None = None,
+    ) -> None:
         super().__init__()
+        self.body, self.latent_size = body, latent_size
         shape = GroundingShape(
-            state_size=3,
-            action_size=4,
-            goal_size=2,
+            state_size=body.motion_size,
+            action_size=body.given_size,
+            goal_size=body.seen_size,
             latent_size=latent_size,
             head_sizes=head_sizes,
             position_octaves=0,
         )
         self.grounding = GroundingModel(shape)
         self.weights = weights
+        self.base = base
+        self.register_buffer("given_std", torch.ones(body.given_size))
+        self.given_std: Tensor
 
     def set_scales(self, stretch: Stretch) -> None:
         """Set the input scales from the histories, and the correction's from the future steps of walking."""
         walked = stretch.is_walking
-        nearer = _nearer(stretch.past_ball)
+        correction = (stretch.motion - stretch.simulated)[walked]
+        if self.base is not None:
+            correction = self.base.residuals(stretch)
+        nearer = self._nearer(stretch)
         model = self.grounding
         model.set_scales(
             {
                 "state": stretch.past_motion.flatten(0, 1),
-                "goal": bounded(stretch.past_ball).flatten(0, 1),
-                "correction": (stretch.motion - stretch.simulated)[walked],
+                "goal": self.body.features(stretch.past_seen).flatten(0, 1),
+                "correction": correction,
             }
         )
         rewards = torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1)
         model.set_reward_scales(rewards, torch.ones_like(rewards[:, 0]))
-        # Sideways and in turn a mean other than zero is an accident of the recordings.
-        model.state_mean[1:] = 0.0
-        model.goal_mean[1:] = 0.0
+        model.state_mean *= model.state_mean.new_tensor(self.body.usual_motion)
+        model.goal_mean *= model.goal_mean.new_tensor(self.body.usual_seen)
+        if self.body.is_scaled and self.body.given_size:
+            self.given_std.copy_(stretch.past_action.flatten(0, 1).std(0).clamp_min(_LEAST))
 
     def begin(self, stretch: Stretch) -> Tensor:
-        """Return the hidden state (B, Z) after the history."""
-        inputs = (stretch.past_motion, bounded(stretch.past_ball), stretch.past_action)
-        _, hidden = self.grounding.encoder(self.grounding.encoder_input(*inputs))
-        return torch.as_tensor(hidden[:, -1])
+        """Return the hidden state (B, Z) after the history, and the memory of the base."""
+        _, hidden = self.grounding.encoder(
+            self._inputs(stretch.past_motion, stretch.past_seen, stretch.past_action)
+        )
+        own = torch.as_tensor(hidden[:, -1])
+        return own if self.base is None else torch.cat([own, self.base.begin(stretch)], dim=-1)
 
-    def motion(self, memory: Tensor, ball: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
+    def motion(self, memory: Tensor, seen: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
         """Return the corrected motion (f_abs)."""
-        return self.grounding.correct(self.grounding.encoder.latent(memory), action, simulated)
+        own, its = memory.tensor_split([self.latent_size], dim=-1)
+        if self.base is not None:
+            simulated = self.base.motion(its, seen, action, simulated)
+        return self.grounding.correct(self.grounding.encoder.latent(own), action / self.given_std, simulated)
 
-    def after(self, memory: Tensor, motion: Tensor, ball: Tensor, action: Tensor) -> Tensor:
-        """Return the hidden state (B, Z) after a step."""
-        inputs = self.grounding.encoder_input(motion, bounded(ball), action)
-        return self.grounding.encoder.step(inputs, memory)
+    def after(self, memory: Tensor, motion: Tensor, seen: Tensor, action: Tensor) -> Tensor:
+        """Return the memory, as of `begin`, after a step."""
+        own, its = memory.tensor_split([self.latent_size], dim=-1)
+        own = self.grounding.encoder.step(self._inputs(motion, seen, action), own)
+        return own if self.base is None else torch.cat([own, self.base.after(its, motion, seen, action)], -1)
 
     def loss(self, stretch: Stretch) -> Tensor:
         """Return λ1 L_trans + λ2 L_rew (paper, Section IV-A) over the history, each step given the true past.
@@ -72,12 +97,13 @@ class HistoryModel(Predictor):
         if self.weights.latent == self.weights.reward == 0.0:
             return stretch.motion.new_zeros(())
         motion, simulated = stretch.past_motion, stretch.past_simulated
-        nearer = _nearer(stretch.past_ball)
+        nearer = self._nearer(stretch)
+        given = stretch.past_action / self.given_std
         windows = PairedWindows(
             state=motion[:, :-1],
-            action=stretch.past_action[:, 1:],
-            previous_action=stretch.past_action[:, :-1],
-            goal=bounded(stretch.past_ball[:, :-1]),
+            action=given[:, 1:],
+            previous_action=given[:, :-1],
+            goal=self.body.features(stretch.past_seen[:, :-1]),
             simulated_next=simulated[:, 1:],
             next_state=motion[:, 1:],
             reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
@@ -89,8 +115,12 @@ class HistoryModel(Predictor):
         total, _ = self.grounding.losses(windows, replace(self.weights, state=0.0))
         return total
 
+    def _nearer(self, stretch: Stretch) -> Tensor:
+        return self.body.nearer(stretch.past_seen, stretch.past_action, stretch.past_motion)
 
-def _nearer(ball: Tensor) -> Tensor:
-    """Return the decrease (B, T - 1) of the bounded distance of the ball (B, T, 2)."""
-    distance: Tensor = bounded(ball).norm(dim=-1)
-    return distance[:, :-1] - distance[:, 1:]
+    def _inputs(self, motion: Tensor, seen: Tensor, action: Tensor) -> Tensor:
+        return self.grounding.encoder_input(motion, self.body.features(seen), action / self.given_std)
+
+
+_LEAST = 1e-6
+"""Least deviation that is divided by."""

@@ -1,6 +1,6 @@
 """The models that a study compares, as its page and its figure show them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from astra_data.methods import METHODS
 
@@ -50,4 +50,20 @@ MODELS = {
         "how much nearer the ball comes",
     ),
 }
-"""By the names in `[fit]` of a study's recipe."""
+"""Of a walk, by the names in a study's recipe."""
+
+MODELS_OF_JOINTS = MODELS | {
+    "raw": replace(MODELS["raw"], text="joints that move to their targets as the time constant says"),
+    "gains": replace(
+        MODELS["gains"],
+        title="Second-order response",
+        text="stiffness, damping and a constant pull of each joint, by least squares",
+    ),
+    "mlp": replace(MODELS["mlp"], text="a feed-forward network on the same H steps"),
+    "astra": replace(
+        MODELS["astra"],
+        text="the same with all three losses, λ = (0.1, 1, 1); the logs have no reward, so L_rew predicts "
+        "how much nearer the joints come to their targets",
+    ),
+}
+"""Of joints."""

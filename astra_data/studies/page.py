@@ -1,4 +1,4 @@
-"""The results of a study as Markdown (its text is in `reports/templates/walks.md.jinja`) and as a figure."""
+"""The results of a study as Markdown (its text is in `reports/templates`) and as a figure."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,8 +8,9 @@ from matplotlib.figure import Figure
 
 from astra_data.reports.figures import walk_prediction
 from astra_data.reports.formatting import fill
-from astra_data.studies.errors import AXES, BODY_AXES
-from astra_data.studies.models import MODELS
+from astra_data.studies.joints import ALL
+from astra_data.studies.models import MODELS, MODELS_OF_JOINTS, Model
+from astra_data.studies.walking import AXES, BODY_AXES
 
 SHOWN_S = 1.0
 """The horizon of the first table."""
@@ -19,18 +20,19 @@ def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str
     """Return the page on what `study.run_study` found by `command`, with the figure in file `image`."""
     first = found["cases"][0]
     last = first["sizes"][-1]["models"]
+    looks, of_joints = _looks(found), _is_of_joints(found)
     recordings = [
         [
             recording["name"],
-            f"{recording['minutes']:.1f}",
+            f"{recording['minutes']:.2g}" if of_joints else f"{recording['minutes']:.1f}",
             str(recording["pieces"]),
-            f"{100 * recording['broken_share']:.0f} %",
+            *([] if of_joints else [f"{100 * recording['broken_share']:.0f} %"]),
         ]
         for recording in found["recordings"]
     ]
     by_minutes = [
         [
-            MODELS[model].title,
+            looks[model].title,
             *(
                 _share(size["models"][model][_shown(first)]["mean"], "less_than_raw")
                 for size in first["sizes"]
@@ -40,7 +42,7 @@ def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str
         if model != "raw"
     ]
     return fill(
-        "walks.md.jinja",
+        "joints.md.jinja" if of_joints else "walks.md.jinja",
         found=found,
         config=found["config"],
         name=name,
@@ -48,11 +50,10 @@ def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str
         image=image,
         recordings=recordings,
         models=[
-            (MODELS[model].title, MODELS[model].text)
-            for model in found["config"]["models"]
-            if model in MODELS
+            (looks[model].title, looks[model].text) for model in found["config"]["models"] if model in looks
         ],
-        cases=list(map(_case, found["cases"])),
+        cases=[_case_of_joints(case, looks) if of_joints else _case(case, looks) for case in found["cases"]],
+        has_targets=found.get("has_targets", True),
         minutes=["model", *(f"{size['minutes']:.3g} min" for size in first["sizes"])],
         by_minutes=by_minutes if len(first["sizes"]) > 1 else [],
         made=found["origin"],
@@ -70,17 +71,26 @@ def figure(found: Mapping[str, Any]) -> Figure:
     def band(cells: list[Mapping[str, float]]) -> Any:  # noqa: ANN401 - an array
         return np.array([[cell[key] for cell in cells] for key in ("rmse", "low", "high")])
 
+    axes = case.get("judged", BODY_AXES)
     by_horizon = {
         axis: {model: band([rows[horizon][axis] for horizon in horizons]) for model, rows in last.items()}
-        for axis in BODY_AXES
+        for axis in axes
     }
     by_minutes = {
         axis: {model: band([size["models"][model][shown][axis] for size in case["sizes"]]) for model in last}
-        for axis in BODY_AXES
+        for axis in axes
     }
     minutes = [size["minutes"] for size in case["sizes"]]
-    looks = {name: (model.title, model.colour) for name, model in MODELS.items()}
+    looks = {name: (model.title, model.colour) for name, model in _looks(found).items()}
     return walk_prediction(case["horizons_s"], by_horizon, minutes, by_minutes, float(shown), looks)
+
+
+def _is_of_joints(found: Mapping[str, Any]) -> bool:
+    return bool(found["config"].get("simulator") == "joints")
+
+
+def _looks(found: Mapping[str, Any]) -> Mapping[str, Model]:
+    return MODELS_OF_JOINTS if _is_of_joints(found) else MODELS
 
 
 def _shown_s(case: Mapping[str, Any]) -> float:
@@ -93,20 +103,53 @@ def _shown(case: Mapping[str, Any]) -> str:
     return f"{_shown_s(case):.3g}"
 
 
-def _case(case: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers of a case on the page, and the lines of its three tables."""
-    size, shown = case["sizes"][-1], _shown(case)
-    at_shown = {model: horizons[shown] for model, horizons in size["models"].items()}
+def _numbers(case: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers of a case on the page."""
+    size = case["sizes"][-1]
     return {
         "title": case["title"],
-        "shown": shown,
+        "shown": _shown(case),
         "minutes": size["minutes"],
         "test_minutes": case["test_minutes"],
         "pieces": case["pieces"],
         "starts": case["starts"][case["horizons_s"].index(_shown_s(case))],
+        "horizons": ["model", *(f"{horizon} s" for horizon in size["models"]["raw"])],
+    }
+
+
+def _case_of_joints(case: Mapping[str, Any], looks: Mapping[str, Model]) -> dict[str, Any]:
+    """Return the numbers of a case, and the lines of its three tables."""
+    models, shown = case["sizes"][-1]["models"], _shown(case)
+    at_shown = {model: horizons[shown] for model, horizons in models.items()}
+    return _numbers(case) | {
         "errors": [
             [
-                MODELS[model].title,
+                looks[model].title,
+                _error(cells[ALL]),
+                *(_share(cells[ALL], f"less_than_{reference}") for reference in ("raw", "ridge")),
+            ]
+            for model, cells in at_shown.items()
+        ],
+        "joints": ["joint", *(looks[model].title for model in models)],
+        "by_joint": [
+            [joint, *(f"{cells[joint]['rmse']:.4f}" for cells in at_shown.values())]
+            for joint in case["axes"][1:]
+        ],
+        "by_horizon": [
+            [looks[model].title, *(f"{cells[ALL]['rmse']:.4f}" for cells in horizons.values())]
+            for model, horizons in models.items()
+        ],
+    }
+
+
+def _case(case: Mapping[str, Any], looks: Mapping[str, Model]) -> dict[str, Any]:
+    """Return the numbers of a case of walks, and the lines of its three tables."""
+    size, shown = case["sizes"][-1], _shown(case)
+    at_shown = {model: horizons[shown] for model, horizons in size["models"].items()}
+    return _numbers(case) | {
+        "errors": [
+            [
+                looks[model].title,
                 *(_error(cells[axis]) for axis in AXES),
                 *(_share(cells["mean"], f"less_than_{reference}") for reference in ("raw", "ridge")),
             ]
@@ -114,7 +157,7 @@ def _case(case: Mapping[str, Any]) -> dict[str, Any]:
         ],
         "by_axis": [
             [
-                MODELS[model].title,
+                looks[model].title,
                 *(
                     _share(cells[axis], f"less_than_{reference}")
                     for reference in ("raw", "ridge")
@@ -124,10 +167,9 @@ def _case(case: Mapping[str, Any]) -> dict[str, Any]:
             for model, cells in at_shown.items()
             if model != "raw"
         ],
-        "horizons": ["model", *(f"{horizon} s" for horizon in size["models"]["raw"])],
         "by_horizon": [
             [
-                MODELS[model].title,
+                looks[model].title,
                 *(
                     " / ".join(f"{cells[axis]['rmse']:.3f}" for axis in BODY_AXES)
                     for cells in horizons.values()

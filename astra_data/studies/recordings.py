@@ -1,4 +1,4 @@
-"""Recordings of a walking robot: datasets and logs → pieces of rows; rows that are not walking are marked."""
+"""Recordings of a robot: datasets and logs → pieces of rows; rows that do not count are marked."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,35 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.core.config import Config, Positive
+from astra_data.core.config import load_recipe
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
 from astra_data.dataset.format import INFO_PATH
-from astra_data.exchange.importers import json
-from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.importing import import_dataset, log_suffixes
+from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import find_sources, is_archive
-from astra_data.worlds.plane.geometry import wrapped
-
-Floats = NDArray[np.float64]
-
-STATE_NAMES = ("x", "y", "yaw", "ball_x", "ball_y")
-ACTION_NAMES = ("turn", "forward", "left", "kick")
-
-
-class WalkingConfig(Config):
-    """When a robot counts as walking: not while it is carried, nor where self-localisation jumps."""
-
-    jump_m: Positive = 0.06
-    """A larger displacement between two rows is a jump of self-localisation: at 60 Hz, 3.6 m/s."""
-    jump_rad: Positive = 0.1
-    """The same for the change of heading."""
-    fastest_m_s: Positive = 0.6
-    """A robot that is faster over half a second is carried or corrects its position. Twice the maximum speed
-    of the robot's walk engine."""
-    piece_s: Positive = 30.0
-    """Longer episodes are cut into pieces of this length, the unit of hold-out and of resampling."""
+from astra_data.studies.body import Body, Floats, Reading
+from astra_data.studies.walking import WALKER
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +27,18 @@ class Piece:
 
     Attributes:
         recording: its name.
-        state: [x, y, heading, ball x, ball y] before each row and after the last, in m and rad, (N + 1, 5).
-        action: (turn, forward, left, kick) in each row, (N, 4). broken: rows that are not walking, (N,).
+        state: before each row and after the last, (N + 1, S): of a walk [x, y, heading, ball x, ball y] in m
+            and rad, of joints their positions.
+        action: in each row, (N, A): of a walk (turn, forward, left, kick), of joints their targets; A is 0
+            where no targets were recorded.
+        broken: rows that are not walking, (N,). body: what they are of.
     """
 
     recording: str
     state: Floats
     action: Floats
     broken: NDArray[np.bool_]
+    body: Body = WALKER
 
     def __len__(self) -> int:
         """Return N."""
@@ -89,61 +75,66 @@ class Recording:
         return float(sum(piece.broken.sum() for piece in self.pieces) / self.rows)
 
 
-def read_recordings(place: Path, mapping: Path, home: Path, config: WalkingConfig) -> list[Recording]:
+def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> list[Recording]:
     """Read every recording in `place`, and import by `mapping` those that are not datasets yet.
 
     Args:
         place: a dataset, a log, an archive of logs, or a folder of any of these; each archive and each
-            dataset is one recording, and so are all loose logs of a folder.
+            dataset is one recording, and each loose log of a folder, or all of these where the mapping has
+            `split.files = false`.
         mapping: how logs become columns.
         home: folder where imported datasets are kept, so that none is imported twice.
-        config: thresholds for walking.
+        config: which body they are of, and which rows count.
 
     Raises:
         BadInputError: a part of `place` is not usable, or there is none; the message says why.
     """
     if not place.exists():
         raise BadInputError(f"{place} does not exist: expected a dataset, or logs that {mapping} describes")
+    settings = load_recipe(mapping, ImportMapping)
+    suffixes = log_suffixes(settings)
     found, faults = [], []
-    for part in _parts(place):
+    for part in _parts(place, suffixes, each=settings.split.files):
         try:
-            found.append(_recording(part, mapping, home, config))
+            found.append(_recording(part, mapping, suffixes, home, config))
         except BadInputError as error:
             faults.append(str(error))
     if not found:
-        reasons = "; ".join(faults) or "it has no datasets, no archives and no .json or .log files"
-        raise BadInputError(f"{place}: expected recordings of a walking robot, found none: {reasons}")
+        endings = " or ".join(suffixes)
+        reasons = "; ".join(faults) or f"it has no datasets, no archives and no {endings} files"
+        raise BadInputError(f"{place}: expected recordings of a robot, found none: {reasons}")
     if faults:
         raise BadInputError(f"{place}: {'; '.join(faults)}; move aside what is not a recording")
     return found
 
 
-def _parts(place: Path) -> Iterator[Path]:
-    """Yield the file or folder of each recording in `place`."""
+def _parts(place: Path, suffixes: tuple[str, ...], *, each: bool) -> Iterator[Path]:
+    """Yield the file or folder of each recording in `place`; of loose logs, `each` or their folder."""
     if place.is_file() or (place / INFO_PATH).is_file():
         yield place
         return
     inside = sorted(path for path in place.iterdir() if not path.name.startswith("."))
-    has_logs = any(path.is_file() and path.name.endswith(json.SUFFIXES) for path in inside)
-    if has_logs:
-        yield place
+    logs = [path for path in inside if path.is_file() and path.name.endswith(suffixes)]
+    if logs:
+        yield from logs if each else [place]
     for path in inside:
         if is_archive(path) and path.is_file():
             yield path
-        elif path.is_dir() and not has_logs:
-            yield from _parts(path)
+        elif path.is_dir() and not logs:
+            yield from _parts(path, suffixes, each=each)
 
 
-def _recording(part: Path, mapping: Path, home: Path, config: WalkingConfig) -> Recording:
+def _recording(
+    part: Path, mapping: Path, suffixes: tuple[str, ...], home: Path, config: Reading
+) -> Recording:
     name, root = place_name(part), part
     if not (part / INFO_PATH).is_file():
-        files = [source.path for source in find_sources(part, json.SUFFIXES)]
+        files = [source.path for source in find_sources(part, suffixes)]
         digests = "".join(file_digest(path) for path in dict.fromkeys([mapping, *files]))
         root = home / f"{name}-{sha256(digests.encode()).hexdigest()[:8]}"
         if not root.exists():
             import_dataset([part], mapping, out=root)
     dataset = Dataset.open(root)
-    _check_names(dataset)
     fps = int(dataset.info["fps"])
     return Recording(name, dataset.content_hash, fps, tuple(_pieces(name, dataset, fps, config)))
 
@@ -153,21 +144,10 @@ def place_name(place: Path) -> str:
     return place.resolve().name.partition(".")[0]
 
 
-def _check_names(dataset: Dataset) -> None:
-    expected = {STATE: STATE_NAMES, NEXT_STATE: STATE_NAMES, ACTION: ACTION_NAMES}
-    found = {column.name: column.names for column in dataset.schema}
-    faults = [
-        f"{name} holds {', '.join(found.get(name) or ('no names',))}, expected {', '.join(names)}"
-        for name, names in expected.items()
-        if found.get(name) != names
-    ]
-    if faults:
-        raise BadInputError(f"{dataset.reference}: {'; '.join(faults)}")
-
-
-def _pieces(name: str, dataset: Dataset, fps: int, config: WalkingConfig) -> Iterator[Piece]:
+def _pieces(name: str, dataset: Dataset, fps: int, config: Reading) -> Iterator[Piece]:
     longest = round(config.piece_s * fps)
-    columns = [STATE, NEXT_STATE, ACTION, TERMINATED]
+    body = config.body(dataset)
+    columns = [STATE, NEXT_STATE, TERMINATED, *([ACTION] if body.given_size else [])]
     for episode in dataset.episodes(columns):
         # A terminated episode has no next state at its end in the log: the state itself stands in.
         rows = len(episode) - int(episode.columns[TERMINATED][-1])
@@ -175,20 +155,9 @@ def _pieces(name: str, dataset: Dataset, fps: int, config: WalkingConfig) -> Ite
             continue
         following = episode.columns[NEXT_STATE][rows - 1 : rows]
         state = np.concatenate([episode.columns[STATE][:rows], following]).astype(np.float64)
-        action = episode.columns[ACTION][:rows].astype(np.float64)
-        broken = broken_rows(state, fps, config)
+        recorded = episode.columns.get(ACTION, np.empty((len(episode), 0)))
+        action = recorded[:rows].astype(np.float64)
+        broken = config.broken(state, fps)
         for first in range(0, rows, longest):
             last = min(first + longest, rows)
-            yield Piece(name, state[first : last + 1], action[first:last], broken[first:last])
-
-
-def broken_rows(state: Floats, fps: int, config: WalkingConfig) -> NDArray[np.bool_]:
-    """Return which rows (N,) between states (N + 1, 5) are not walking: jumps, and speeds above the limit."""
-    place, heading = state[:, :2], state[:, 2]
-    moved = np.linalg.norm(np.diff(place, axis=0), axis=1)
-    broken = (moved > config.jump_m) | (abs(wrapped(np.diff(heading))) > config.jump_rad)
-    half = min(fps // 2, len(moved))
-    far = np.linalg.norm(place[half:] - place[:-half], axis=1) > config.fastest_m_s * half / fps
-    for first in np.flatnonzero(far):
-        broken[first : first + half] = True
-    return np.asarray(broken)
+            yield Piece(name, state[first : last + 1], action[first:last], broken[first:last], body)

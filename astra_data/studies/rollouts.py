@@ -1,7 +1,8 @@
-"""Open-loop prediction of walks, and fitting models to it."""
+"""Open-loop prediction of recordings, and fitting models to it."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,12 +14,12 @@ from astra_data.core.seeding import derive
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.studies.histories import HistoryModel
-from astra_data.studies.motion import MIRROR, chained, composed, seen_after
-from astra_data.studies.predictors import Gains, Predictor
+from astra_data.studies.joints import Joints
+from astra_data.studies.predictors import Gains, Predictor, Response
 from astra_data.studies.walks import Stretch, Walks
 from astra_data.studies.windows import WindowModel
 
-STRENGTHS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+STRENGTHS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Penalties of ridge regression, of which the best is chosen."""
 
 
@@ -36,7 +37,9 @@ class FitConfig(DescentConfig):
     weight_decay: NotNegative = 0.01
     """Weight decay of AdamW."""
     noise: NotNegative = 1.0
-    """Standard deviation of noise on the history, in units of `NOISE`, against overfitting."""
+    """Standard deviation of noise on the history, in units of `Body.noise`, against overfitting."""
+    start: Literal["simulator", "ridge"] = "simulator"
+    """What networks correct: the motion of the raw simulator, or that of ridge regression."""
     latent_size: AtOnce = 64
     """Z of ASTRA and NAS."""
     head_sizes: tuple[AtOnce, ...] = (64, 64)
@@ -45,30 +48,29 @@ class FitConfig(DescentConfig):
     """Hidden layers of the feed-forward network."""
 
 
-NOISE = ((0.02, 0.02, 0.06), (0.1, 0.1))
-"""Noise on motions (forward and left in m, turn in rad) and on the ball (m)."""
-
-
 def predict(model: Predictor, stretch: Stretch) -> Tensor:
-    """Return the predicted poses after each future step, in the body's frame at the start, (B, F, 3).
+    """Return the predicted cumulative motions after each future step, (B, F, M).
 
-    The mean of the prediction and of the mirrored prediction for the mirror image, so that it is symmetric.
+    Of a walk, the mean of the prediction and of the mirrored prediction for the mirror image, so that it is
+    symmetric.
     """
-    both = torch.stack(
-        [rollout(model, stretch), rollout(model, stretch.mirrored()) * stretch.motion.new_tensor(MIRROR)]
-    )
+    if not stretch.body.mirror:
+        return rollout(model, stretch)
+    signs = stretch.motion.new_tensor(stretch.body.mirror["motion"])
+    both = torch.stack([rollout(model, stretch), rollout(model, stretch.mirrored()) * signs])
     return both.mean(0)
 
 
 def rollout(model: Predictor, stretch: Stretch) -> Tensor:
-    """Return the poses (B, F, 3) after each future step, predicted from the one before; the ball rests."""
-    memory, ball = model.begin(stretch), stretch.past_ball[:, -1]
+    """Return the cumulative motions (B, F, M) after each future step, predicted from the one before."""
+    body, memory, seen = stretch.body, model.begin(stretch), stretch.past_seen[:, -1]
     place = torch.zeros_like(stretch.motion[:, 0])
     places = []
-    for action, simulated in zip(stretch.action.unbind(1), stretch.simulated.unbind(1), strict=True):
-        motion = model.motion(memory, ball, action, simulated)
-        place, ball = composed(place, motion), seen_after(ball, motion)
-        memory = model.after(memory, motion, ball, action)
+    for recorded, replayed in zip(stretch.action.unbind(1), stretch.simulated.unbind(1), strict=True):
+        action, simulated = body.command(recorded, replayed, seen)
+        motion = model.motion(memory, seen, action, simulated)
+        place, seen = body.composed(place, motion), body.seen_after(seen, motion)
+        memory = model.after(memory, motion, seen, action)
         places.append(place)
     return torch.stack(places, dim=1)
 
@@ -84,16 +86,16 @@ def fit(name: str, walks: Walks, history: int, config: FitConfig, seed: int, pro
 
 
 def _raw(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    return Gains()
+    return Gains(walks.body.motion_size)
 
 
 def _gains(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    model = Gains()
+    model = Response(walks.body.motion_size) if isinstance(walks.body, Joints) else Gains()
     model.fit(_sample(walks, history, config.steps))
     return model
 
 
-def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
+def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) -> WindowModel:
     """Solve ridge regression with the penalty that is best on the last quarter of each sequence."""
     sequence, step = walks.starts(history, 1)
     is_late = step > 0.75 * walks.lengths[sequence]
@@ -104,27 +106,33 @@ def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) ->
     late_sequence, late_step = walks.starts(history, config.steps)
     is_late = late_step > 0.75 * walks.lengths[late_sequence]
     test = walks.stretches(late_sequence[is_late], late_step[is_late], history, config.steps)
-    end = chained(test.motion)[:, -1]
+    end = walks.body.chained(test.motion)[:, -1]
+    spread = end.std(0).clamp_min(_LEAST)
 
     def error(strength: float) -> float:
         model.solve(early, strength)
-        return float(((predict(model, test)[:, -1] - end) / end.std(0)).square().mean())
+        return float(((predict(model, test)[:, -1] - end) / spread).square().mean())
 
-    model = WindowModel(history).requires_grad_(False)
+    model = WindowModel(history, body=walks.body).requires_grad_(False)
     model.set_scales(everything)
     model.solve(everything, min(STRENGTHS, key=error) if len(test) > 1 else STRENGTHS[-1])
     return model
 
 
 def _mlp(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    model = WindowModel(history, config.hidden_sizes)
+    model = WindowModel(history, config.hidden_sizes, walks.body, _base(walks, history, config, progress))
     model.set_scales(_sample(walks, history, 1))
     return _descend(model, lambda stretch: torch.zeros(()), walks, history, config, progress)
 
 
+def _base(walks: Walks, history: int, config: FitConfig, progress: Progress) -> WindowModel | None:
+    return _ridge(walks, history, config, progress) if config.start == "ridge" else None
+
+
 def _history_model(weights: LossWeights) -> Callable[[Walks, int, FitConfig, Progress], Predictor]:
     def fitted(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-        model = HistoryModel(config.latent_size, config.head_sizes, weights)
+        base = _base(walks, history, config, progress)
+        model = HistoryModel(config.latent_size, config.head_sizes, weights, walks.body, base)
         model.set_scales(_sample(walks, history, 1))
         return _descend(model, model.loss, walks, history, config, progress)
 
@@ -164,7 +172,8 @@ def _descend[M: (WindowModel, HistoryModel)](
     progress: Progress,
 ) -> M:
     """Fit by gradients: open-loop errors after 1, 2, ... steps in units of their spread, plus `own_loss`."""
-    spread = chained(_sample(walks, history, config.steps).motion).std(0)
+    chained = walks.body.chained
+    spread = chained(_sample(walks, history, config.steps).motion).std(0).clamp_min(_LEAST)
     sequence, step = walks.starts(history, 1)
     descent = Descent(model, config, weight_decay=config.weight_decay)
     while not descent.is_over:
@@ -184,12 +193,14 @@ def _descend[M: (WindowModel, HistoryModel)](
 
 
 _EMA_RATE = 0.01
+_LEAST = 1e-3
+"""Least spread that errors are divided by, in the unit of motions: a joint that stands is not all."""
 
 
 def _noisy(stretch: Stretch, size: float) -> Stretch:
-    motion, ball = (stretch.motion.new_tensor(scale) * size for scale in NOISE)
+    motion, seen = (stretch.motion.new_tensor(scale) * size for scale in stretch.body.noise)
     return replace(
         stretch,
         past_motion=stretch.past_motion + motion * torch.randn_like(stretch.past_motion),
-        past_ball=stretch.past_ball + ball * torch.randn_like(stretch.past_ball),
+        past_seen=stretch.past_seen + seen * torch.randn_like(stretch.past_seen),
     )

@@ -10,8 +10,9 @@ from astra_data.core.config import load_recipe, load_tables
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.display import shown
+from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import place_name, read_recordings
-from astra_data.studies.study import GapRecipe, run_study
+from astra_data.studies.study import run_study
 
 RUNS = Path("runs")
 
@@ -76,8 +77,8 @@ def measure_gap(
     name = recipe_path.stem
     home, mapping = root / name, recipe_path.parent / recipe.mapping
     imported = home / "recordings"
-    tested = read_recordings(data, mapping, imported, recipe.walking)
-    learned = [] if train is None else read_recordings(train, mapping, imported, recipe.walking)
+    tested = read_recordings(data, mapping, imported, recipe.reading)
+    learned = [] if train is None else read_recordings(train, mapping, imported, recipe.reading)
     both = {recording.content_hash for recording in tested} & {
         recording.content_hash for recording in learned
     }

@@ -5,13 +5,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
-from astra_data.core.config import Config, Positive, did_you_mean
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
@@ -19,46 +17,14 @@ from astra_data.core.progress import Progress, part
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import generator
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.studies.errors import AXES, Trial, summary
-from astra_data.studies.recordings import Piece, Recording, WalkingConfig
-from astra_data.studies.rollouts import MODELS, FitConfig, fit
-from astra_data.studies.walks import StepsConfig, Walks
+from astra_data.studies.errors import Trial, summary
+from astra_data.studies.gap_recipe import GapRecipe
+from astra_data.studies.recordings import Piece, Recording
+from astra_data.studies.rollouts import fit
+from astra_data.studies.walks import Walks
 
 LEARNED = ("mlp", "nas", "astra")
 """Models that depend on the seed even with all the data."""
-
-
-class GapRecipe(Config):
-    """How well models of a robot's walk predict recordings of it."""
-
-    mapping: str
-    """How logs become columns: a file of `astra-data import`, relative to the recipe."""
-    models: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Names in `rollouts.MODELS`; the raw simulator is always added."""
-    seeds: Annotated[tuple[int, ...], Field(min_length=1)]
-    """Seeds of the smaller data sizes' choice of pieces, and of the networks."""
-    minutes: tuple[Positive, ...] = ()
-    """Sizes of the training data, besides all of it; each is a subset of the larger ones."""
-    horizons_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.5, 1.0, 2.0, 3.0)
-    """Prediction horizons, besides one step; rounded to control steps."""
-    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Share of each recording's pieces held out for testing, if no other recordings are given."""
-    notes: tuple[str, ...] = ()
-    """Paragraphs for the page, such as which data was used for tuning."""
-    walking: WalkingConfig = WalkingConfig()
-    """When a robot counts as walking."""
-    steps: StepsConfig = StepsConfig()
-    """How rows become control steps."""
-    fit: FitConfig = FitConfig()
-    """Settings of fitting."""
-
-    @field_validator("models")
-    @classmethod
-    def _are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
-        for name in models:
-            if name not in MODELS:
-                raise ValueError(f"unknown model '{name}'{did_you_mean(name, MODELS)}")
-        return ("raw", *(name for name in dict.fromkeys(models) if name != "raw"))
 
 
 @dataclass(frozen=True)
@@ -125,7 +91,8 @@ def shortened(pieces: Sequence[Piece], rows: int, seed: int) -> tuple[Piece, ...
         piece, room = pieces[number], rows - sum(map(len, kept))
         if room <= 0:
             break
-        kept.append(Piece(piece.recording, piece.state[: room + 1], piece.action[:room], piece.broken[:room]))
+        columns = (piece.state[: room + 1], piece.action[:room], piece.broken[:room])
+        kept.append(Piece(piece.recording, *columns, piece.body))
     return tuple(kept)
 
 
@@ -144,9 +111,14 @@ def run_study(
         raise BadInputError(
             f"expected recordings of one rate, got {', '.join(map(str, sorted(rates)))} per second"
         )
+    bodies = [recording.pieces[0].body for recording in every]
+    if any(body != bodies[0] for body in bodies):
+        raise BadInputError("expected recordings of the same joints, with targets in all or in none")
     fps = rates.pop()
+    free = {"notes", "models", "seeds", "minutes"}
+    free |= {"walking"} if recipe.simulator == "joints" else {"joints", "simulator"}
     settings = {
-        "recipe": recipe.model_dump(mode="json", exclude={"notes", "models", "seeds", "minutes"}),
+        "recipe": recipe.model_dump(mode="json", exclude=free),
         "data": [recording.content_hash for recording in data],
         "train": [recording.content_hash for recording in train],
     }
@@ -165,6 +137,7 @@ def run_study(
             "config": recipe.model_dump(mode="json"),
             "step_s": recipe.steps.rows / fps,
             "recordings": [_described(recording) for recording in every],
+            "has_targets": bodies[0].given_size > 0,
             "cases": found,
             "origin": made | stopwatch.spent(),
         }
@@ -211,6 +184,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     horizons = (1, *(round(seconds / step_s) for seconds in recipe.horizons_s))
     horizons_s = [horizon * step_s for horizon in horizons]
     trial = Trial.of(Walks.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
+    body = trial.stretch.body
     fits = list(_fits(recipe, case, fps))
     squared: dict[float, dict[str, list[Any]]] = {}
     walks: dict[tuple[float, int], Walks] = {}
@@ -242,7 +216,11 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         {
             "minutes": minutes,
             "models": summary(
-                {name: np.stack(values) for name, values in models.items()}, trial.piece, horizons_s
+                {name: np.stack(values) for name, values in models.items()},
+                trial.piece,
+                horizons_s,
+                axes=body.axes,
+                judged=body.judged,
             ),
         }
         for minutes, models in sorted(squared.items())
@@ -251,7 +229,8 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     return {
         "name": case.name,
         "title": case.title,
-        "axes": list(AXES),
+        "axes": list(body.axes),
+        "judged": list(body.judged),
         "horizons_s": horizons_s,
         "starts": walked.sum(0).tolist(),
         "pieces": len(np.unique(trial.piece)),

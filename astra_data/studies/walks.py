@@ -1,7 +1,8 @@
-"""Recorded walks in control steps, paired with the abstract simulator; and stretches of them."""
+"""Recorded motions in control steps, paired with the abstract simulator; and stretches of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,13 +10,12 @@ from torch.nn.utils.rnn import pad_sequence
 
 from astra_data.core.config import Config, Count
 from astra_data.core.errors import BadInputError
-from astra_data.studies.motion import MIRROR, between
-from astra_data.studies.planar_walker import PlanarWalker
+from astra_data.studies.body import Body
 from astra_data.studies.recordings import Piece
-from astra_data.worlds.plane.geometry import turned
+from astra_data.studies.walking import WALKER
 
-MIRRORED_ACTION = (-1.0, 1.0, -1.0, 1.0)
-MIRRORED_POINT = (1.0, -1.0)
+_KINDS = {"action": "action", "given": "action", "seen": "seen"}
+"""What of `Body.mirror` the columns follow; all others are motions."""
 
 
 class StepsConfig(Config):
@@ -29,43 +29,51 @@ class StepsConfig(Config):
 
 @dataclass(frozen=True)
 class Stretch:
-    """B stretches of a walk: H steps of history, then F steps to predict, all in the body's frame.
+    """B stretches of a recording: H steps of history, then F steps to predict; sizes as in `Body`.
 
     Attributes:
-        past_motion: of each past step, (B, H, 3); the simulator's where the robot did not walk.
-        past_action: mean action in each, (B, H, 4). past_ball: the ball after each, in m, (B, H, 2).
-        past_simulated: the simulator's motion in each, (B, H, 3).
-        action: mean action in each future step, (B, F, 4). simulated: the simulator's motion, (B, F, 3).
-        motion: the robot's motion, (B, F, 3). is_walking: (B, F) bool.
-        heading: in the field at the start of the prediction, (B,).
+        past_motion: of each past step, (B, H, M); the simulator's where the robot did not walk.
+        past_action: the command in each, (B, H, G). past_seen: what is seen after each, (B, H, S).
+        past_simulated: the simulator's motion in each, (B, H, M).
+        action: mean action in each future step, as recorded, (B, F, A).
+        simulated: the simulator's motion from each recorded state, (B, F, M).
+        motion: the robot's motion, (B, F, M). is_walking: (B, F) bool, for joints wherever there is a step.
+        heading: in the field at the start of the prediction, (B,). body: what moves.
     """
 
     past_motion: Tensor
     past_action: Tensor
-    past_ball: Tensor
+    past_seen: Tensor
     past_simulated: Tensor
     action: Tensor
     simulated: Tensor
     motion: Tensor
     is_walking: Tensor
     heading: Tensor
+    body: Body = WALKER
 
     def __len__(self) -> int:
         """Return B."""
         return len(self.heading)
 
     def mirrored(self, which: Tensor | None = None) -> "Stretch":
-        """Mirror left and right in the stretches in `which` (B,) bool, by default all."""
-        signs = {3: MIRROR, 4: MIRRORED_ACTION, 2: MIRRORED_POINT}
-        changed = {}
+        """Mirror left and right in the stretches in `which` (B,) bool, by default all; joints stay."""
+        if not self.body.mirror:
+            return self
+        changed: dict[str, Any] = {}
         for field in fields(self):
             values = getattr(self, field.name)
-            if values.dim() == 3:
-                sign = values.new_tensor(signs[values.shape[-1]])
-                flips = values * sign
-                values = flips if which is None else torch.where(which[:, None, None], flips, values)
-            changed[field.name] = values
-        return Stretch(**changed)
+            if isinstance(values, Tensor) and values.dim() == 3:
+                kind = _KINDS.get(field.name.removeprefix("past_"), "motion")
+                flips = values * values.new_tensor(self.body.mirror[kind])
+                chosen = flips if which is None else torch.where(which[:, None, None], flips, values)
+                changed[field.name] = chosen
+        return replace(self, **changed)
+
+    def first(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what is seen before the first future step, its command and the simulator's motion."""
+        seen = self.past_seen[:, -1]
+        return seen, *self.body.command(self.action[:, 0], self.simulated[:, 0], seen)
 
 
 @dataclass(frozen=True)
@@ -76,20 +84,21 @@ class Walks:
     starts at every row.
 
     Attributes:
-        motion: of each step, in the body's frame, (E, T, 3). simulated: the abstract simulator's, (E, T, 3).
-        action: mean action of the rows, (E, T, 4). ball: in the body's frame before each step and after the
-        last, (E, T + 1, 2). heading: before each step, (E, T). is_walking: (E, T) bool, False in the padding.
-        piece: index of the piece of each sequence, (E,). lengths: steps of each, (E,).
+        motion: of each step, (E, T, M). simulated: the abstract simulator's, (E, T, M).
+        action: mean action of the rows, (E, T, A). seen: what is seen before each step and after the last,
+        (E, T + 1, S). heading: before each step, (E, T). is_walking: (E, T) bool, False in the padding.
+        piece: index of the piece of each sequence, (E,). lengths: steps of each, (E,). body: what moves.
     """
 
     motion: Tensor
     simulated: Tensor
     action: Tensor
-    ball: Tensor
+    seen: Tensor
     heading: Tensor
     is_walking: Tensor
     piece: Tensor
     lengths: Tensor
+    body: Body = WALKER
 
     @classmethod
     def of_pieces(cls, pieces: Sequence[Piece], fps: int, config: StepsConfig) -> "Walks":
@@ -98,8 +107,9 @@ class Walks:
         Raises:
             BadInputError: no piece is long enough for a history and one step.
         """
+        body = pieces[0].body.at(config.rows / fps)
         sequences = [
-            _steps(piece, number, first, fps, config.rows)
+            _steps(body, piece, number, first, fps, config.rows)
             for number, piece in enumerate(pieces)
             for first in range(config.rows)
             if len(piece) - first >= (config.history + 1) * config.rows
@@ -109,12 +119,13 @@ class Walks:
             raise BadInputError(f"expected pieces of more than {seconds:.1f} s without a split, found none")
         columns = {
             name: pad_sequence([sequence[name] for sequence in sequences], batch_first=True)
-            for name in ("motion", "simulated", "action", "ball", "heading", "is_walking")
+            for name in ("motion", "simulated", "action", "seen", "heading", "is_walking")
         }
         return cls(
             **columns,
             piece=torch.tensor([int(sequence["piece"]) for sequence in sequences]),
             lengths=torch.tensor([len(sequence["motion"]) for sequence in sequences]),
+            body=body,
         )
 
     def starts(self, history: int, steps: int) -> tuple[Tensor, Tensor]:
@@ -130,47 +141,28 @@ class Walks:
         """Return the stretches (B, ...) of `sequence` (B,) whose prediction starts at `step` (B,)."""
         row = sequence[:, None]
         past = step[:, None] + torch.arange(-history, 0)
-        simulated = self.simulated[row, past]
+        simulated, before = self.simulated[row, past], self.seen[row, past]
         ahead = step[:, None] + torch.arange(steps)
         inside = ahead < self.is_walking.shape[1]
         ahead = ahead.clamp_max(self.is_walking.shape[1] - 1)
         return Stretch(
             past_motion=torch.where(self.is_walking[row, past][..., None], self.motion[row, past], simulated),
-            past_action=self.action[row, past],
-            past_ball=self.ball[row, past + 1],
+            past_action=self.body.command(self.action[row, past], simulated, before)[0],
+            past_seen=self.seen[row, past + 1],
             past_simulated=simulated,
             action=self.action[row, ahead],
             simulated=self.simulated[row, ahead],
             motion=self.motion[row, ahead],
             is_walking=self.is_walking[row, ahead] & inside,
             heading=self.heading[sequence, step],
+            body=self.body,
         )
 
 
-def _steps(piece: Piece, number: int, first: int, fps: int, rows: int) -> dict[str, Tensor]:
+def _steps(body: Body, piece: Piece, number: int, first: int, fps: int, rows: int) -> dict[str, Tensor]:
     """Return the control steps of a piece from row `first` on, each column (T, ...)."""
     count = (len(piece) - first) // rows
-    state = torch.from_numpy(piece.state[first : first + count * rows + 1 : rows])
-    action = torch.from_numpy(piece.action[first : first + count * rows]).reshape(count, rows, 4)
-    broken = piece.broken[first : first + count * rows].reshape(count, rows).any(axis=1)
-    pose = state[:, :3]
-    return {
-        "motion": between(pose[:-1], pose[1:]).float(),
-        "simulated": _replayed(state[:-1], action, fps).float(),
-        "action": action.mean(1).float(),
-        "ball": turned(state[:, 3:] - pose[:, :2], -pose[:, 2]).float(),
-        "heading": pose[:-1, 2].float(),
-        "is_walking": torch.from_numpy(~broken),
-        "piece": torch.tensor(number),
-    }
-
-
-def _replayed(state: Tensor, action: Tensor, fps: int) -> Tensor:
-    """Return the abstract simulator's motions (T, 3) from `state` (T, 5) under actions (T, rows, 4)."""
-    simulator = PlanarWalker(len(state), timestep_s=1 / fps)
-    # The velocity before does not matter: the body follows commands at once.
-    standing = torch.zeros(len(state), 3, dtype=state.dtype)
-    simulator.reset_to(torch.cat([state[:, :3], standing, state[:, 3:]], dim=-1))
-    for row in action.unbind(1):
-        simulator.step(row)
-    return between(state[:, :3], simulator.state[:, :3])
+    last = first + count * rows
+    broken = piece.broken[first:last].reshape(count, rows).any(axis=1)
+    columns = body.steps(piece.state[first : last + 1], piece.action[first:last], rows, fps)
+    return columns | {"is_walking": torch.from_numpy(~broken), "piece": torch.tensor(number)}

@@ -4,63 +4,93 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.learning.networks.history import mlp
-from astra_data.studies.predictors import Predictor, bounded
+from astra_data.studies.body import Body
+from astra_data.studies.predictors import Predictor
+from astra_data.studies.walking import WALKER
 from astra_data.studies.walks import Stretch
+
+_LEAST = 1e-6
+"""Least deviation that is divided by."""
 
 
 class WindowModel(Predictor):
-    """Corrects the simulator's motion from the last H motions and actions, the ball, and that motion itself.
+    """Corrects the simulator's motion from the last H motions and commands, what is seen, and that motion.
 
-    Without hidden layers it is linear. Scales are buffers, so they are saved with the weights.
+    Without hidden layers it is linear. With a `base` of the same history it corrects that model's motion
+    instead. Scales are buffers, so they are saved with the weights.
     """
 
-    def __init__(self, history: int, hidden_sizes: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self,
+        history: int,
+        hidden_sizes: tuple[int, ...] = (),
+        body: Body = WALKER,
+        base: "WindowModel | None" = None,
+    ) -> None:
         super().__init__()
-        self.history = history
-        self.network = mlp((7 * history + 9, *hidden_sizes, 3))
+        self.history, self.body = history, body
+        motion, given, seen = body.motion_size, body.given_size, body.seen_size
+        inputs = (motion + given) * (history + 1) + seen
+        self.base = base
+        self.network = mlp((inputs, *hidden_sizes, motion))
         # Before fitting it is the raw simulator.
         for parameter in self.network[-1].parameters():
             nn.init.zeros_(parameter)
         for name in ("motion_mean", "motion_std", "correction_std"):
-            self.register_buffer(name, torch.ones(3))
+            self.register_buffer(name, torch.ones(motion))
+        for name, size in (("given_std", given), ("seen_std", seen)):
+            self.register_buffer(name, torch.ones(size))
+        self.register_buffer("seen_mean", torch.zeros(seen))
         self.motion_mean: Tensor
         self.motion_std: Tensor
         self.correction_std: Tensor
+        self.given_std: Tensor
+        self.seen_mean: Tensor
+        self.seen_std: Tensor
 
     def set_scales(self, stretch: Stretch) -> None:
         """Set the scales from the future steps of walking."""
         motion, simulated = (values[stretch.is_walking] for values in (stretch.motion, stretch.simulated))
-        self.motion_std.copy_(motion.std(0))
-        # Sideways and in turn a mean other than zero is an accident of the recordings.
-        self.motion_mean.copy_(motion.mean(0) * motion.new_tensor([1.0, 0.0, 0.0]))
-        self.correction_std.copy_((motion - simulated).std(0))
+        self.motion_std.copy_(motion.std(0).clamp_min(_LEAST))
+        self.motion_mean.copy_(motion.mean(0) * motion.new_tensor(self.body.usual_motion))
+        self.correction_std.copy_((motion - simulated).std(0).clamp_min(_LEAST))
+        if self.base is not None:
+            self.correction_std.copy_(self.base.residuals(stretch).std(0).clamp_min(_LEAST))
+        if self.body.is_scaled:
+            seen, given, _ = stretch.first()
+            if given.numel():
+                self.given_std.copy_(given.std(0).clamp_min(_LEAST))
+            self.seen_mean.copy_(seen.mean(0))
+            self.seen_std.copy_(seen.std(0).clamp_min(_LEAST))
 
-    def inputs(self, memory: Tensor, ball: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
-        """Return the network's inputs, (B, 7 H + 9)."""
-        past, past_action = memory.view(len(memory), self.history, 7).split((3, 4), dim=-1)
-        seen = [self._normal(past).flatten(1), past_action.flatten(1), action, bounded(ball)]
-        return torch.cat([*seen, self._normal(simulated)], dim=-1)
+    def inputs(self, memory: Tensor, seen: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
+        """Return the network's inputs, (B, (M + G) (H + 1) + S)."""
+        sizes = (self.body.motion_size, self.body.given_size)
+        past, past_action = memory.view(len(memory), self.history, sum(sizes)).split(sizes, dim=-1)
+        given = [(past_action / self.given_std).flatten(1), action / self.given_std]
+        place = (self.body.features(seen) - self.seen_mean) / self.seen_std
+        return torch.cat([self._normal(past).flatten(1), *given, place, self._normal(simulated)], dim=-1)
 
     def begin(self, stretch: Stretch) -> Tensor:
-        """Return the window of past motions and actions, (B, 7 H)."""
+        """Return the window of past motions and commands, (B, (M + G) H)."""
         return torch.cat([stretch.past_motion, stretch.past_action], dim=-1).flatten(1)
 
-    def motion(self, memory: Tensor, ball: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
+    def motion(self, memory: Tensor, seen: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
         """Return the corrected motion."""
-        correction: Tensor = self.network(self.inputs(memory, ball, action, simulated))
-        return simulated + self.correction_std * correction
+        correction: Tensor = self.network(self.inputs(memory, seen, action, simulated))
+        start = simulated if self.base is None else self.base.motion(memory, seen, action, simulated)
+        return start + self.correction_std * correction
 
-    def after(self, memory: Tensor, motion: Tensor, ball: Tensor, action: Tensor) -> Tensor:
+    def after(self, memory: Tensor, motion: Tensor, seen: Tensor, action: Tensor) -> Tensor:
         """Return the window moved on by one step."""
-        return torch.cat([memory[:, 7:], motion, action], dim=-1)
+        return torch.cat([memory[:, motion.shape[1] + action.shape[1] :], motion, action], dim=-1)
 
     def solve(self, stretch: Stretch, strength: float) -> None:
         """Solve ridge regression of the first step's correction; the penalty is `strength` times the samples.
 
         Only for a model without hidden layers.
         """
-        step = (stretch.past_ball[:, -1], stretch.action[:, 0], stretch.simulated[:, 0])
-        inputs = self.inputs(self.begin(stretch), *step).double()
+        inputs = self.inputs(self.begin(stretch), *stretch.first()).double()
         target = ((stretch.motion - stretch.simulated)[:, 0] / self.correction_std).double()
         inputs = torch.cat([inputs, torch.ones_like(inputs[:, :1])], dim=1)
         penalty = strength * len(inputs) * torch.ones(inputs.shape[1], dtype=torch.float64)
@@ -70,6 +100,10 @@ class WindowModel(Predictor):
         with torch.no_grad():
             weight.copy_(solution[:-1].T)
             bias.copy_(solution[-1])
+
+    def residuals(self, stretch: Stretch) -> Tensor:
+        """Return what the prediction of the first step lacks, (B, M)."""
+        return stretch.motion[:, 0] - self.motion(self.begin(stretch), *stretch.first())
 
     def _normal(self, motion: Tensor) -> Tensor:
         return (motion - self.motion_mean) / self.motion_std

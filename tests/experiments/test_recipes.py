@@ -6,12 +6,12 @@ from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.plan import plan
-from astra_data.studies.study import GapRecipe
+from astra_data.studies.gap_recipe import GapRecipe
 
 HOUSE = Path(__file__).parents[2]
 
 
-WALKS = [HOUSE / "recipes/nao_real.toml"]
+WALKS = [HOUSE / f"recipes/{name}.toml" for name in ("nao_real", "icub_joints", "pace_joints")]
 """Recipes of `astra-data gap`, which have no stages."""
 
 

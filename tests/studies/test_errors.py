@@ -3,8 +3,9 @@ import pytest
 import torch
 from toy_walks import FPS, piece
 
-from astra_data.studies.errors import AXES, Trial, summary
+from astra_data.studies.errors import Trial, summary
 from astra_data.studies.predictors import Gains
+from astra_data.studies.walking import AXES
 from astra_data.studies.walks import StepsConfig, Walks
 
 CONFIG = StepsConfig(rows=10, history=4)

@@ -6,7 +6,7 @@ from toy_walks import FPS, piece
 
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.studies.histories import HistoryModel
-from astra_data.studies.predictors import bounded
+from astra_data.studies.walking import bounded
 from astra_data.studies.walks import StepsConfig, Stretch, Walks
 
 HISTORY = 5
@@ -44,10 +44,10 @@ def test_the_hidden_state_after_a_history_is_that_of_its_steps_one_by_one(stretc
         stretch,
         **{
             name: getattr(stretch, name)[:, :-1]
-            for name in ("past_motion", "past_ball", "past_action", "past_simulated")
+            for name in ("past_motion", "past_seen", "past_action", "past_simulated")
         },
     )
-    last = (stretch.past_motion[:, -1], stretch.past_ball[:, -1], stretch.past_action[:, -1])
+    last = (stretch.past_motion[:, -1], stretch.past_seen[:, -1], stretch.past_action[:, -1])
     torch.testing.assert_close(model.after(model.begin(shorter), *last), model.begin(stretch))
 
 
@@ -55,7 +55,7 @@ def test_motions_are_those_of_the_grounding_models_correction(stretch: Stretch) 
     model = model_of(stretch)
     memory = model.begin(stretch)
     action, simulated = stretch.action[:, 0], stretch.simulated[:, 0]
-    found = model.motion(memory, stretch.past_ball[:, -1], action, simulated)
+    found = model.motion(memory, stretch.past_seen[:, -1], action, simulated)
     latent = model.grounding.encoder.latent(memory)
     torch.testing.assert_close(found, model.grounding.correct(latent, action, simulated))
     # A ball elsewhere changes nothing now, as it is part of the memory.
@@ -77,7 +77,7 @@ def test_nas_has_no_loss_of_its_own_and_astra_one_of_latent_and_reward(stretch: 
 
 def test_the_reward_is_how_much_nearer_the_ball_comes(stretch: Stretch) -> None:
     model = model_of(stretch).grounding
-    distance = bounded(stretch.past_ball).norm(dim=-1)
+    distance = bounded(stretch.past_seen).norm(dim=-1)
     nearer = (distance[:, :-1] - distance[:, 1:]).flatten()
     torch.testing.assert_close(model.reward_mean, nearer.mean())
     torch.testing.assert_close(model.reward_std, nearer.std(correction=0).clamp_min(1e-3))
@@ -97,10 +97,10 @@ def test_steps_that_are_not_walking_are_not_learned_from(stretch: Stretch) -> No
         return float(model.loss(replace(still, **{column: values})).detach()) != pytest.approx(once, rel=1e-5)
 
     # How much nearer the ball comes in step 1 is predicted from step 0 and the action of step 1.
-    assert changes("past_ball", slice(0, 1)) and changes("past_ball", slice(1, 2))
+    assert changes("past_seen", slice(0, 1)) and changes("past_seen", slice(1, 2))
     assert changes("past_action", slice(0, 1)) and changes("past_action", slice(1, 2))
-    assert not changes("past_ball", slice(2, None))
+    assert not changes("past_seen", slice(2, None))
     assert not changes("past_action", slice(2, None))
     # A ball on the other side is as far away: of that, only step 0 is an input.
-    assert changes("past_ball", slice(0, 1), turned=True)
-    assert not changes("past_ball", slice(1, 2), turned=True)
+    assert changes("past_seen", slice(0, 1), turned=True)
+    assert not changes("past_seen", slice(1, 2), turned=True)

@@ -5,7 +5,8 @@ import torch
 from toy_walks import FPS, piece
 
 from astra_data.studies.motion import chained
-from astra_data.studies.predictors import HALF_SEEN_M, Gains, bounded
+from astra_data.studies.predictors import Gains
+from astra_data.studies.walking import HALF_SEEN_M, bounded
 from astra_data.studies.walks import StepsConfig, Stretch, Walks
 
 CONFIG = StepsConfig(rows=10, history=4)
@@ -31,7 +32,7 @@ def test_before_fitting_gains_are_the_raw_simulator_and_remember_nothing(stretch
     memory = model.begin(stretch)
     assert memory.shape == (len(stretch), 0)
     simulated, action = stretch.simulated[:, 0], stretch.action[:, 0]
-    ball = stretch.past_ball[:, -1]
+    ball = stretch.past_seen[:, -1]
     assert torch.equal(model.motion(memory, ball, action, simulated), simulated)
     assert model.after(memory, simulated, ball, action) is memory
 
@@ -63,7 +64,7 @@ def test_gains_that_the_walk_was_made_with_are_found() -> None:
     made = Stretch(
         past_motion=simulated,
         past_action=blank,
-        past_ball=blank[..., :2],
+        past_seen=blank[..., :2],
         past_simulated=simulated,
         action=blank,
         simulated=simulated,

@@ -6,7 +6,8 @@ import pytest
 from toy_walks import actions, log, states, write_archive
 
 from astra_data.core.errors import BadInputError
-from astra_data.studies.recordings import WalkingConfig, broken_rows, read_recordings
+from astra_data.studies.recordings import read_recordings
+from astra_data.studies.walking import WalkingConfig
 
 MAPPING = Path(__file__).parents[2] / "recipes/imports/nao_guda.toml"
 CONFIG = WalkingConfig()
@@ -44,11 +45,11 @@ def test_jumps_and_carried_stretches_are_no_walking() -> None:
     state[100:, 1] += 0.08
     state[150:, 2] += 2 * np.pi  # the same heading
     state[160:, 2] += 0.2
-    broken = broken_rows(state, 60, CONFIG)
+    broken = CONFIG.broken(state, 60)
     assert np.flatnonzero(broken).tolist() == [99, 159]
     state[200:231, 0] += np.arange(31) * 0.01  # carried, 0.84 m/s
     state[231:, 0] += 0.3
-    assert broken_rows(state, 60, CONFIG)[200:230].all()
+    assert CONFIG.broken(state, 60)[200:230].all()
 
 
 def test_nothing_usable_is_one_clear_error(tmp_path: Path) -> None:

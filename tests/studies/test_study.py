@@ -9,9 +9,10 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.core.progress import silent
 from astra_data.studies.errors import Trial
+from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.predictors import Gains
 from astra_data.studies.recordings import Piece, Recording
-from astra_data.studies.study import GapRecipe, cases, run_study, shortened
+from astra_data.studies.study import cases, run_study, shortened
 from astra_data.studies.walks import StepsConfig, Walks
 
 STEPS = StepsConfig(rows=10, history=4)

@@ -28,7 +28,7 @@ def test_the_walk_of_a_moved_robot_is_the_same() -> None:
     ball = np.tile(composed(frame, torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64))[0, :2], (151, 1))
     there = replace(here, state=np.concatenate([moved.numpy(), ball], axis=1))
     one, other = (Walks.of_pieces([walk], FPS, CONFIG) for walk in (here, there))
-    for name in ("motion", "simulated", "action", "ball"):
+    for name in ("motion", "simulated", "action", "seen"):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-5, rtol=0)
 
 
@@ -52,7 +52,8 @@ def test_the_mirror_image_of_the_mirror_image_is_the_stretch() -> None:
     stretch = walks.stretches(*walks.starts(4, 5), 4, 5)
     mirrored = stretch.mirrored()
     assert not torch.equal(mirrored.motion, stretch.motion)
-    for field in fields(stretch):
+    columns = [field for field in fields(stretch) if field.name != "body"]
+    for field in columns:
         assert torch.equal(getattr(mirrored.mirrored(), field.name), getattr(stretch, field.name))
     half = stretch.mirrored(torch.arange(len(stretch)) % 2 == 0)
     assert torch.equal(half.action[::2], mirrored.action[::2])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from toy_walks import FPS, piece
 
-from astra_data.studies.predictors import bounded
+from astra_data.studies.walking import bounded
 from astra_data.studies.walks import StepsConfig, Stretch, Walks
 from astra_data.studies.windows import WindowModel
 
@@ -20,7 +20,7 @@ def stretch() -> Stretch:
 
 
 def step(stretch: Stretch) -> tuple[Tensor, Tensor, Tensor]:
-    return stretch.past_ball[:, -1], stretch.action[:, 0], stretch.simulated[:, 0]
+    return stretch.past_seen[:, -1], stretch.action[:, 0], stretch.simulated[:, 0]
 
 
 def linear(stretch: Stretch) -> WindowModel:
@@ -52,7 +52,7 @@ def test_the_window_moves_on_with_each_step(stretch: Stretch) -> None:
     model = linear(stretch)
     memory = model.begin(stretch)
     motion, action = stretch.motion[:, 0], stretch.action[:, 0]
-    moved = model.after(memory, motion, stretch.past_ball[:, -1], action).view(-1, HISTORY, 7)
+    moved = model.after(memory, motion, stretch.past_seen[:, -1], action).view(-1, HISTORY, 7)
     torch.testing.assert_close(moved[:, -1], torch.cat([motion, action], dim=-1))
     torch.testing.assert_close(moved[:, :-1, :3], stretch.past_motion[:, 1:])
     torch.testing.assert_close(moved[:, :-1, 3:], stretch.past_action[:, 1:])

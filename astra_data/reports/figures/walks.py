@@ -13,7 +13,12 @@ Floats = NDArray[np.float64]
 Bands = Mapping[str, Mapping[str, Floats]]
 """Axis → model → error, low and high, (3, K)."""
 
-LABELS = {"forward_m": "forward (m)", "left_m": "left (m)", "turn_rad": "turn (rad)"}
+LABELS = {
+    "forward_m": "forward (m)",
+    "left_m": "left (m)",
+    "turn_rad": "turn (rad)",
+    "all_joints": "all joints",
+}
 RAW = "raw"
 
 

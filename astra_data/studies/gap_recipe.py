@@ -1,0 +1,53 @@
+"""The recipe of a study, a TOML file."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from astra_data.core.config import Config, Positive, did_you_mean
+from astra_data.studies.joints import JointsConfig
+from astra_data.studies.rollouts import MODELS, FitConfig
+from astra_data.studies.walking import WalkingConfig
+from astra_data.studies.walks import StepsConfig
+
+
+class GapRecipe(Config):
+    """How well models of a robot's walk, or of its joints, predict recordings of it."""
+
+    mapping: str
+    """How logs become columns: a file of `astra-data import`, relative to the recipe."""
+    models: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Names in `rollouts.MODELS`; the raw simulator is always added."""
+    seeds: Annotated[tuple[int, ...], Field(min_length=1)]
+    """Seeds of the smaller data sizes' choice of pieces, and of the networks."""
+    minutes: tuple[Positive, ...] = ()
+    """Sizes of the training data, besides all of it; each is a subset of the larger ones."""
+    horizons_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.5, 1.0, 2.0, 3.0)
+    """Prediction horizons, besides one step; rounded to control steps."""
+    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    """Share of each recording's pieces held out for testing, if no other recordings are given."""
+    notes: tuple[str, ...] = ()
+    """Paragraphs for the page, such as which data was used for tuning."""
+    simulator: Literal["planar_walker", "joints"] = "planar_walker"
+    """The abstract simulator, and so what is predicted: a walk in the plane, or joints sent to targets."""
+    walking: WalkingConfig = WalkingConfig()
+    """When a robot counts as walking."""
+    joints: JointsConfig = JointsConfig()
+    """How the joints' simulator responds."""
+    steps: StepsConfig = StepsConfig()
+    """How rows become control steps."""
+    fit: FitConfig = FitConfig()
+    """Settings of fitting."""
+
+    @field_validator("models")
+    @classmethod
+    def _are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
+        for name in models:
+            if name not in MODELS:
+                raise ValueError(f"unknown model '{name}'{did_you_mean(name, MODELS)}")
+        return ("raw", *(name for name in dict.fromkeys(models) if name != "raw"))
+
+    @property
+    def reading(self) -> WalkingConfig | JointsConfig:
+        """How recordings are read."""
+        return self.joints if self.simulator == "joints" else self.walking
