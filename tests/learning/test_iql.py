@@ -3,7 +3,6 @@ from typing import Any
 import pytest
 import torch
 from pydantic import ValidationError
-from tensordict import TensorDict
 from torch import Tensor
 
 from astra_data.core.checkpoint import flatten, unflatten
@@ -135,11 +134,10 @@ def test_returns_are_those_of_a_plain_loop() -> None:
                 continue
             rewards = 2.0 * experience.reward[episode, step:end] - 1.0
             summed = sum(0.9**ahead * float(reward) for ahead, reward in enumerate(rewards))
-            got = table[row]
-            assert float(got["next", "reward"]) == pytest.approx(summed)
-            assert torch.equal(got["observation"], experience.observation[episode, step])
-            assert torch.equal(got["next", "observation"], experience.next_observation[episode, end - 1])
-            assert bool(got["next", "terminated"]) == bool(experience.terminated[episode, end - 1])
+            assert float(table.reward[row]) == pytest.approx(summed)
+            assert torch.equal(table.observation[row], experience.observation[episode, step])
+            assert torch.equal(table.next_observation[row], experience.next_observation[episode, end - 1])
+            assert bool(table.terminated[row]) == bool(experience.terminated[episode, end - 1])
             row += 1
     assert row == len(table)
 
@@ -158,18 +156,16 @@ def test_updates_are_those_of_the_printed_losses() -> None:
     iql = learner(experience, settings)
 
     def advantage(observation: Tensor, action: Tensor) -> Tensor:
-        loss, seen = iql._loss, {"observation": observation, "action": action}
-        values = []
-        for index in range(2):
-            with torch.no_grad(), loss.target_qvalue_network_params[index].to_module(loss.qvalue_network):
-                batch = TensorDict(seen, batch_size=observation.shape[:-1])
-                values.append(loss.qvalue_network(batch)["state_action_value"].squeeze(-1))
-        return torch.minimum(*values) - iql.values(observation)
+        """Return min Q - V, by the slow Q."""
+        pair = torch.cat([observation, action], dim=-1)
+        with torch.no_grad():
+            first, second = (network(pair).squeeze(-1) for network in iql._critics.slow_action_values)
+        return torch.minimum(first, second) - iql.values(observation)
 
     table = transitions(experience, settings)
     torch.manual_seed(derive(2, "update 0"))
-    batch = table[torch.randint(len(table), (256,))]
-    ahead = advantage(batch["observation"], batch["action"])
+    rows = torch.randint(len(table), (256,))
+    ahead = advantage(table.observation[rows], table.action[rows])
     assert (ahead > 0).any() and (ahead < 0).any()
     expected = torch.where(ahead > 0, 0.8, 0.2) * ahead.square()
     assert iql.iterate()["value"] == pytest.approx(float(expected.mean()), rel=1e-4)
@@ -181,7 +177,7 @@ def test_updates_are_those_of_the_printed_losses() -> None:
         log_prob = normal.log_prob(columns["action"]).sum(-1)
     expected = -(weight * log_prob)[learned].mean()
     assert iql.iterate()["policy"] == pytest.approx(float(expected), rel=1e-4)
-    gradients = [parameter.grad.flatten() for parameter in iql._actor if parameter.grad is not None]
+    gradients = [parameter.grad.flatten() for parameter in iql.policy.parameters() if parameter.grad is not None]
     assert float(torch.cat(gradients).norm()) == pytest.approx(1e-3, rel=1e-2)
 
 
