@@ -122,9 +122,9 @@ class _Critics(nn.Module):
 
     def __init__(self, observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> None:
         super().__init__()
-        self.value = mlp((observation_size, *hidden_sizes, 1), nn.ReLU)
+        self.value = mlp((observation_size, *hidden_sizes, 1), nn.ReLU, inplace=True)
         sizes = (observation_size + action_size, *hidden_sizes, 1)
-        self.action_values = nn.ModuleList(mlp(sizes, nn.ReLU) for _ in range(2))
+        self.action_values = nn.ModuleList(mlp(sizes, nn.ReLU, inplace=True) for _ in range(2))
         self.slow_action_values = copy.deepcopy(self.action_values).requires_grad_(False)
 
     def advantage(self, observation: Tensor, action: Tensor) -> Tensor:
