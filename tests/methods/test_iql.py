@@ -8,6 +8,8 @@ import torch
 from spending import SPENT, spend
 from toy_episodes import toy_episodes
 
+from astra_data.core.checkpoint import flatten, save_tensors
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
@@ -192,3 +194,11 @@ def test_after_an_interruption_it_goes_on(
     whole.save(tmp_path / "whole")
     resumed.save(tmp_path / "resumed")
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
+
+
+def test_a_checkpoint_of_another_version_is_refused(learn: Learn, tmp_path: Path) -> None:
+    state = {"networks": {"weight": torch.zeros(1)}, "updates": 3}
+    clocks = {"points": [], "spent": SPENT}
+    save_tensors(tmp_path / "checkpoint.safetensors", flatten(state), clocks)
+    with pytest.raises(BadInputError, match="expected a checkpoint of this version"):
+        learn()

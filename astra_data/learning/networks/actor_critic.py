@@ -60,7 +60,7 @@ class ActorCritic(Policy):
         return self.gaussian(self.actor(features))
 
     def gaussian(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation (..., A) of the action for the `output` (..., A) of the actor."""
+        """Return mean and standard deviation (..., A) of the action for the actor's `output` (..., A)."""
         mean = bounded(output, self.shape.clips_mean)
         return mean, self.log_std.exp().expand_as(mean)
 

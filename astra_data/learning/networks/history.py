@@ -13,7 +13,7 @@ def mlp(
 ) -> nn.Sequential:
     """Build linear layers of `sizes` with `activation` between them.
 
-    `inplace` saves time where batches are (N, size); a gradient through those of more dimensions takes longer.
+    `inplace` saves time where batches are (N, size); with more dimensions the gradient takes longer.
     """
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
