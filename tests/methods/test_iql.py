@@ -138,7 +138,7 @@ def test_cloning_does_what_was_recorded_whatever_it_paid(
     rightwards = torch.rand(6, STEPS) < 0.25
     episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))
     episodes.reward.copy_(torch.where(rightwards, 10.0, -10.0))
-    settings = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300}
+    settings: dict[str, Any] = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300}
     settings |= {"learning_rate": 1e-2, "critic_learning_rate": 1e-2}
     seen = experience_of(TASK, episodes)
     start = torch.zeros(6, STEPS)
@@ -197,7 +197,7 @@ def test_after_an_interruption_it_goes_on(
 
 
 def test_a_checkpoint_of_another_version_is_refused(learn: Learn, tmp_path: Path) -> None:
-    state = {"networks": {"weight": torch.zeros(1)}, "updates": 3}
+    state: dict[str, Any] = {"networks": {"weight": torch.zeros(1)}, "updates": 3}
     clocks = {"points": [], "spent": SPENT}
     save_tensors(tmp_path / "checkpoint.safetensors", flatten(state), clocks)
     with pytest.raises(BadInputError, match="expected a checkpoint of this version"):
