@@ -207,9 +207,9 @@ def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
     policy.iterate()  # The one update of the critics.
 
     def ours() -> int:
-        for _ in range(updates):
-            values.iterate()
-            policy.iterate()
+        for learner in (values, policy):  # one after the other, as a training does
+            for _ in range(updates):
+                learner.iterate()
         return updates
 
     command = ["--no-project", "--python", "3.12", "--with", "d3rlpy", "--with", f"torch=={TORCH}", "python"]

@@ -1,1 +1,1 @@
-"""Policy optimisation on any batched environment, with TorchRL's losses."""
+"""Policy optimisation, on any batched environment or from recorded episodes."""

@@ -1,17 +1,19 @@
-"""Implicit Q-learning (Kostrikov et al. 2022) from recorded episodes, with TorchRL's losses.
+"""Implicit Q-learning (Kostrikov et al. 2022) from recorded episodes.
 
 As in their Algorithm 1 the critics come first, from single transitions, for they do not depend on the policy;
 then the policy is extracted by advantage-weighted regression, from windows of consecutive steps, so that a
 recurrent policy learns with its memory. The critics see no history: the recorded random commands are held for
-a while, and critics that know the last command learn little about any other.
+a while, and critics that know the last command learn little about any other. Once they are finished, each
+recorded step has one weight for good.
 
 Every update seeds torch from (seed, update), so a run resumed from a checkpoint gives the same result as an
 uninterrupted one.
 """
 
+import copy
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import torch
 from pydantic import model_validator
@@ -24,9 +26,8 @@ from astra_data.learning.networks.history import mlp
 from astra_data.learning.networks.policy import Policy
 from astra_data.learning.recorded import Recorded
 
-if TYPE_CHECKING:
-    from tensordict import TensorDict
-    from torchrl.objectives import IQLLoss
+_LARGEST_WEIGHT = 100.0
+_ROWS_AT_ONCE = 8192
 
 
 class IqlConfig(Config):
@@ -96,6 +97,43 @@ class Experience(Recorded):
     terminated: Tensor
 
 
+@dataclass(frozen=True)
+class Transitions:
+    """N transitions of n steps, from which the critics learn.
+
+    Attributes:
+        observation: (N, O). action: (N, A). reward: summed and discounted over the n steps, (N,).
+        next_observation: n steps later, (N, O). terminated: (N,) bool, the task ended there.
+    """
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    next_observation: Tensor
+    terminated: Tensor
+
+    def __len__(self) -> int:
+        """Return N."""
+        return len(self.reward)
+
+
+class _Critics(nn.Module):
+    """V, two Q, and slow copies of these, of observations (..., O) and actions (..., A)."""
+
+    def __init__(self, observation_size: int, action_size: int, hidden_sizes: tuple[int, ...]) -> None:
+        super().__init__()
+        self.value = mlp((observation_size, *hidden_sizes, 1), nn.ReLU, inplace=True)
+        sizes = (observation_size + action_size, *hidden_sizes, 1)
+        self.action_values = nn.ModuleList(mlp(sizes, nn.ReLU, inplace=True) for _ in range(2))
+        self.slow_action_values = copy.deepcopy(self.action_values).requires_grad_(False)
+
+    def advantage(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return min Q - V (...), by the slow Q, with the gradient of V alone."""
+        pair = torch.cat([observation, action], dim=-1)
+        first, second = (network(pair) for network in self.slow_action_values)
+        return torch.as_tensor((torch.minimum(first, second) - self.value(observation)).squeeze(-1))
+
+
 class Iql:
     """A training in progress.
 
@@ -105,22 +143,17 @@ class Iql:
 
     def __init__(self, policy: Policy, experience: Experience, config: IqlConfig, *, seed: int) -> None:
         """Prepare to train `policy` in place on `experience`, with all randomness from `seed`."""
-        from torchrl.objectives import SoftUpdate
-
         self.policy, self.config, self.seed = policy, config, seed
         self.updates = 0
         self._experience = experience
         self._transitions = transitions(experience, config)
         torch.manual_seed(derive(seed, "critics"))
-        self._loss = _iql_loss(policy, experience, config)
-        self._target = SoftUpdate(self._loss, tau=config.target_rate)
-        self._critics = [
-            *self._loss.qvalue_network_params.parameters(),
-            *self._loss.value_network_params.parameters(),
-        ]
-        self._actor = [*self._loss.actor_network_params.parameters()]
-        self._critic_optimizer = torch.optim.Adam(self._critics, lr=config.critic_learning_rate)
-        self._optimizer = torch.optim.Adam(self._actor, lr=config.learning_rate)
+        observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
+        self._critics = _Critics(observed, acted, config.critic_sizes).to(experience.observation.device)
+        learned = [*self._critics.value.parameters(), *self._critics.action_values.parameters()]
+        self._critic_optimizer = torch.optim.Adam(learned, lr=config.critic_learning_rate, fused=True)
+        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, fused=True)
+        self._weights: Tensor | None = None
 
     @property
     def total_updates(self) -> int:
@@ -134,7 +167,7 @@ class Iql:
 
     def iterate(self) -> dict[str, float]:
         """Make one update and return its losses: "value" and "action_value", or the "policy"'s."""
-        torch.manual_seed(derive(self.seed, f"update {self.updates}"))
+        _seed(derive(self.seed, f"update {self.updates}"), self._transitions.reward.device)
         losses = (
             self._learn_values()
             if self.updates < self.config.critic_updates
@@ -144,43 +177,67 @@ class Iql:
         return losses
 
     def _learn_values(self) -> dict[str, float]:
-        rows = torch.randint(len(self._transitions), (self.config.critic_batch,))
-        batch = self._transitions[rows.to(self._transitions.device)]
-        value = self._loss.value_loss(batch)[0].mean()
-        action_value = self._loss.qvalue_loss(batch)[0].mean()
+        """Take a step down the losses of V, eq. 5, and Q, eq. 6; let the slow Q follow."""
+        config, critics, table = self.config, self._critics, self._transitions
+        rows = torch.randint(len(table), (config.critic_batch,)).to(table.reward.device)
+        observation, action = table.observation[rows], table.action[rows]
+        advantage = critics.advantage(observation, action)
+        weight = torch.where(advantage > 0, config.expectile, 1.0 - config.expectile)
+        value = (weight * advantage.square()).mean()
+        with torch.no_grad():
+            following = critics.value(table.next_observation[rows]).squeeze(-1) * ~table.terminated[rows]
+            wanted = table.reward[rows] + config.discount**config.return_steps * following
+        pair = torch.cat([observation, action], dim=-1)
+        first, second = (network(pair).squeeze(-1) - wanted for network in critics.action_values)
+        action_value = first.square().mean() + second.square().mean()
         self._critic_optimizer.zero_grad()
         (value + action_value).backward()
         self._critic_optimizer.step()
-        self._target.step()
+        with torch.no_grad():
+            slow, fast = critics.slow_action_values.parameters(), critics.action_values.parameters()
+            torch._foreach_lerp_([*slow], [*fast], config.target_rate)
         return {"value": float(value.detach()), "action_value": float(action_value.detach())}
 
     def _learn_policy(self, update: int) -> dict[str, float]:
-        from tensordict import TensorDict
-
-        config = self.config
+        """Take a step down the loss of the policy, eq. 7."""
+        config, policy = self.config, self.policy
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate * (1 + math.cos(math.pi * update / config.policy_updates)) / 2
-        columns, learned = self._experience.windows(config.batch_windows, config.window, config.burn_in)
-        loss = self._loss.actor_loss(TensorDict(columns, batch_size=learned.shape))[0][learned].mean()
+        if self._weights is None:
+            self._weights = self._weigh()
+        steps, learned = self._experience.draw(config.batch_windows, config.window, config.burn_in)
+        seen = self._experience.observation[..., : policy.shape.observation_size][steps]
+        start = torch.zeros(learned.shape, device=learned.device)
+        features = policy.remember_sequence(
+            seen, self._experience.previous_action[steps], policy.initial_hidden(len(seen)), start
+        )
+        likelihood = policy.log_prob(features[learned], self._experience.action[steps][learned])
+        loss = -(self._weights[steps][learned] * likelihood).mean()
         self._optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self._actor, config.gradient_norm)
+        nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
         self._optimizer.step()
         return {"policy": float(loss.detach())}
 
     @torch.no_grad()
+    def _weigh(self) -> Tensor:
+        """Return the weight exp(β (Q - V)) of each recorded step, (E, T), by the finished critics."""
+        columns = self._experience.observation, self._experience.action
+        rows = zip(*(column.flatten(0, 1).split(_ROWS_AT_ONCE) for column in columns), strict=True)
+        advantage = torch.cat([self._critics.advantage(*row) for row in rows])
+        weights = (self.config.temperature * advantage).exp().clamp_max(_LARGEST_WEIGHT)
+        return weights.view(self._experience.reward.shape)
+
+    @torch.no_grad()
     def values(self, observation: Tensor) -> Tensor:
         """Return the state values (...) of `observation` (..., O)."""
-        from tensordict import TensorDict
-
-        batch = TensorDict({"observation": observation}, batch_size=observation.shape[:-1])
-        with self._loss.value_network_params.to_module(self._loss.value_network):
-            return torch.as_tensor(self._loss.value_network(batch)["state_value"].squeeze(-1))
+        return torch.as_tensor(self._critics.value(observation).squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that `load_state_dict` needs to continue from here."""
         return {
-            "networks": self._loss.state_dict(),
+            "critics": self._critics.state_dict(),
+            "policy": self.policy.state_dict(),
             "critic_optimizer": self._critic_optimizer.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "updates": self.updates,
@@ -188,13 +245,21 @@ class Iql:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
-        self._loss.load_state_dict(state["networks"])
+        self._critics.load_state_dict(state["critics"])
+        self.policy.load_state_dict(state["policy"])
         self._critic_optimizer.load_state_dict(state["critic_optimizer"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self.updates = state["updates"]
+        self.updates, self._weights = state["updates"], None
 
 
-def transitions(experience: Experience, config: IqlConfig) -> "TensorDict":
+def _seed(seed: int, device: torch.device) -> None:
+    """Seed torch's generators of the CPU and `device`; `torch.manual_seed` takes ten times as long."""
+    torch.default_generator.manual_seed(seed)
+    if device.type == "cuda":
+        torch.cuda.manual_seed(seed)
+
+
+def transitions(experience: Experience, config: IqlConfig) -> Transitions:
     """Return the transitions (N,) of `experience` with n-step returns and the observation n steps later.
 
     n is `config.return_steps`. Steps with fewer recorded steps after them are left out, unless the task ended
@@ -203,8 +268,6 @@ def transitions(experience: Experience, config: IqlConfig) -> "TensorDict":
     Raises:
         BadInputError: there are none.
     """
-    from tensordict import TensorDict
-
     count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
     reward = (experience.reward * config.reward_scale + config.reward_shift) * (step < lengths)
@@ -213,73 +276,11 @@ def transitions(experience: Experience, config: IqlConfig) -> "TensorDict":
     last = (step + count - 1).minimum(lengths - 1)
     rows = (torch.arange(len(lengths), device=lengths.device)[:, None], last)
     terminated = experience.terminated[rows]
-    table = {
-        "observation": experience.observation,
-        "action": experience.action,
-        "next": {
-            "observation": experience.next_observation[rows],
-            "reward": summed.unsqueeze(-1),
-            "terminated": terminated.unsqueeze(-1),
-            "done": terminated.unsqueeze(-1),
-        },
-    }
     whole = (step + count <= lengths) | (terminated & (step < lengths))
     if not bool(whole.any()):
         raise BadInputError(
             f"expected an episode of at least {count} steps (return_steps), or one that ends the task; "
             f"the longest has {int(lengths.max())}"
         )
-    return TensorDict(table, batch_size=reward.shape)[whole]
-
-
-def _iql_loss(policy: Policy, experience: Experience, config: IqlConfig) -> "IQLLoss":
-    from tensordict.nn import TensorDictModule
-    from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
-    from torchrl.objectives import IQLLoss
-
-    observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
-    actor = ProbabilisticActor(
-        TensorDictModule(
-            _Policy(policy), in_keys=["observation", "previous_action"], out_keys=["loc", "scale"]
-        ),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal if policy.squashes else IndependentNormal,
-        distribution_kwargs={"tanh_loc": False},
-    )
-    loss = IQLLoss(
-        actor,
-        ValueOperator(_ActionValue(observed, acted, config), in_keys=["observation", "action"]),
-        ValueOperator(mlp((observed, *config.critic_sizes, 1), nn.ReLU), in_keys=["observation"]),
-        loss_function="l2",
-        temperature=config.temperature,
-        expectile=config.expectile,
-        reduction="none",
-        scalar_output_mode="exclude",
-    )
-    loss.make_value_estimator(gamma=config.discount**config.return_steps)
-    return loss.to(experience.observation.device)
-
-
-class _ActionValue(nn.Module):
-    def __init__(self, observed: int, acted: int, config: IqlConfig) -> None:
-        super().__init__()
-        self.network = mlp((observed + acted, *config.critic_sizes, 1), nn.ReLU)
-
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        return torch.as_tensor(self.network(torch.cat([observation, action], dim=-1)))
-
-
-class _Policy(nn.Module):
-    """The policy over whole windows (B, T, ...), from an empty memory."""
-
-    def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, observation: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
-        start = torch.zeros(observation.shape[:2], device=observation.device)
-        hidden = self.policy.initial_hidden(len(observation))
-        seen = observation[..., : self.policy.shape.observation_size]
-        features = self.policy.remember_sequence(seen, previous_action, hidden, start)
-        mean, std = self.policy.policy(features)
-        return mean, std
+    columns = experience.observation, experience.action, summed, experience.next_observation[rows], terminated
+    return Transitions(*(column[whole] for column in columns))

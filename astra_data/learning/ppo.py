@@ -1,11 +1,10 @@
-"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's loss and GAE.
+"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's GAE.
 
 One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
 rollouts of some environments, so the same code trains policies with and without memory.
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -14,16 +13,16 @@ from astra_data.core.config import Config, Count, NotNegative, Positive, Share
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting, Taken
 from astra_data.learning.learner import Learner, Resumable
-from astra_data.learning.networks.actor_critic import ActorCritic, bounded
+from astra_data.learning.networks.actor_critic import ActorCritic
+from astra_data.learning.networks.policy import gaussian_log_prob
 from astra_data.learning.return_scale import ReturnScale
 from astra_data.worlds.batched import BatchedEnv
 
-if TYPE_CHECKING:
-    from torchrl.objectives import ClipPPOLoss
-
-
 _PULL = 0.05
 """Weight in the loss of the square by which means that are clipped are beyond ±1."""
+
+_SEEN = ("observation", "previous_action", "hidden", "start")
+_LEARNED = ("action", "action_log_prob", "advantage", "value_target")
 
 
 class PpoConfig(Config):
@@ -94,7 +93,6 @@ class Ppo(Learner):
             policy.value_layer.weight.mul_(config.critic_gain)
         self._first_std = float(policy.log_std.detach().exp().max())
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
-        self._loss = _ppo_loss(policy, config)
         parts: dict[str, Resumable] = {"policy": policy, "optimizer": self._optimizer}
         self._returns = None
         if config.normalize_returns:
@@ -138,17 +136,17 @@ class Ppo(Learner):
             features, hidden = policy.remember(acting.observation, acting.previous_action, acting.hidden)
             mean, std = policy.policy(features)
             action = torch.normal(mean, std)
-            value = policy.value(features)
             taken = acting.take(action, hidden)
             step, expired = taken.step, taken.expired
             row |= {
+                "features": features,
+                "mean": mean,
+                "std": std,
                 "action": action,
-                "action_log_prob": torch.distributions.Normal(mean, std).log_prob(action).sum(-1),
-                "value": value,
                 "reward": self._scaled(taken),
                 "terminated": step.terminated,
                 "done": taken.done,
-                "beyond": torch.zeros_like(value),
+                "beyond": torch.zeros_like(step.reward),
             }
             if bool(expired.any()):
                 beyond, _ = policy.remember(step.observation[expired], taken.action[expired], hidden[expired])
@@ -156,6 +154,8 @@ class Ppo(Learner):
             for name, values in row.items():
                 columns.setdefault(name, []).append(values)
         rollout = {name: torch.stack(values, dim=1) for name, values in columns.items()}
+        rollout["value"] = policy.value(rollout["features"])
+        rollout["action_log_prob"] = gaussian_log_prob(rollout["mean"], rollout["std"], rollout["action"])
         last, _ = policy.remember(acting.observation, acting.previous_action, acting.hidden)
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
@@ -163,6 +163,7 @@ class Ppo(Learner):
         advantage, target = vec_generalized_advantage_estimate(
             self.config.discount, self.config.gae_lambda, *(part.unsqueeze(-1) for part in parts)
         )
+        advantage, target = advantage.squeeze(-1), target.squeeze(-1)
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 
     def _scaled(self, taken: Taken) -> Tensor:
@@ -172,8 +173,6 @@ class Ppo(Learner):
         return self._returns.scaled(taken.step.reward, taken.done)
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
-        from tensordict import TensorDict
-
         config, policy = self.config, self.policy
         advantage = rollout["advantage"]
         rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
@@ -181,55 +180,33 @@ class Ppo(Learner):
         for _ in range(config.epochs):
             order = torch.randperm(count, device=advantage.device)
             for rows in order.chunk(config.minibatches):
-                batch = {name: values[rows] for name, values in rollout.items()}
-                features = policy.remember_sequence(
-                    batch["observation"], batch["previous_action"], batch["hidden"], batch["start"]
-                )
-                learned = ("action", "action_log_prob", "advantage", "value_target")
-                columns = {"features": features} | {name: batch[name] for name in learned}
-                losses = self._loss(TensorDict(columns, batch_size=features.shape[:2]))
-                if config.most_kl is not None and losses["kl_approx"].abs() > config.most_kl:
+                loss, moved = self._loss({name: rollout[name][rows] for name in _SEEN + _LEARNED})
+                if config.most_kl is not None and moved.abs() > config.most_kl:
                     return
-                total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
-                if policy.shape.clips_mean:
-                    beyond = (policy.actor(features).abs() - 1.0).clamp_min(0.0)
-                    total = total + _PULL * beyond.square().mean()
                 self._optimizer.zero_grad()
-                total.backward()
+                loss.backward()
                 nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
                 self._optimizer.step()
 
+    def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the loss, eq. 9 of Schulman et al. with the clipped objective of eq. 7, and a KL divergence.
 
-def _ppo_loss(policy: ActorCritic, config: PpoConfig) -> "ClipPPOLoss":
-    from tensordict.nn import TensorDictModule
-    from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-    from torchrl.objectives import ClipPPOLoss
-
-    actor = ProbabilisticActor(
-        TensorDictModule(_Policy(policy), in_keys=["features"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-        distribution_kwargs={"tanh_loc": False},
-    )
-    critic = ValueOperator(policy.critic, in_keys=["features"])
-    loss = ClipPPOLoss(
-        actor,
-        critic,
-        clip_epsilon=config.clip,
-        entropy_coeff=config.entropy_weight,
-        critic_coeff=config.value_weight,
-        loss_critic_type="l2",
-    )
-    loss.set_keys(value_target="value_target", advantage="advantage", sample_log_prob="action_log_prob")
-    return loss
-
-
-class _Policy(nn.Module):
-    def __init__(self, policy: ActorCritic) -> None:
-        super().__init__()
-        self.actor, self.log_std = policy.actor, policy.log_std
-        self._clips = policy.shape.clips_mean
-
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        mean = bounded(self.actor(features), self._clips)
-        return mean, self.log_std.exp().expand_as(mean)
+        That is an estimate of the divergence of the policy from the one that collected the rollout.
+        """
+        config, policy = self.config, self.policy
+        remembered = policy.remember_sequence(*(batch[name] for name in _SEEN))
+        features, action, action_log_prob, advantage, target = (
+            values.flatten(0, 1) for values in (remembered, *(batch[name] for name in _LEARNED))
+        )
+        output = policy.actor(features)
+        mean, std = policy.gaussian(output)
+        moved = gaussian_log_prob(mean, std, action) - action_log_prob
+        ratio = moved.exp()
+        clipped = ratio.clamp(1.0 - config.clip, 1.0 + config.clip)
+        gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
+        wrong = (policy.value(features) - target).square().mean()
+        entropy = (std.log() + math.log(2 * math.pi * math.e) / 2).sum(-1).mean()
+        loss = config.value_weight * wrong - gain - config.entropy_weight * entropy
+        if policy.shape.clips_mean:
+            loss = loss + _PULL * (output.abs() - 1.0).clamp_min(0.0).square().mean()
+        return loss, -moved.mean()

@@ -20,18 +20,28 @@ class Recorded:
     action: Tensor
     lengths: Tensor
 
-    def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
+    def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """Draw windows of `length` steps from torch's global generator.
 
         Returns:
-            the columns by name, (count, length, ...), and which steps to learn from, (count, length) bool:
-            all but the first `burn_in` of a window that begins within its episode.
+            their places in the columns, episodes (count, 1) and steps (count, length), and which steps to
+            learn from, (count, length) bool: all but the first `burn_in` of a window that begins within its
+            episode.
         """
         episodes, steps, learned = draw_steps(self.lengths, count, length)
         learned &= steps < self.lengths[episodes]
         learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
+        return (episodes, steps), learned
+
+    def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Draw windows as `draw` does.
+
+        Returns:
+            the columns by name, (count, length, ...), and which steps to learn from, (count, length) bool.
+        """
+        places, learned = self.draw(count, length, burn_in)
         names = ("observation", "previous_action", "action")
-        return {name: getattr(self, name)[episodes, steps] for name in names}, learned
+        return {name: getattr(self, name)[places] for name in names}, learned
 
 
 def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,9 +1,9 @@
+from dataclasses import fields
 from typing import Any
 
 import pytest
 import torch
 from pydantic import ValidationError
-from tensordict import TensorDict
 from torch import Tensor
 
 from astra_data.core.checkpoint import flatten, unflatten
@@ -11,7 +11,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.iql import Experience, Iql, IqlConfig, transitions
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.learning.networks.policy import Policy
+from astra_data.learning.networks.policy import Policy, PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
 
 QUICK = IqlConfig(
     critic_updates=300,
@@ -123,6 +124,50 @@ def test_there_is_value_beyond_the_record_but_not_beyond_the_task(
     assert found.tolist() == pytest.approx(expected, abs=0.1)
 
 
+@pytest.mark.parametrize("expectile", [0.5, 0.8])
+def test_a_state_is_worth_the_expectile_of_what_its_actions_pay(expectile: float) -> None:
+    """Going right ends the task with 1, as often as going left with 0: V = τ, of τ (1 - V) = (1 - τ) V."""
+    ended, at = torch.ones(8, 1, dtype=torch.bool), torch.zeros(8, 1, 1)
+    pays = (torch.arange(8) % 2).float().unsqueeze(-1)
+    experience = Experience(
+        observation=at,
+        previous_action=at,
+        action=2.0 * pays.unsqueeze(-1) - 1.0,
+        lengths=torch.ones(8, dtype=torch.int64),
+        reward=pays,
+        next_observation=at,
+        terminated=ended,
+    )
+    settings = config(expectile=expectile, reward_scale=1.0, policy_updates=0, target_rate=0.2)
+    iql = trained(learner(experience, settings.model_copy(update={"critic_updates": 600})))
+    assert float(iql.values(torch.zeros(1))) == pytest.approx(expectile, abs=0.03)
+
+
+def test_a_weight_is_at_most_100() -> None:
+    iql = trained(learner(walks(), config(critic_updates=20, temperature=1e4, policy_updates=1)))
+    assert iql._weights is not None
+    assert (float(iql._weights.max()), iql._weights.shape) == (100.0, (64, 24))
+
+
+def test_an_action_at_the_bound_can_be_learned_by_a_policy_that_squashes() -> None:
+    experience = walks()
+    experience.action.fill_(1.0)
+    policy = SoftActor(PolicyShape(1, 1, hidden_sizes=(8,)))
+    before = mean_action(policy)
+    settings = config(critic_updates=1, temperature=0.0)
+    assert (mean_action(trained(Iql(policy, experience, settings, seed=0)).policy) > before + 0.3).all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+@pytest.mark.parametrize("memory", [0, 8])
+def test_it_learns_on_a_gpu(memory: int) -> None:
+    torch.manual_seed(1)
+    policy = ActorCritic(ActorCriticShape(1, 1, memory, 8, (32,))).to("cuda")
+    columns = {field.name: getattr(walks(), field.name).to("cuda") for field in fields(Experience)}
+    iql = trained(Iql(policy, Experience(**columns), config(critic_updates=5, policy_updates=5), seed=2))
+    assert {parameter.device.type for parameter in iql.policy.parameters()} == {"cuda"}
+
+
 def test_returns_are_those_of_a_plain_loop() -> None:
     experience = walks(count=5, steps=7)
     settings = config(return_steps=3, discount=0.9, reward_scale=2.0, reward_shift=-1.0)
@@ -135,11 +180,10 @@ def test_returns_are_those_of_a_plain_loop() -> None:
                 continue
             rewards = 2.0 * experience.reward[episode, step:end] - 1.0
             summed = sum(0.9**ahead * float(reward) for ahead, reward in enumerate(rewards))
-            got = table[row]
-            assert float(got["next", "reward"]) == pytest.approx(summed)
-            assert torch.equal(got["observation"], experience.observation[episode, step])
-            assert torch.equal(got["next", "observation"], experience.next_observation[episode, end - 1])
-            assert bool(got["next", "terminated"]) == bool(experience.terminated[episode, end - 1])
+            assert float(table.reward[row]) == pytest.approx(summed)
+            assert torch.equal(table.observation[row], experience.observation[episode, step])
+            assert torch.equal(table.next_observation[row], experience.next_observation[episode, end - 1])
+            assert bool(table.terminated[row]) == bool(experience.terminated[episode, end - 1])
             row += 1
     assert row == len(table)
 
@@ -158,18 +202,16 @@ def test_updates_are_those_of_the_printed_losses() -> None:
     iql = learner(experience, settings)
 
     def advantage(observation: Tensor, action: Tensor) -> Tensor:
-        loss, seen = iql._loss, {"observation": observation, "action": action}
-        values = []
-        for index in range(2):
-            with torch.no_grad(), loss.target_qvalue_network_params[index].to_module(loss.qvalue_network):
-                batch = TensorDict(seen, batch_size=observation.shape[:-1])
-                values.append(loss.qvalue_network(batch)["state_action_value"].squeeze(-1))
-        return torch.minimum(*values) - iql.values(observation)
+        """Return min Q - V, by the slow Q."""
+        pair = torch.cat([observation, action], dim=-1)
+        with torch.no_grad():
+            first, second = (network(pair).squeeze(-1) for network in iql._critics.slow_action_values)
+        return torch.minimum(first, second) - iql.values(observation)
 
     table = transitions(experience, settings)
     torch.manual_seed(derive(2, "update 0"))
-    batch = table[torch.randint(len(table), (256,))]
-    ahead = advantage(batch["observation"], batch["action"])
+    rows = torch.randint(len(table), (256,))
+    ahead = advantage(table.observation[rows], table.action[rows])
     assert (ahead > 0).any() and (ahead < 0).any()
     expected = torch.where(ahead > 0, 0.8, 0.2) * ahead.square()
     assert iql.iterate()["value"] == pytest.approx(float(expected.mean()), rel=1e-4)
@@ -181,7 +223,7 @@ def test_updates_are_those_of_the_printed_losses() -> None:
         log_prob = normal.log_prob(columns["action"]).sum(-1)
     expected = -(weight * log_prob)[learned].mean()
     assert iql.iterate()["policy"] == pytest.approx(float(expected), rel=1e-4)
-    gradients = [parameter.grad.flatten() for parameter in iql._actor if parameter.grad is not None]
+    gradients = [part.grad.flatten() for part in iql.policy.parameters() if part.grad is not None]
     assert float(torch.cat(gradients).norm()) == pytest.approx(1e-3, rel=1e-2)
 
 

@@ -130,10 +130,8 @@ def test_advantages_are_those_of_a_plain_loop(memory: int) -> None:
         wrong = reward + 0.9 * after[:, step] * ~env.steps[step].terminated - value[:, step]
         advantage[:, step] = wrong + 0.9 * 0.8 * advantage[:, step + 1] * ~done[:, step]
     torch.testing.assert_close(rollout["value"], value)
-    torch.testing.assert_close(rollout["advantage"].squeeze(-1), advantage[:, :-1], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(
-        rollout["value_target"].squeeze(-1), advantage[:, :-1] + value, atol=1e-5, rtol=1e-4
-    )
+    torch.testing.assert_close(rollout["advantage"], advantage[:, :-1], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(rollout["value_target"], advantage[:, :-1] + value, atol=1e-5, rtol=1e-4)
 
 
 def test_an_update_is_that_of_the_printed_loss() -> None:
@@ -150,8 +148,8 @@ def test_an_update_is_that_of_the_printed_loss() -> None:
     kept = {name: values.clone() for name, values in rollout.items()}
     learner._learn(rollout)
     optimizer = torch.optim.Adam(theirs.parameters(), lr=3e-3, eps=1e-5)
-    target = kept["value_target"].squeeze(-1)
-    advantage = (kept["advantage"].squeeze(-1) - kept["advantage"].mean()) / kept["advantage"].std()
+    target = kept["value_target"]
+    advantage = (kept["advantage"] - kept["advantage"].mean()) / kept["advantage"].std()
     for epoch in range(3):
         mean, std = theirs.policy(kept["observation"])
         normal = torch.distributions.Normal(mean, std)
@@ -303,3 +301,14 @@ def test_a_clipped_mean_learns_to_turn_back_from_its_bound() -> None:
         train(learner)
         reached[clips] = distance_after(learner.policy, 7)
     assert reached[True] < 0.3 < reached[False]
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_a_loss_is_all_on_the_device_of_the_policy(memory: int) -> None:
+    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
+    learner = ppo(GoToZero(8), 1, horizon=7, memory=memory, clips=True)
+    rollout = learner._collect()
+    learner.policy.to("meta")
+    loss, moved = learner._loss({name: values.to("meta") for name, values in rollout.items()})
+    loss.backward()
+    assert (loss.device.type, moved.device.type) == ("meta", "meta")

@@ -8,6 +8,8 @@ import torch
 from spending import SPENT, spend
 from toy_episodes import toy_episodes
 
+from astra_data.core.checkpoint import flatten, save_tensors
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
@@ -136,7 +138,8 @@ def test_cloning_does_what_was_recorded_whatever_it_paid(
     rightwards = torch.rand(6, STEPS) < 0.25
     episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))
     episodes.reward.copy_(torch.where(rightwards, 10.0, -10.0))
-    settings = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300, "learning_rate": 1e-2}
+    settings: dict[str, Any] = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300}
+    settings |= {"learning_rate": 1e-2, "critic_learning_rate": 1e-2}
     seen = experience_of(TASK, episodes)
     start = torch.zeros(6, STEPS)
     mean = {}
@@ -191,3 +194,11 @@ def test_after_an_interruption_it_goes_on(
     whole.save(tmp_path / "whole")
     resumed.save(tmp_path / "resumed")
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
+
+
+def test_a_checkpoint_of_another_version_is_refused(learn: Learn, tmp_path: Path) -> None:
+    state: dict[str, Any] = {"networks": {"weight": torch.zeros(1)}, "updates": 3}
+    clocks = {"points": [], "spent": SPENT}
+    save_tensors(tmp_path / "checkpoint.safetensors", flatten(state), clocks)
+    with pytest.raises(BadInputError, match="expected a checkpoint of this version"):
+        learn()

@@ -38,8 +38,8 @@ class ActorCritic(Policy):
 
     def __init__(self, shape: ActorCriticShape) -> None:
         super().__init__(shape)
-        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, shape.action_size))
-        self.critic = mlp((shape.feature_size, *shape.hidden_sizes, 1))
+        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, shape.action_size), inplace=True)
+        self.critic = mlp((shape.feature_size, *shape.hidden_sizes, 1), inplace=True)
         self.log_std = nn.Parameter(torch.full((shape.action_size,), shape.initial_log_std))
         for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
             layers = [layer for layer in network if isinstance(layer, nn.Linear)]
@@ -57,7 +57,11 @@ class ActorCritic(Policy):
 
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (..., A) of the action for `features` (..., F)."""
-        mean = bounded(self.actor(features), self.shape.clips_mean)
+        return self.gaussian(self.actor(features))
+
+    def gaussian(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation (..., A) of the action for the actor's `output` (..., A)."""
+        mean = bounded(output, self.shape.clips_mean)
         return mean, self.log_std.exp().expand_as(mean)
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:

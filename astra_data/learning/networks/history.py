@@ -8,11 +8,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
-def mlp(sizes: tuple[int, ...], activation: type[nn.Module] = nn.ELU) -> nn.Sequential:
-    """Build linear layers of `sizes` with `activation` between them."""
+def mlp(
+    sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False
+) -> nn.Sequential:
+    """Build linear layers of `sizes` with `activation` between them.
+
+    `inplace` saves time where batches are (N, size); with more dimensions the gradient takes longer.
+    """
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), activation()]
+        layers += [nn.Linear(size_in, size_out), activation(inplace=inplace)]
     return nn.Sequential(*layers[:-1])
 
 

@@ -1,5 +1,6 @@
 """The base of all policies: a recurrent memory where observations hold no latent, and a head that acts."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -8,6 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.learning.networks.history import HistoryEncoder
+
+_SMALLEST_SQUASHED = 1e-6 - 1.0
+"""Actions beyond it are taken for it, since the tanh of no number is -1."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,11 @@ def features_of(
     return torch.cat([observation, memory.latent(memory.through_episodes(inputs, hidden, start))], dim=-1)
 
 
+def gaussian_log_prob(mean: Tensor, std: Tensor, value: Tensor) -> Tensor:
+    """Return the log-density (...) of `value` (..., A) under independent Gaussians (..., A)."""
+    return (((value - mean) / std).square() / -2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
+
+
 class Policy(nn.Module, ABC):
     """Acts on observations and its memory of them.
 
@@ -90,6 +99,14 @@ class Policy(nn.Module, ABC):
     @abstractmethod
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return location and scale (..., A) of a Gaussian for `features` (..., F)."""
+
+    def log_prob(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return the log-density (...) of `action` (..., A) for `features` (..., F)."""
+        if not self.squashes:
+            return gaussian_log_prob(*self.policy(features), action)
+        inside = action.clamp(_SMALLEST_SQUASHED, -_SMALLEST_SQUASHED)
+        drawn = gaussian_log_prob(*self.policy(features), inside.atanh())
+        return drawn - torch.log1p(-inside.square()).sum(-1)
 
     @abstractmethod
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:

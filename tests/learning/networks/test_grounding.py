@@ -1,6 +1,6 @@
 """On a world whose error in simulation depends on the actions of the past, which no single state shows."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -283,3 +283,15 @@ def test_the_latent_loss_is_the_negative_log_likelihood() -> None:
     likelihood = torch.distributions.Normal(mean, (0.5 * log_variance).exp()).log_prob(latent[:, 1:])
     constant = 0.5 * torch.log(torch.tensor(2 * torch.pi))
     torch.testing.assert_close(parts["latent"], -likelihood.mean() - constant)
+
+
+def test_nothing_is_made_on_another_device_than_the_models() -> None:
+    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
+    windows = lagging_world(3, 5, seed=0)
+    columns = {field.name: getattr(windows, field.name).to("meta") for field in fields(windows)}
+    model = GroundingModel(GroundingShape(state_size=2, action_size=2, goal_size=2)).to("meta")
+    loss, _ = model.losses(replace(windows, **columns), LossWeights())
+    loss.backward()
+    assert loss.device.type == "meta"
+    latent, _ = model.encode(replace(windows, **columns))
+    assert (latent.device.type, latent.shape) == ("meta", (3, 5, 64))

@@ -76,3 +76,35 @@ def test_the_likeliest_action_is_taken_unless_one_is_drawn(index: int) -> None:
         return
     torch.testing.assert_close(drawn.mean(0), location, atol=0.03, rtol=0)
     torch.testing.assert_close(drawn.std(0), scale, rtol=0.03, atol=0)
+
+
+def test_the_density_of_an_action_is_that_of_its_distribution() -> None:
+    action = torch.rand(3, 5, 2) * 1.8 - 0.9
+    for policy in policies(0):
+        normal = torch.distributions.Normal(*policy.policy(OBSERVATION))
+        distribution: torch.distributions.Distribution = normal
+        if policy.squashes:
+            tanh = torch.distributions.TanhTransform()
+            distribution = torch.distributions.TransformedDistribution(normal, tanh)
+        expected = distribution.log_prob(action).sum(-1)
+        torch.testing.assert_close(policy.log_prob(OBSERVATION, action), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_the_bounds_of_actions_have_a_density() -> None:
+    for policy in policies(0):
+        assert policy.log_prob(OBSERVATION, torch.ones(3, 5, 2)).isfinite().all()
+        assert policy.log_prob(OBSERVATION, -torch.ones(3, 5, 2)).isfinite().all()
+
+
+@pytest.mark.parametrize("memory_size", [0, 6])
+def test_nothing_is_made_on_another_device_than_the_policys(memory_size: int) -> None:
+    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
+    seen, action, start = (values.to("meta") for values in (OBSERVATION, ACTION, torch.zeros(3, 5)))
+    for policy in (policy.to("meta") for policy in policies(memory_size)):
+        hidden = policy.initial_hidden(3)
+        features, after = policy.remember(seen[:, 0], action[:, 0], hidden)
+        sequence = policy.remember_sequence(seen, action, hidden, start)
+        policy.log_prob(sequence, action).mean().backward()
+        acted = policy.act(features)
+        assert {tensor.device.type for tensor in (hidden, features, after, sequence, acted)} == {"meta"}
+        assert (acted.shape, sequence.shape) == ((3, 2), (3, 5, 4 + memory_size))
