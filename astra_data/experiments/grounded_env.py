@@ -29,7 +29,7 @@ from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.train import InSimulator, Training
 from astra_data.worlds.registry import task_named
 
-OPTIONS = tuple(name for name in EnvConfig.model_fields if name != "ramp")
+OPTIONS = tuple(name for name in EnvConfig.model_fields if not name.startswith("ramp"))
 """The keywords of an environment; a ramp is the training's, not the environment's."""
 
 

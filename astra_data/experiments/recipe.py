@@ -158,6 +158,9 @@ class Recipe(Config):
         collects_by = self.collect and self.collect.behavior
         if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: take 'suboptimal_ppo'")
+        eases = any(table.ramp_while for table in (self.train, self.plus))
+        if eases and task_named(self.task).objective.is_lasting:
+            raise ValueError(f"ramp_while: no episode of {self.task} succeeds before its end: expected 0")
         return self
 
     @model_validator(mode="after")

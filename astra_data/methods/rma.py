@@ -50,7 +50,7 @@ class TeacherThenStudent(InSimulator):
         phase_1 = replace(training, progress=part(training.progress, 0.0, first))
         phase_2 = replace(training, progress=part(training.progress, first, 1.0))
         ppo = Ppo(env, teacher, config, horizon=horizon, seed=seed)
-        curve = optimise(ppo, env, config.ramp, phase_1)
+        curve = optimise(ppo, env, config.penalty_ramp, phase_1)
         adaptation = Adaptation(
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )

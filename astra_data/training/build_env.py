@@ -1,7 +1,7 @@
 """Build the environment that a policy is trained in: from a grounding, switches and the data."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import scipy
@@ -13,6 +13,7 @@ from astra_data.core.config import Config, Count, NotNegative, Positive, Share
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.learning.recorded import Recorded
+from astra_data.training.ramp import Ramp
 from astra_data.training.simulator_env import DataStarts, RewardSource, SimulatorEnv, policy_observation
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.mazes import Maze
@@ -59,6 +60,9 @@ class EnvConfig(Config):
     ramp: Share = 0.0
     """Share of the training over which the penalties grow from zero: at full size from the start, they teach
     the robot to stand still."""
+    ramp_while: Share = Field(default=0.0, exclude_if=lambda share: not share)
+    """Success of training episodes with which the penalties grow; with less they shrink, as fast, so that
+    care does not cost the way. 0: they grow whatever there is."""
     data_start_share: Share = 0.0
     """Share of the episodes that start from the middle of a recorded one."""
     episode_steps: Count | None = None
@@ -72,6 +76,19 @@ class EnvConfig(Config):
             return values
         current = {key: value for key, value in values.items() if key not in RENAMED}
         return {new: values[old] for old, new in RENAMED.items() if old in values} | current
+
+    @model_validator(mode="after")
+    def _has_a_ramp(self) -> Self:
+        if self.ramp_while and not self.ramp:
+            raise ValueError(
+                "ramp_while: expected a ramp, a share of the training over which penalties grow"
+            )
+        return self
+
+    @property
+    def penalty_ramp(self) -> Ramp:
+        """How the penalties grow."""
+        return Ramp(self.ramp, self.ramp_while)
 
     @property
     def foresees(self) -> bool:

@@ -30,6 +30,7 @@ from astra_data.learning.recorded import Recorded
 from astra_data.learning.sac import Sac, SacConfig
 from astra_data.training.build_env import EnvConfig, env_parts, recorded_steps, training_env
 from astra_data.training.policy_file import PolicyFile, Simulation
+from astra_data.training.ramp import Ramp
 from astra_data.training.simulator_env import RewardSource, SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv
 from astra_data.worlds.task import Task
@@ -244,13 +245,13 @@ def train_in(
     learner = config.make_learner(
         env, shape, training.device, horizon=horizon, seed=training.seed, recorded=recorded
     )
-    return learner.policy, optimise(learner, env, config.ramp, training)
+    return learner.policy, optimise(learner, env, config.penalty_ramp, training)
 
 
 def optimise(
     learner: Learner,
     env: ResumableEnv,
-    ramp: float,
+    ramp: Ramp,
     training: Training,
     checkpoint_name: str = "checkpoint.safetensors",
 ) -> dict[str, Any]:
@@ -267,7 +268,7 @@ def optimise(
     points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
     is_lasting = training.task.objective.is_lasting
     while not learner.done:
-        env.penalty_scale = min(1.0, learner.steps / (learner.total_steps * ramp)) if ramp else 1.0
+        env.penalty_scale = ramp.scale(points, learner.steps, learner.total_steps)
         metrics = learner.iterate()
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}

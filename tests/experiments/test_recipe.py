@@ -103,6 +103,7 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ({"train": SAC | {"windw": 9}}, "train.windw: unknown key: did you mean 'window'?"),
         ({"train": SAC, "plus": {"learner": "ppo"}}, "expected that of [train], 'sac', got 'ppo'"),
         ({"train": SAC | {"ramp": 0.4}}, "train: ramp: expected 0 with SAC"),
+        ({"plus": {"ramp_while": 0.9}}, "plus: ramp_while: expected a ramp, a share of the training"),
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
         (
             {"train": {"disagreement_penalty": 1.0}},
@@ -128,6 +129,10 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ({"train": {"hidden_sizes": [10**9]}}, "train.hidden_sizes.0: expected less than or equal to"),
         ({"evaluate": {"episodes": 10**9}}, "evaluate.episodes: expected less than or equal to 1000000"),
         ({"task": "antmaze-umaze", "collect": {"behavior": "suboptimal_sac"}}, "take 'suboptimal_ppo'"),
+        (
+            {"task": "humanoid-kinematics", "plus": {"ramp": 0.5, "ramp_while": 0.9}},
+            "ramp_while: no episode of humanoid-kinematics succeeds before its end: expected 0",
+        ),
     ],
 )
 def test_what_does_not_fit_the_learner_is_told_in_a_line(tables: dict[str, Any], message: str) -> None:

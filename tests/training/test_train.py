@@ -23,6 +23,7 @@ from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo
 from astra_data.learning.recorded import Recorded
 from astra_data.learning.sac import Sac
+from astra_data.training.ramp import Ramp
 from astra_data.training.train import (
     AnyTrainConfig,
     InSimulator,
@@ -151,8 +152,11 @@ class Counting:
         self.steps, self.observation = int(state["steps"]), observation
 
 
+WHOLE = Ramp(0.0)
+
+
 def counted(
-    given: Training, ramp: float, figures: Callable[[int], dict[str, float]]
+    given: Training, ramp: Ramp, figures: Callable[[int], dict[str, float]]
 ) -> tuple[Counting, dict[str, Any]]:
     env = ToyWorld(2)
     learner = Counting(env, figures)
@@ -165,14 +169,23 @@ def test_penalties_ramp_up_over_a_share_of_the_training(tmp_path: Path) -> None:
         ("none", 0.0, [1.0] * 10),
     ):
         (tmp_path / name).mkdir()
-        learner, _ = counted(training(tmp_path / name), ramp, lambda step: {"success": 0.0})
+        learner, _ = counted(training(tmp_path / name), Ramp(ramp), lambda step: {"success": 0.0})
         assert learner.scales == pytest.approx(expected)
+
+
+def test_penalties_shrink_while_the_training_fails(tmp_path: Path) -> None:
+    succeeding = {1, 2, 3, *range(9, 11)}
+    learner, _ = counted(
+        training(tmp_path), Ramp(0.5, 0.5), lambda step: {"success": float(step in succeeding) * 0.7}
+    )
+    # Means of five points: 0.7 until step 3, then 0.52, 0.42, 0.28, 0.14, 0 and 0.14; a step is a fifth.
+    assert learner.scales == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 0.6, 0.4, 0.2, 0.0, 0.0], abs=1e-9)
 
 
 def test_the_curve_has_every_iteration_and_null_for_what_is_undefined(tmp_path: Path) -> None:
     notes: list[tuple[float, str]] = []
     given = training(tmp_path, progress=lambda share, note: notes.append((share, note)))
-    _, curve = counted(given, 0.0, lambda step: {"success": math.nan if step < 3 else step / 10})
+    _, curve = counted(given, WHOLE, lambda step: {"success": math.nan if step < 3 else step / 10})
     assert [point["success"] for point in curve["points"]] == [
         None,
         None,
@@ -189,14 +202,14 @@ def test_where_success_is_to_last_the_length_of_episodes_is_told_instead(tmp_pat
     notes: list[str] = []
     walker = TASKS["humanoid-kinematics"]
     given = training(tmp_path, task=walker, progress=lambda share, note: notes.append(note))
-    _, curve = counted(given, 0.0, lambda step: {"success": 0.0, "episode_steps": 1000.0 * step})
+    _, curve = counted(given, WHOLE, lambda step: {"success": 0.0, "episode_steps": 1000.0 * step})
     assert {point["success"] for point in curve["points"]} == {None}
     assert notes[-1].endswith("steps of training episodes 5,500")
 
 
 def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     given = training(tmp_path)
-    first, _ = counted(given, 0.0, lambda step: {"success": 0.5})
+    first, _ = counted(given, WHOLE, lambda step: {"success": 0.5})
     assert (tmp_path / "checkpoint.safetensors").is_file()
     env = ToyWorld(2)
     again = Counting(env, lambda step: {"success": 0.5})
