@@ -86,7 +86,7 @@ def summary(
     found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for name, values in rmse.items():
         # The first replicate is the sample itself.
-        less = {reference: 1 - values / rmse[reference] for reference in references}
+        less = {reference: 1 - _ratio(values, rmse[reference]) for reference in references}
         found[name] = {}
         for k, horizon in enumerate(horizons_s):
             rows: dict[str, dict[str, float]] = {}
@@ -96,8 +96,8 @@ def summary(
                     rows[axis] |= _less(reference, less[reference][:, k, a])
             rows["mean"] = {}
             for reference in references:
-                body = less[reference][:, k, : len(judged)].mean(-1)
-                rows["mean"] |= _less(reference, body)
+                parts = less[reference][:, k, : len(judged)]
+                rows["mean"] |= _less(reference, _ratio(np.nansum(parts, -1), np.isfinite(parts).sum(-1)))
             found[name][f"{horizon:.3g}"] = rows
     return found
 
@@ -110,6 +110,11 @@ def _rmse(squared: Floats, number: NDArray[np.intp], weight: Floats) -> Floats:
     )
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.tensordot(weight, total, 1) / np.tensordot(weight, count, 1)))
+
+
+def _ratio(values: Floats, divisor: Floats | NDArray[np.int64]) -> Floats:
+    """Return `values` / `divisor`; NaN where that is 0, as are the errors of a joint at rest."""
+    return np.divide(values, divisor, out=np.full_like(values, np.nan), where=divisor > 0)
 
 
 def _less(reference: str, values: Floats) -> dict[str, float]:

@@ -80,9 +80,7 @@ class EnvConfig(Config):
     @model_validator(mode="after")
     def _has_a_ramp(self) -> Self:
         if self.ramp_while and not self.ramp:
-            raise ValueError(
-                "ramp_while: expected a ramp, a share of the training over which penalties grow"
-            )
+            raise ValueError("ramp_while: expected a ramp, a share of the training over which penalties grow")
         return self
 
     @property

@@ -48,6 +48,16 @@ def test_intervals_resample_pieces() -> None:
     assert (cell["rmse"], cell["low"], cell["high"]) == pytest.approx((5**0.5, 1.0, 3.0), abs=1e-5)
 
 
+def test_an_axis_at_rest_in_some_resamples_is_compared_by_the_others() -> None:
+    piece_of = np.repeat(np.arange(3), 10)
+    raw = np.ones((1, 30, 1, len(AXES)))
+    raw[0, piece_of > 0, 0, 0] = 0.0  # one resample in nine takes piece 1 or 2 alone
+    cell = summary({"raw": raw, "nas": raw / 4}, piece_of, [1.0])["nas"]["1"]
+    for axis in ("forward_m", "mean"):
+        assert cell[axis]["less_than_raw"] == cell[axis]["less_than_raw_low"] == pytest.approx(0.5)
+        assert cell[axis]["less_than_raw_high"] == pytest.approx(0.5)
+
+
 def test_intervals_hold_95_percent_of_the_resamples() -> None:
     """By another bootstrap; a 90 % interval would be a sixth narrower."""
     rng = np.random.default_rng(5)
