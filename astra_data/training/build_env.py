@@ -55,6 +55,9 @@ class EnvConfig(Config):
     keep_member: bool = Field(default=False, exclude_if=lambda keeps: not keeps)
     """Correct each row, and predict its reward, by one of the `[ground] members`, in equal shares: simulators
     that differ are harder to exploit."""
+    change_penalty: NotNegative = Field(default=0.0, exclude_if=lambda weight: not weight)
+    """Subtracted from the reward of a step, times the squared change of the command: robots fall and lose time
+    where commands jump about. It is whole from the start."""
     command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: Share = 0.0
@@ -206,6 +209,7 @@ def training_env(
         command_limit_m_s=config.command_limit_m_s,
         thinness=None if parts.thinness is None else config.support_penalty * parts.thinness,
         disagreement_penalty=config.disagreement_penalty,
+        change_penalty=config.change_penalty,
         starts=parts.starts,
         data_start_share=config.data_start_share if parts.starts else 0.0,
         shows_parameters=shows_parameters,

@@ -69,6 +69,7 @@ class SimulatorEnv:
         command_limit_m_s: float = 2.0,
         thinness: Tensor | None = None,
         disagreement_penalty: float = 0.0,
+        change_penalty: float = 0.0,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
         shows_parameters: bool = False,
@@ -85,6 +86,7 @@ class SimulatorEnv:
             thinness: subtracted from the reward of a step to each cell of the maze's fine grid, (height,
                 width); None without a maze.
             disagreement_penalty: subtracted from the reward, times the simulator's `disagreement`.
+            change_penalty: subtracted from it, times the squared change of the command.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
             shows_parameters: end observations with the normalised parameters of a simulator that varies.
@@ -100,12 +102,14 @@ class SimulatorEnv:
         self.free = None if maze is None else FreeSpace.of_maze(maze, radius_m=0.0, device=device)
         self.thinness = thinness
         self.disagreement_penalty = disagreement_penalty
+        self.change_penalty = change_penalty
         self.starts = starts
         self.data_start_share = data_start_share
         self.device = simulator.state.device
         self.num_envs = len(simulator.state)
         self.action_size = objective.action_size
         self.goal = torch.zeros(self.num_envs, objective.goal_size, device=self.device)
+        self._command = torch.zeros(self.num_envs, self.action_size, device=self.device)
         self.failed = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._shows_parameters = shows_parameters
         shown = self._shown_parameters()
@@ -127,11 +131,13 @@ class SimulatorEnv:
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
         state = self.objective.draw_starts(rng, len(rows))
         self.goal[rows] = self._tensor(self.objective.draw_goals(rng, len(rows)))
+        self._command[rows] = 0.0
         self.simulator.start(self._tensor(state), rows, self.goal[rows])
 
     def _start_from_data(self, rows: Tensor, starts: DataStarts) -> None:
         moments = torch.randint(len(starts.state), (len(rows),), device=self.device)
         self.goal[rows] = starts.goal[moments]
+        self._command[rows] = starts.previous_action[moments]
         self.simulator.start(
             starts.state[moments],
             rows,
@@ -146,7 +152,8 @@ class SimulatorEnv:
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A), clipped to ±1 and to the command limit."""
         before = self.simulator.state
-        after = self.simulator.step(self.objective.limit_command(action, self.command_limit_m_s))
+        command = self.objective.limit_command(action, self.command_limit_m_s)
+        after = self.simulator.step(command)
         success = self.objective.reached(after, self.goal)
         self.failed = self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:
@@ -170,9 +177,13 @@ class SimulatorEnv:
             predicted = self.simulator.predicted_reward(own, with_failures=not self.topple)
             if predicted is not None:
                 reward = torch.where(decided, reward, predicted)
+        reward = reward + self.penalty_scale * penalty
+        if self.change_penalty:
+            reward = reward - self.change_penalty * (command - self._command).square().sum(-1)
+            self._command = command
         return Step(
             observation=self._observe(),
-            reward=reward + self.penalty_scale * penalty,
+            reward=reward,
             terminated=success | self.failed,
             success=success,
         )
@@ -188,10 +199,13 @@ class SimulatorEnv:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
-        return {"goal": self.goal} | self.simulator.state_dict()
+        changes = {"command": self._command} if self.change_penalty else {}
+        return {"goal": self.goal} | changes | self.simulator.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
         """Continue from `state`; return the observations (B, O)."""
         self.goal = state["goal"].clone()
+        if self.change_penalty:
+            self._command = state["command"].clone()
         self.simulator.load_state_dict(state)
         return self._observe()

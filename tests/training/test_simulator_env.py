@@ -241,6 +241,36 @@ def test_the_penalty_scale_scales_the_penalties() -> None:
     assert [rewards[0] - reward for reward in rewards] == pytest.approx([0.0, 0.25, 1.0], abs=1e-5)
 
 
+def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -> None:
+    still, penalised = world(2), world(2, change_penalty=0.5, command_limit_m_s=0.5)
+    penalised.penalty_scale = 0.0
+    paid = []
+    for command in ([0.0, 0.4], [0.0, 0.4], [3.0, 0.0]):  # the last is shortened to 0.5
+        state = penalised.state_dict()
+        still.load_state_dict(state)
+        reward = penalised.step(torch.tensor([command] * 2)).reward
+        paid.append((still.step(torch.tensor([command] * 2).clamp(-0.5, 0.5)).reward - reward).tolist())
+    for row, change in zip(paid, (0.16, 0.0, 0.41), strict=True):
+        assert row == pytest.approx([0.5 * change] * 2, abs=1e-5)
+    penalised.reset(torch.tensor([True, False]))
+    still.load_state_dict(penalised.state_dict())
+    command = torch.tensor([[0.5, 0.0]] * 2)
+    paid = still.step(command).reward - penalised.step(command).reward
+    assert paid.tolist() == pytest.approx([0.125, 0.0], abs=1e-5)
+
+
+def test_from_a_recorded_moment_the_first_change_is_from_the_recorded_command() -> None:
+    starts = DataStarts(
+        state=torch.tensor([[-4.0, 4.0, 0.0, 0.0]]),
+        goal=torch.tensor([[4.0, 4.0]]),
+        hidden=None,
+        previous_action=torch.tensor([[0.3, 0.0]]),
+    )
+    one = world(1, change_penalty=1.0, starts=starts, data_start_share=1.0)
+    one.reset()
+    assert one.state_dict()["command"].tolist() == [pytest.approx([0.3, 0.0])]
+
+
 def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
