@@ -20,6 +20,7 @@ from astra_data.learning.ppo import Ppo
 from astra_data.learning.rma import Adaptation, RmaConfig
 from astra_data.methods.method import Method, Table
 from astra_data.training.policy_file import PolicyFile
+from astra_data.training.ramp import Ramp
 from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimise
 
 
@@ -54,7 +55,7 @@ class TeacherThenStudent(InSimulator):
         adaptation = Adaptation(
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )
-        curve["adaptation"] = optimise(adaptation, env, 0.0, phase_2, "adaptation_checkpoint.safetensors")
+        curve["adaptation"] = optimise(adaptation, env, Ramp(), phase_2, "adaptation_checkpoint.safetensors")
         for spent in ("wall_seconds", "cpu_seconds"):
             curve[spent] += curve["adaptation"][spent]
         episodes = training.episodes

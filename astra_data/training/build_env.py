@@ -56,8 +56,8 @@ class EnvConfig(Config):
     """Correct each row, and predict its reward, by one of the `[ground] members`, in equal shares: simulators
     that differ are harder to exploit."""
     change_penalty: NotNegative = Field(default=0.0, exclude_if=lambda weight: not weight)
-    """Subtracted from the reward of a step, times the squared change of the command: robots fall and lose time
-    where commands jump about. It is whole from the start."""
+    """Subtracted from the reward of a step, times the squared change of the command, from the start: robots
+    fall and lose time where commands jump about."""
     command_limit_m_s: Positive = 2.0
     """Shorten longer commands to this, in training and in the target; by default longer than any command."""
     ramp: Share = 0.0

@@ -19,7 +19,7 @@ class Ramp:
         while_success: success of training episodes below which it falls, as fast, in place of growing.
     """
 
-    share: float
+    share: float = 0.0
     while_success: float = 0.0
 
     def scale(self, points: Points, steps: int, total_steps: int) -> float:

@@ -16,7 +16,7 @@ from astra_data.worlds.variation import PlanarVariation
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def world(num_envs: int = 4, **options: float | torch.Tensor) -> SimulatorEnv:
+def world(num_envs: int = 4, **options: float | torch.Tensor | DataStarts) -> SimulatorEnv:
     simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
     return SimulatorEnv(TASK, simulator, **options)  # type: ignore[arg-type]
 
@@ -121,7 +121,7 @@ def test_episodes_may_start_from_recorded_moments() -> None:
     moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
     starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)
     torch.manual_seed(0)
-    one = world(1000, starts=starts, data_start_share=0.3)  # type: ignore[arg-type]
+    one = world(1000, starts=starts, data_start_share=0.3)
     one.reset()
     recorded = (one.simulator.state == moment).all(dim=1)
     assert float(recorded.float().mean()) == pytest.approx(0.3, abs=0.05)
@@ -254,9 +254,9 @@ def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -
         assert row == pytest.approx([0.5 * change] * 2, abs=1e-5)
     penalised.reset(torch.tensor([True, False]))
     still.load_state_dict(penalised.state_dict())
-    command = torch.tensor([[0.5, 0.0]] * 2)
-    paid = still.step(command).reward - penalised.step(command).reward
-    assert paid.tolist() == pytest.approx([0.125, 0.0], abs=1e-5)
+    same = torch.tensor([[0.5, 0.0]] * 2)
+    less = still.step(same).reward - penalised.step(same).reward
+    assert less.tolist() == pytest.approx([0.125, 0.0], abs=1e-5)
 
 
 def test_from_a_recorded_moment_the_first_change_is_from_the_recorded_command() -> None:

@@ -152,7 +152,7 @@ class Counting:
         self.steps, self.observation = int(state["steps"]), observation
 
 
-WHOLE = Ramp(0.0)
+WHOLE = Ramp()
 
 
 def counted(
@@ -214,7 +214,7 @@ def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     env = ToyWorld(2)
     again = Counting(env, lambda step: {"success": 0.5})
     again.total_steps = 12
-    curve = optimise(cast(Learner, again), env, 0.0, given)
+    curve = optimise(cast(Learner, again), env, WHOLE, given)
     assert again.scales == [1.0, 1.0]
     assert torch.equal(again.observation, first.env.observe())
     assert [point["steps"] for point in curve["points"]] == list(range(1, 13))
