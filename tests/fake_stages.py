@@ -38,6 +38,7 @@ class FakeConfig(Config):
     limits_commands: bool = False
     disagreement_penalty: float = 0.0
     keep_member: bool = False
+    ramp_while: float = 0.0
     reward: str | None = None
     correction_heads: int = 1
     members: int = 0
