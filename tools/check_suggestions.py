@@ -137,9 +137,8 @@ def foreseen(setting: Setting, folder: Path, seed: int, fresh: str) -> float:
         latent, _ = model.encode(windows)
         predictions.append(model.ensemble_predictions(latent, windows.action, windows.simulated_next))
     asked = torch.cat(predictions)
-    error = pairs.steps(windows.next_state - asked.mean(0)).double()
-    white = torch.linalg.solve_triangular(torch.linalg.cholesky(committee.covariance), error.T, upper=False)
-    return float(stats.spearmanr(pairs.steps(committee.information(asked)), white.norm(dim=0)).statistic)
+    white = committee.whitened(pairs.steps(windows.next_state - asked.mean(0)))
+    return float(stats.spearmanr(pairs.steps(committee.information(asked)), white.norm(dim=-1)).statistic)
 
 
 def measured(setting: Setting, folder: Path, seed: int) -> dict[str, Any]:

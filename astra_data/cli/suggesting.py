@@ -41,7 +41,7 @@ def suggest(
         folder, found, task = write(
             run, row=row, seed=seed, out=output, root=root, progress=progress, **given
         )
-    expected = (found.rollouts.information * found.rollouts.reached).sum(0)
+    expected = found.rollouts.expected.sum(0)
     nats, average = expected[found.taken].mean(), expected.mean()
     number = f"{len(found.taken)} of {len(expected)}"
     typer.echo(f"suggested: {number} episodes, with {nats:.1f} nats each, on average of all {average:.1f}")

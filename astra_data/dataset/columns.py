@@ -112,13 +112,15 @@ class Column:
                 faults.append(f"astra has {key!r}, expected unit, frame, role, mirror")
             elif len(words) != self.size:
                 faults.append(f"{len(words)} words in astra's {key} for {self.size} values")
-        unknown = sorted(set((self.astra or {}).get("role", [])) - set(ROLES))
-        if unknown:
+        if unknown := sorted(set((self.astra or {}).get("role", [])) - set(ROLES)):
             faults.append(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
-        if not faults:
-            faults = [*self._role_faults(), *self._mirror_faults()]
-        if faults:
+        if faults := faults or [*self._role_faults(), *self._mirror_faults()]:
             raise BadInputError(f"Column {self.name[:MOST_NAME_BYTES]!r}: {'; '.join(faults)}.")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each value; without names its index."""
+        return self.names or tuple(map(str, range(self.size)))
 
     @property
     def roles(self) -> list[tuple[str, slice]]:
@@ -140,8 +142,7 @@ class Column:
         words = astra.get("mirror")
         if words is None:
             return None if "invariant" in astra.get("role", []) else ([*range(self.size)], [1] * self.size)
-        names = list(self.names or ())
-        source = [names.index(word.lstrip("-")) if word else index for index, word in enumerate(words)]
+        source = [self.labels.index(word.lstrip("-")) if word else index for index, word in enumerate(words)]
         return source, [-1 if word.startswith("-") else 1 for word in words]
 
     def _role_faults(self) -> list[str]:
@@ -173,12 +174,11 @@ class Column:
 
     def feature(self) -> dict[str, Any]:
         """Return the column's entry in LeRobot's `features`."""
-        names = None if self.names is None else list(self.names)
-        entry: dict[str, Any] = {"dtype": self.dtype, "shape": [self.size], "names": names}
-        astra = {key: list(words) for key, words in (self.astra or {}).items()}
-        if self.meaning or astra:
-            entry["astra"] = ({"meaning": self.meaning} if self.meaning else {}) | astra
-        return entry
+        names = self.names and list(self.names)
+        astra: dict[str, Any] = {"meaning": self.meaning} if self.meaning else {}
+        astra |= {key: list(words) for key, words in (self.astra or {}).items()}
+        entry = {"dtype": self.dtype, "shape": [self.size], "names": names}
+        return entry | ({"astra": astra} if astra else {})
 
     @classmethod
     def from_feature(cls, name: str, feature: Mapping[str, Any]) -> "Column":

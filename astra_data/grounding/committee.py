@@ -36,6 +36,11 @@ class Rollouts:
     information: Tensor
     reached: Tensor
 
+    @property
+    def expected(self) -> Tensor:
+        """What each step is expected to teach, in nats, (T, B)."""
+        return self.information * self.reached
+
 
 @dataclass(frozen=True)
 class Committee:
@@ -92,11 +97,8 @@ class Committee:
         if self.clearance_m is not None and isinstance(simulator, WalledSimulator):
             simulator.keep_clear(self.clearance_m)
         simulator.reset_to(start)
-        objective, previous, reached = (
-            self.task.objective,
-            torch.zeros_like(action[0]),
-            torch.ones(len(start)),
-        )
+        objective, previous = self.task.objective, torch.zeros_like(action[0])
+        reached = torch.ones(len(start))
         hidden = [start.new_zeros(len(start), model.shape.latent_size) for model in self.models]
         memories = [model.initial_memory(start, previous) for model in self.failures]
         states, information, reach = [], [], []
@@ -130,6 +132,12 @@ class Committee:
             progress((step + 1) / len(action), f"step {step + 1} of {len(action)}")
         return Rollouts(torch.stack(states), torch.stack(information), torch.stack(reach))
 
+    def whitened(self, difference: Tensor) -> Tensor:
+        """Return differences of states (..., X), float64, such that the scatter would have covariance 1."""
+        apart, factor = difference.double(), torch.linalg.cholesky(self.covariance)
+        white: Tensor = torch.linalg.solve_triangular(factor, apart.flatten(0, -2).T, upper=False)
+        return white.T.view_as(apart)
+
     def information(self, predictions: Tensor) -> Tensor:
         """Return what seeing the outcome of a step would teach, (...), given predictions (K, ..., X) of it.
 
@@ -137,9 +145,7 @@ class Committee:
         distribution: ½ log |I + Σ⁻¹ C|, with C the covariance of the predictions and Σ that of the scatter
         (MacKay, 1992, "Information-based objective functions for active data selection").
         """
-        apart = (predictions - predictions.mean(0)).double()
-        factor = torch.linalg.cholesky(self.covariance)
-        white = torch.linalg.solve_triangular(factor, apart.flatten(0, -2).T, upper=False).T.view_as(apart)
+        white = self.whitened(predictions - predictions.mean(0))
         members = white.movedim(0, -2)
         identity = torch.eye(len(predictions), dtype=white.dtype)
         gram = identity + members @ members.mT / (len(predictions) - 1)

@@ -24,7 +24,7 @@ def dropped_values(column: Column, episodes: PairedEpisodes) -> dict[str, Tensor
     state, abstract = episodes.target_state, episodes.windows.state
     same = state.unsqueeze(-1) == abstract.unsqueeze(-2)
     kept = episodes.steps(same).all(0).any(-1).tolist()
-    names = column.names or [f"{entry}" for entry in range(column.size)]
+    names = column.labels
     values: dict[str, Tensor] = {}
     for role, group in column.roles or [("invariant", slice(0, column.size))]:
         if role == "quaternion":

@@ -204,7 +204,7 @@ def _lifted(points: Array) -> Array:
 def _labels(column: Column) -> list[str]:
     if column.size == 1 and not column.names:
         return [column.name]
-    return [f"{column.name}/{name}" for name in column.names or range(column.size)]
+    return [f"{column.name}/{name}" for name in column.labels]
 
 
 def _times(rerun: Any, count: int, after: bool, fps: int) -> list[Any]:  # noqa: ANN401

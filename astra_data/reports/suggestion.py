@@ -70,11 +70,9 @@ def _of_commands(task: Task) -> Column:
 
 def labels(column: Column) -> list[str]:
     """Return the names of a column's entries with their units, where these are known."""
-    names = column.names or tuple(map(str, range(column.size)))
     units = (column.astra or {}).get("unit", ["1"] * column.size)
-    return [
-        name if unit in ("1", "") else f"{name} ({unit})" for name, unit in zip(names, units, strict=True)
-    ]
+    named = zip(column.labels, units, strict=True)
+    return [name if unit in ("1", "") else f"{name} ({unit})" for name, unit in named]
 
 
 def suggestion_page(
@@ -90,7 +88,7 @@ def suggestion_page(
         origin: the groundings whose corrections disagree.
     """
     episodes, rollouts = suggestion.plan.episodes, suggestion.rollouts
-    expected = (rollouts.information * rollouts.reached).sum(0).numpy()
+    expected = rollouts.expected.sum(0).numpy()
     lengths = (rollouts.reached.sum(0) * task.timestep_s).numpy()
     number = len(str(len(episodes)))
     states, commands = labels(task.abstract_state), labels(_of_commands(task))

@@ -160,7 +160,10 @@ def collect(
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         training = part(progress, 0.0, share)
-        behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
+        if plan is None:
+            behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
+        else:
+            behavior, metadata = PlannedCommands(plan.actions(world)), {}
         if config.random_share:
             behavior = MixedBehavior(behavior, _random(world, config, RandomCommands), config.random_share)
         stopwatch = Stopwatch(metadata.get("spent"))
@@ -217,14 +220,14 @@ def _steps_before(position: int, writer: StagedWriter) -> int:
 
 def _keep(least_steps: int, writer: StagedWriter) -> None:
     """Keep the first episodes that have `least_steps` together."""
-    kept = _steps_before(len(writer.staged), writer)
+    kept = sum(writer.lengths.values())
     if kept < least_steps:
         raise BadInputError(
             f"least_steps: expected {least_steps}, got {kept} in {len(writer.staged)} episodes: "
             f"take more episodes, and delete {writer.folder}"
         )
-    for position in reversed(sorted(writer.staged)):
-        kept -= writer.lengths[position]
+    for position, steps in sorted(writer.lengths.items(), reverse=True):
+        kept -= steps
         if kept < least_steps:
             break
         writer.drop(position)
@@ -241,8 +244,6 @@ def _behavior(
     """Return the behaviour and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         return _random(task, config, commands), {}
-    if config.plan is not None:
-        return PlannedCommands(Plan.load(config.plan, task).actions(task)), {}
     if config.behavior.startswith("suboptimal"):
         from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - TorchRL is slow to import
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.studies.body import Body
-from astra_data.studies.predictors import Predictor
+from astra_data.studies.predictors import LEAST_DEVIATION, Predictor
 from astra_data.studies.walking import WALKER
 from astra_data.studies.walks import Stretch
 from astra_data.studies.windows import WindowModel
@@ -66,7 +66,7 @@ class HistoryModel(Predictor):
         model.state_mean *= model.state_mean.new_tensor(self.body.usual_motion)
         model.goal_mean *= model.goal_mean.new_tensor(self.body.usual_seen)
         if self.body.is_scaled and self.body.given_size:
-            self.given_std.copy_(stretch.past_action.flatten(0, 1).std(0).clamp_min(_LEAST))
+            self.given_std.copy_(stretch.past_action.flatten(0, 1).std(0).clamp_min(LEAST_DEVIATION))
 
     def begin(self, stretch: Stretch) -> Tensor:
         """Return the hidden state (B, Z) after the history, and the memory of the base."""
@@ -120,7 +120,3 @@ class HistoryModel(Predictor):
 
     def _inputs(self, motion: Tensor, seen: Tensor, action: Tensor) -> Tensor:
         return self.grounding.encoder_input(motion, self.body.features(seen), action / self.given_std)
-
-
-_LEAST = 1e-6
-"""Least deviation that is divided by."""

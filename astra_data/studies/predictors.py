@@ -12,6 +12,9 @@ from torch import Tensor, nn
 from astra_data.studies.motion import chained
 from astra_data.studies.walks import Stretch
 
+LEAST_DEVIATION = 1e-6
+"""Least deviation that inputs and corrections are divided by."""
+
 
 class Predictor(nn.Module, ABC):
     """Predicts the motion of each step; its memory (B, N) is passed in and returned."""

@@ -5,12 +5,9 @@ from torch import Tensor, nn
 
 from astra_data.learning.networks.history import mlp
 from astra_data.studies.body import Body
-from astra_data.studies.predictors import Predictor
+from astra_data.studies.predictors import LEAST_DEVIATION, Predictor
 from astra_data.studies.walking import WALKER
 from astra_data.studies.walks import Stretch
-
-_LEAST = 1e-6
-"""Least deviation that is divided by."""
 
 
 class WindowModel(Predictor):
@@ -51,17 +48,17 @@ class WindowModel(Predictor):
     def set_scales(self, stretch: Stretch) -> None:
         """Set the scales from the future steps of walking."""
         motion, simulated = (values[stretch.is_walking] for values in (stretch.motion, stretch.simulated))
-        self.motion_std.copy_(motion.std(0).clamp_min(_LEAST))
+        self.motion_std.copy_(motion.std(0).clamp_min(LEAST_DEVIATION))
         self.motion_mean.copy_(motion.mean(0) * motion.new_tensor(self.body.usual_motion))
-        self.correction_std.copy_((motion - simulated).std(0).clamp_min(_LEAST))
+        self.correction_std.copy_((motion - simulated).std(0).clamp_min(LEAST_DEVIATION))
         if self.base is not None:
-            self.correction_std.copy_(self.base.residuals(stretch).std(0).clamp_min(_LEAST))
+            self.correction_std.copy_(self.base.residuals(stretch).std(0).clamp_min(LEAST_DEVIATION))
         if self.body.is_scaled:
             seen, given, _ = stretch.first()
             if given.numel():
-                self.given_std.copy_(given.std(0).clamp_min(_LEAST))
+                self.given_std.copy_(given.std(0).clamp_min(LEAST_DEVIATION))
             self.seen_mean.copy_(seen.mean(0))
-            self.seen_std.copy_(seen.std(0).clamp_min(_LEAST))
+            self.seen_std.copy_(seen.std(0).clamp_min(LEAST_DEVIATION))
 
     def inputs(self, memory: Tensor, seen: Tensor, action: Tensor, simulated: Tensor) -> Tensor:
         """Return the network's inputs, (B, (M + G) (H + 1) + S)."""

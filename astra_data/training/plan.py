@@ -114,5 +114,4 @@ class PlannedCommands:
 
 def names_of(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the entries of an abstract state, and of the axes of a command."""
-    column = task.abstract_state
-    return column.names or tuple(map(str, range(column.size))), tuple(task.limits)
+    return task.abstract_state.labels, tuple(task.limits)

@@ -104,7 +104,7 @@ def suggested(
     features = torch.cat([rollouts.state, proposals.action], dim=-1)
     spread = features.flatten(0, 1).std(0).clamp_min(1e-6)
     taken, information = chosen(
-        (rollouts.information * rollouts.reached).T,
+        rollouts.expected.T,
         (features[::every] / spread).transpose(0, 1),
         config.episodes,
         config.reach,

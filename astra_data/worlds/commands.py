@@ -60,7 +60,7 @@ class Commands(Mapping[str, tuple[float, float]]):
             raise BadInputError(f"commands: {source.reference} has no column {ACTION}: give their bounds")
         least, largest = (np.asarray(statistics[ACTION][end], float).tolist() for end in ("min", "max"))
         column = next(column for column in source.schema if column.name == ACTION)
-        names = column.names or tuple(map(str, range(column.size)))
+        names = column.labels
         if still := [name for name, low, high in zip(names, least, largest, strict=True) if low == high]:
             raise BadInputError(
                 f"commands: {', '.join(still)} never changes in {source.reference}: give the bounds"

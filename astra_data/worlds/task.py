@@ -141,7 +141,7 @@ class Task:
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
-        names = abstract.names or tuple(map(str, range(abstract.size)))
+        names = abstract.labels
         size = self.objective.goal_size
         usual = {
             "state": replace(self.state, name=STATE),

@@ -52,11 +52,7 @@ def deletion(called: str, uids: Sequence[int]) -> str:
 
 def labels(column: Column) -> list[str]:
     """Return a name for each value of `column`."""
-    if column.names:
-        return list(column.names)
-    if column.size == 1:
-        return [column.name]
-    return [str(index) for index in range(column.size)]
+    return [column.name] if column.size == 1 and not column.names else list(column.labels)
 
 
 def channels(column: Column, indices: Sequence[int]) -> str:
