@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import base_method
 from astra_data.grounding.files import load_grounding, load_history_model
-from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel

@@ -115,7 +115,7 @@ def replayed_inputs(
     `_REPLAYED` steps begin at every `RISK_STEPS`-th recorded moment. What is seen of a step is from the one
     that began longest before it: nearly all that the averages remember is simulated then.
     """
-    windows, grounding = episodes.windows, grounding.for_replay()
+    windows, grounding = episodes.windows, grounding.reduced(members=False, failures=False)
     moments = Moments.every(windows, RISK_STEPS)
     simulator = grounding.corrected(task.simulator(len(moments), str(windows.mask.device)), None)
     hidden = grounding.hidden_before(windows, RISK_STEPS)

@@ -21,6 +21,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
 from astra_data.grounding.raw import scatter_factor
+from astra_data.grounding.scatter import fit_scatter
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
 from astra_data.worlds.task import Task
@@ -73,6 +74,9 @@ class GroundConfig(DescentConfig):
     recorded_clearance: bool = Field(default=False, exclude_if=lambda used: not used)
     """Let corrected states come no closer to walls than the robot did in 99 of 100 recorded steps: a body
     slimmer than the robot's slides where nothing was recorded. Without effect where a task has no walls."""
+    scatter: bool = Field(default=False, exclude_if=lambda used: not used)
+    """Scatter corrected states as held-out episodes do around the correction: by how much depends on the
+    moment. Without it a simulator moves more smoothly than any robot, and policies are never disturbed."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes that are held out, to measure and to fit the scatter around the correction,
     unless the dataset holds some out itself."""
@@ -156,6 +160,11 @@ class HistoryFit:
         if config.recorded_clearance:
             metrics["clearance_m"] = clearance = recorded_clearance_m(fitting.task, fitting.training)
             grounding = replace(grounding, clearance_m=clearance)
+        if config.scatter:
+            scatters, metrics["scatter"] = fit_scatter(
+                model, fitting.training, fitting.held_out, fitting.seed
+            )
+            grounding = replace(grounding, scatters=scatters)
         if foresees:
             failures = fit_failures(
                 fitting.task, grounding, fitting.training, config.failure_members, fitting.seed
@@ -201,7 +210,9 @@ def _fitted(
         }
     )
     rewards, goes_on = training.steps(windows.reward), training.steps(windows.goes_on)
-    model.set_reward_scales(rewards, goes_on, config.failure_weight)
+    # A failure model that replaces the topple head replaces R_pred's failure part, too: fitted in vain, that
+    # would fill the latent with the failures of the data.
+    model.set_reward_scales(rewards, goes_on, config.failure_weight if weights.topple else 0.0)
     fitting = replace(whole, training=training, seed=seed, progress=progress)
     return model, _optimise(model, weights, fitting, whole.folder / name)
 

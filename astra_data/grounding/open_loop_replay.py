@@ -1,6 +1,6 @@
 """Recorded actions replayed open loop from the start of each episode, to be looked at."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,19 +35,20 @@ def replay_open_loop(
 ) -> OpenLoopReplay:
     """Replay whole `episodes` in the simulator of `task` as `grounding` corrects it.
 
-    The model alone corrects, as in `gap_report`. Where there are members, each replays the episodes by itself
-    too, and the disagreement is the mean over them.
+    The model alone corrects, as in `gap_report`; hazards are those of replays that are scattered, if the
+    grounding does so. Where there are members, each replays the episodes by itself too, and the disagreement
+    is the mean over them.
     """
     history = grounding if isinstance(grounding, HistoryGrounding) else None
-    alone = history.reduced(members=False, failures=True) if history else grounding.for_replay()
-    state, hazard, disagreement = _replayed(task, alone, episodes, seed=seed)
+    state, hazard, disagreement = _replayed(task, grounding.for_replay(), episodes, seed=seed)
     if history is None:
         is_ensemble = bool(disagreement.any())
     else:
-        hazard = None if history.failures is None else hazard
+        foreseeing = history.reduced(members=False, failures=True)
+        hazard = None if history.failures is None else _replayed(task, foreseeing, episodes, seed=seed)[1]
         is_ensemble = bool(history.members) or history.model.shape.correction_heads > 1
         if count := len(history.members):
-            members = history.reduced(members=True, failures=False)
+            members = replace(history, failures=None, scatters=None)
             apart = _replayed(task, members, episodes, seed=seed, copies=count)[2]
             disagreement = apart.unflatten(0, (count, len(episodes))).mean(0)
     return OpenLoopReplay(state, hazard, disagreement if is_ensemble else None)

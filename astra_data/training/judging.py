@@ -31,12 +31,14 @@ class Judge:
     def simulator(self, episodes: int) -> SimulatorEnv:
         """Return its simulator, in which its failure model ends episodes, if it has one.
 
-        Otherwise its states are scattered. With a failure model, which is shown that scatter, they are not:
-        white noise slows a walk down as no target does.
+        Otherwise its states are scattered, unless the grounding does so itself. With a failure model, which
+        is shown that scatter, they are not: white noise slows a walk down as no target does.
         """
         made = self.grounding
-        foresees = isinstance(made, HistoryGrounding) and made.failures is not None
-        simulator = made.simulator(self.task, episodes, scatter=None if foresees else self.scatter)
+        history = made if isinstance(made, HistoryGrounding) else None
+        foresees = history is not None and history.failures is not None
+        scatters = foresees or (history is not None and history.scatters is not None)
+        simulator = made.simulator(self.task, episodes, scatter=None if scatters else self.scatter)
         return SimulatorEnv(self.task.objective, simulator, topple=foresees)
 
     def success(self, policy: DeployedPolicy, episodes: int, seed: int) -> float:

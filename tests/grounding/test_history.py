@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
+from astra_data.grounding.grounded_simulator import GroundedSimulator
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.worlds.plane.mazes import U_MAZE

@@ -5,7 +5,8 @@ import torch
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
+from astra_data.grounding.grounded_simulator import GroundedSimulator
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING

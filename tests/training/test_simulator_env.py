@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape

@@ -206,8 +206,12 @@ class GroundingModel(nn.Module):
 
     def ensemble_predictions(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """Return the next abstract state as each of the K heads corrects it, (K, ..., X)."""
-        inputs = torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
+        inputs = self.correction_inputs(latent, action, simulated_next)
         return torch.stack([simulated_next + head(inputs) * self.correction_std for head in self.corrections])
+
+    def correction_inputs(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return what the correction sees of a step, (..., I)."""
+        return torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
 
     def disagreement(self, predictions: Tensor) -> Tensor:
         """Return the spread (...) of ensemble predictions (K, ..., X), relative to that on the data."""
@@ -216,8 +220,7 @@ class GroundingModel(nn.Module):
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
         """Return the log-odds (...) of a topple within `RISK_STEPS`, on the way to `next_state`."""
-        inputs = torch.cat([latent, action, self.state_features(next_state)], dim=-1)
-        logit: Tensor = self.topple_head(inputs)
+        logit: Tensor = self.topple_head(self.correction_inputs(latent, action, next_state))
         return logit.squeeze(-1)
 
     def topple_risk(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:

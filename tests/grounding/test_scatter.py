@@ -1,0 +1,166 @@
+"""The scatter model: what a correction leaves unexplained, by the moment."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from toy_episodes import no_episodes, toy_episodes
+
+from astra_data.core.progress import silent
+from astra_data.grounding.failures import replayed_inputs
+from astra_data.grounding.files import load_grounding, save_grounding
+from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.open_loop_replay import replay_open_loop
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.scatter import fit_scatter
+from astra_data.learning.networks.failure import FailureModel, FailureShape
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
+from astra_data.worlds.registry import TASKS
+
+TASK = TASKS["antmaze-umaze"]
+CALM, WILD = 0.01, 0.05
+MASKED = 7
+
+
+def grounding_model() -> GroundingModel:
+    torch.manual_seed(0)
+    return GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False).eval()
+
+
+def scattered_episodes(seed: int, episodes: int = 30) -> PairedEpisodes:
+    """Robots that scatter little around the simulator, and much where they are told to go right."""
+    torch.manual_seed(seed)
+    state = torch.tensor([0.0, 4.0, 0.0, 0.0]) + 0.1 * torch.randn(episodes, 50, 4)
+    action = torch.rand(episodes, 50, 2)
+    action[..., 0] = (0.5 + 0.5 * action[..., 0]) * (2 * torch.randint(2, (episodes, 50)) - 1)
+    scale = torch.where(action[..., :1] > 0, WILD, CALM)
+    mask = torch.ones(episodes, 50)
+    mask[:, -MASKED:] = 0.0
+    residual = scale * torch.randn(episodes, 50, 4) + 1e3 * (1 - mask)[..., None]
+    return toy_episodes(state, action, simulated_next=state, next_state=state + residual, mask=mask)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[ScatterModel, dict[str, float]]:
+    return fit_scatter(grounding_model(), scattered_episodes(0), scattered_episodes(1), seed=0)
+
+
+def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_steps(
+    fitted: tuple[ScatterModel, dict[str, float]],
+) -> None:
+    scatters, figures = fitted
+    model, fresh = grounding_model(), scattered_episodes(2)
+    windows = fresh.windows
+    latent, _ = model.encode(windows)
+    inputs = fresh.steps(model.correction_inputs(latent, windows.action, windows.simulated_next))
+    right = fresh.steps(windows.action)[:, 0] > 0
+    drawn = scatters.draw(inputs)
+    assert float(drawn[right].std()) == pytest.approx(WILD, rel=0.15)
+    assert float(drawn[~right].std()) == pytest.approx(CALM, rel=0.3)
+    assert len(scatters.forms) == 30 * (50 - MASKED)
+    assert float(scatters.forms.std()) == pytest.approx(1.0, abs=0.15)
+    # Of a Gaussian whose size is one of two, against one of the average size: nats of each of four entries.
+    usual = ((CALM**2 + WILD**2) / 2) ** 0.5
+    gain = 4 * (torch.tensor(usual).log() - torch.tensor([CALM, WILD]).log().mean())
+    assert figures["gain_nats"] == pytest.approx(float(gain), rel=0.15)
+    assert figures["kurtosis"] == pytest.approx(3.0, abs=0.6)
+
+
+def test_the_same_seed_fits_the_same_one(fitted: tuple[ScatterModel, dict[str, float]]) -> None:
+    again, _ = fit_scatter(grounding_model(), scattered_episodes(0), scattered_episodes(1), seed=0)
+    kept = fitted[0].state_dict()
+    assert all(torch.equal(values, kept[name]) for name, values in again.state_dict().items())
+
+
+def even(size: float = 0.05) -> ScatterModel:
+    """Return a model with two forms, to the left and to the right."""
+    shape = grounding_model().shape
+    inputs = shape.latent_size + 2 + 4 + grounding_model().position_features.size
+    made = ScatterModel(ScatterShape(inputs, 4, 2)).requires_grad_(False).eval()
+    made.forms[0, 0], made.forms[1, 0] = -size, size
+    return made
+
+
+def test_corrected_states_are_scattered_and_replays_are_not() -> None:
+    grounding = HistoryGrounding(grounding_model(), scatters=even())
+    worlds = [one.simulator(TASK, 64) for one in (grounding, grounding.for_replay())]
+    for world in worlds:
+        torch.manual_seed(0)
+        world.start(torch.tensor([0.0, 4.0, 0.0, 0.0]).expand(64, 4), torch.arange(64), torch.zeros(64, 2))
+    apart = worlds[0].step(torch.zeros(64, 2)) - worlds[1].step(torch.zeros(64, 2))
+    assert sorted({round(value, 4) for value in apart[:, 0].tolist()}) == [-0.05, 0.05]
+    assert apart[:, 1:].abs().max() < 1e-6
+    assert float(worlds[0].disagreement.abs().max()) == 0.0
+
+
+def test_files_hold_it_and_are_as_before_without_it(tmp_path: Path) -> None:
+    plain = HistoryGrounding(grounding_model())
+    for scatters in (None, even()):
+        path, made = tmp_path / "grounding.safetensors", replace(plain, scatters=scatters)
+        save_grounding(path, made, no_episodes())
+        loaded = load_grounding(path)
+        assert isinstance(loaded, HistoryGrounding)
+        tensors, metadata = made.to_file()
+        assert ("scatter" in metadata) == any(name.startswith("scatter.") for name in tensors)
+        assert (loaded.scatters is None) == (scatters is None) == ("scatter" not in metadata)
+        if scatters is not None and loaded.scatters is not None:
+            assert torch.equal(loaded.scatters.forms, scatters.forms)
+            assert not any(one.requires_grad for one in loaded.scatters.parameters())
+
+
+def test_a_failure_model_is_fitted_to_replays_that_are_scattered() -> None:
+    episodes = scattered_episodes(0, episodes=4)
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    failures.set_move_scales(episodes.windows)
+    seen = []
+    for scatters in (None, even(), even()):
+        torch.manual_seed(0)
+        grounding = HistoryGrounding(grounding_model(), scatters=scatters)
+        seen.append(replayed_inputs(TASK, grounding, failures, episodes))
+    assert torch.equal(seen[1], seen[2])
+    assert not torch.allclose(seen[0], seen[1])
+
+
+def test_an_open_loop_replay_shows_the_mean_path_and_the_hazards_of_scattered_ones() -> None:
+    episodes = scattered_episodes(0, episodes=4)
+    torch.manual_seed(5)
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).requires_grad_(False).eval()
+    plain = HistoryGrounding(grounding_model(), failures)
+    one, scattered = (
+        replay_open_loop(TASK, made, episodes, seed=0) for made in (plain, replace(plain, scatters=even()))
+    )
+    assert torch.equal(one.state, scattered.state)
+    assert one.hazard is not None and scattered.hazard is not None
+    assert not torch.allclose(one.hazard, scattered.hazard)
+
+
+@pytest.mark.parametrize("used", [False, True])
+def test_a_fit_has_it_if_it_is_asked_to(tmp_path: Path, used: bool) -> None:
+    config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8, scatter=used)
+    assert ("scatter" in config.model_dump()) == used
+    fitting = Fitting(
+        TASK, config, None, scattered_episodes(0), scattered_episodes(1), 0, "cpu", tmp_path, silent
+    )
+    grounding, metrics = HistoryFit(latent=False, reward=False)(fitting)
+    assert (grounding.scatters is not None) == ("scatter" in metrics) == used
+
+
+@pytest.mark.parametrize("foresees", [False, True])
+def test_rpred_learns_failures_only_where_no_failure_model_replaces_it(
+    tmp_path: Path, foresees: bool
+) -> None:
+    training = scattered_episodes(0)
+    soon = torch.zeros(30, 50)
+    soon[:15, 20:40] = 1.0
+    reward = torch.zeros(30, 50, 2)
+    reward[:15, 39, 1] = -10.0
+    training = replace(training, windows=replace(training.windows, topples_soon=soon, reward=reward))
+    config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8, failure_members=int(foresees))
+    fitting = Fitting(TASK, config, None, training, training, 0, "cpu", tmp_path, silent)
+    grounding, _ = HistoryFit(latent=False, reward=True)(fitting)
+    assert (grounding.failures is not None) == foresees
+    assert (float(grounding.model.failure_weight) == 0.0) == foresees
+    assert float(grounding.model.failure_cost) < 0
