@@ -10,6 +10,7 @@ from small_cart import TASK
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
 from astra_data.training import judging
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
@@ -62,6 +63,17 @@ def test_a_judge_ends_episodes_by_its_failure_model_or_else_scatters_states(
         assert simulator.scatter is None
     else:
         assert torch.equal(simulator.scatter, grounding.model.residual_factor)
+
+
+def test_a_judge_that_scatters_by_the_moment_adds_no_other_scatter(judge: Judge) -> None:
+    whole: Any = judge.grounding
+    state_size, inputs = whole.model.shape.state_size, whole.model.corrections[0][0].in_features
+    scatters = ScatterModel(ScatterShape(inputs, state_size, 1)).requires_grad_(False)
+    for known in (None, scatters):
+        made = replace(judge, grounding=replace(whole, failures=None, scatters=known))
+        simulator: Any = made.simulator(2).simulator
+        assert simulator.scatters is known
+        assert (simulator.scatter is None) == (known is not None)
 
 
 def test_success_is_the_share_of_the_episodes(
