@@ -58,7 +58,7 @@ def replayed(task: Task, grounding: HistoryGrounding, moments: Moments, steps: i
     moments.start(simulator, hidden[moments.episode, moments.first])
     places = [moments.state[:, :2]]
     for step in range(steps):
-        action = moments.windows.action[moments.episode, moments.first + step]
+        action = moments.windows.action[moments.episode, moments.after(step)]
         places.append(simulator.step(action)[:, :2])
     return torch.stack(places, dim=1)
 
@@ -67,7 +67,7 @@ def _print_motion(
     task: Task, known: dict[str, HistoryGrounding], episodes: PairedEpisodes, seed: int
 ) -> None:
     windows, lengths = episodes.windows, episodes.lengths.tolist()
-    whole = Moments(windows, torch.arange(len(episodes)), torch.zeros(len(episodes), dtype=torch.long))
+    whole = Moments.every(windows, windows.mask.shape[1])
     paths = {"recorded": torch.cat([windows.state[:, :1], windows.next_state], dim=1)[..., :2]}
     paths |= {name: replayed(task, one, whole, windows.mask.shape[1]) for name, one in known.items()}
     titles = " | ".join(f"change over {lag} s" for lag in LAGS_S)
@@ -113,11 +113,8 @@ def _print_speeds(task: Task, known: dict[str, HistoryGrounding], episodes: Pair
             float(((path[of, -1] - path[of, steps // 2]) * along).sum(-1).mean()) / (HELD_S / 2)
             for path in paths.values()
         ]
-        print(
-            f"| {float(length[of].mean()):.2f} | {int(of.sum())} | "
-            + " | ".join(f"{v:.2f} m/s" for v in speeds),
-            "|",
-        )
+        told = " | ".join(f"{speed:.2f} m/s" for speed in speeds)
+        print(f"| {float(length[of].mean()):.2f} | {int(of.sum())} | {told} |")
 
 
 def _held(task: Task, episodes: PairedEpisodes, steps: int) -> Iterator[tuple[int, int]]:

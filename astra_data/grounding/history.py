@@ -79,18 +79,16 @@ class HistoryGrounding(FittedGrounding):
         """Return weights and sizes."""
         tensors = self.model.state_dict()
         metadata: dict[str, Any] = {"shape": asdict(self.model.shape), "target": self.model.target}
-        if self.failures is not None:
-            tensors |= {f"{_FAILURES}.{name}": one for name, one in self.failures.state_dict().items()}
-            metadata[_FAILURES] = asdict(self.failures.shape)
-        if self.scatters is not None:
-            tensors |= {f"{_SCATTER}.{name}": one for name, one in self.scatters.state_dict().items()}
-            metadata[_SCATTER] = asdict(self.scatters.shape)
+        for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatters)):
+            if model is not None:
+                tensors |= _named(part, model)
+                metadata[part] = asdict(model.shape)
         if self.clearance_m is not None:
             metadata["clearance_m"] = self.clearance_m
         if self.members:
             metadata[_MEMBERS] = len(self.members)
         for number, member in enumerate(self.members):
-            tensors |= {f"{_MEMBERS}.{number}.{name}": one for name, one in member.state_dict().items()}
+            tensors |= _named(f"{_MEMBERS}.{number}", member)
         return tensors, metadata
 
     @classmethod
@@ -117,8 +115,13 @@ def _loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], dev
     return model.to(device).requires_grad_(False).eval()
 
 
+def _named(part: str, model: nn.Module) -> dict[str, Tensor]:
+    """Return the tensors of a model that is a `part` of a grounding, by their names in files."""
+    return {f"{part}.{name}": one for name, one in model.state_dict().items()}
+
+
 def _within(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """Return the tensors of a `part`, by their names within it."""
+    """Return the tensors of a `part`, by their names within it: what `_named` was given."""
     prefix = f"{part}."
     return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 

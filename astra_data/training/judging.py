@@ -37,8 +37,9 @@ class Judge:
         made = self.grounding
         history = made if isinstance(made, HistoryGrounding) else None
         foresees = history is not None and history.failures is not None
-        scatters = foresees or (history is not None and history.scatters is not None)
-        simulator = made.simulator(self.task, episodes, scatter=None if scatters else self.scatter)
+        scatters = history is not None and history.scatters is not None
+        scatter = None if foresees or scatters else self.scatter
+        simulator = made.simulator(self.task, episodes, scatter=scatter)
         return SimulatorEnv(self.task.objective, simulator, topple=foresees)
 
     def success(self, policy: DeployedPolicy, episodes: int, seed: int) -> float:

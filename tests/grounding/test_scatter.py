@@ -69,6 +69,16 @@ def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_ste
     assert figures["kurtosis"] == pytest.approx(3.0, abs=0.6)
 
 
+def test_forms_are_as_wild_as_held_out_steps_where_training_ones_are_not() -> None:
+    """An overfitted correction leaves too little unexplained of what it was fitted to."""
+    training, calm = scattered_episodes(0), scattered_episodes(1)
+    windows = calm.windows
+    wilder = windows.state + 3 * (windows.next_state - windows.state)
+    held_out = replace(calm, windows=replace(windows, next_state=wilder))
+    scatters, _ = fit_scatter(grounding_model(), training, held_out, seed=0)
+    assert float(scatters.forms.std()) == pytest.approx(3.0, abs=0.45)
+
+
 def test_the_same_seed_fits_the_same_one(fitted: tuple[ScatterModel, dict[str, float]]) -> None:
     again, _ = fit_scatter(grounding_model(), scattered_episodes(0), scattered_episodes(1), seed=0)
     kept = fitted[0].state_dict()
@@ -135,6 +145,20 @@ def test_an_open_loop_replay_shows_the_mean_path_and_the_hazards_of_scattered_on
     assert torch.equal(one.state, scattered.state)
     assert one.hazard is not None and scattered.hazard is not None
     assert not torch.allclose(one.hazard, scattered.hazard)
+
+
+def test_members_disagree_about_the_mean_path() -> None:
+    others = grounding_model()
+    list(others.corrections[0].parameters())[-2].normal_(std=0.05)
+    others.usual_disagreement.fill_(1e-3)
+    plain = HistoryGrounding(grounding_model(), members=(others,))
+    one, scattered = (
+        replay_open_loop(TASK, made, scattered_episodes(0, episodes=4), seed=0).disagreement
+        for made in (plain, replace(plain, scatters=even()))
+    )
+    assert one is not None and scattered is not None
+    assert one.max() > 0
+    assert torch.equal(one, scattered)
 
 
 @pytest.mark.parametrize("used", [False, True])
