@@ -142,14 +142,14 @@ def compared_foresight(
     held_out: PairedEpisodes,
     predicts_reward: bool,
 ) -> dict[str, Any]:
-    """Return the `foresight` on held-out episodes: of R_pred, and of the failure model or the topple head.
+    """Return the `foresight` on held-out episodes: of R_pred, and of failure model or topple head, as fitted.
 
     The failure model is measured on replays, the others on what was recorded.
     """
     windows, model, failures = held_out.windows, grounding.model, grounding.failures
     latent, _ = model.encode(windows)
     compared = {}
-    if predicts_reward and model.failure_cost < 0:
+    if predicts_reward and model.failure_weight > 0:
         parts = model.predict_reward_parts(latent, windows.action)
         compared["predicted_reward"] = (parts[..., 1] / model.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
     if failures is not None:

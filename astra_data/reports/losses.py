@@ -38,8 +38,12 @@ def loss_head(results: Results) -> list[str]:
         for score in results.scores
         for title in (f"{score.title} {where(results)}", "IQM [95\N{NO-BREAK SPACE}%]")
     ]
-    last = "out of time" if results.headline == SUCCESS else "lasted"
-    return [f"{results.headline.title} in its simulator", *scores, "lost", "failed", last, "seeds"]
+    return [f"{results.headline.title} in its simulator", *scores, "lost", "failed", _last(results), "seeds"]
+
+
+def _last(results: Results) -> str:
+    """Return how episodes end that neither fail nor reach a goal before their horizon."""
+    return "out of time" if results.headline == SUCCESS else "lasted"
 
 
 def losses(results: Results) -> list[Loss]:
@@ -48,14 +52,14 @@ def losses(results: Results) -> list[Loss]:
 
 
 def _loss(results: Results, name: str, row: MethodResults) -> Loss:
-    headline = results.headline
+    headline, last = results.headline, _last(results)
     simulated = row.summary.get(f"simulated_{headline.measure}")
     reached, failed = np.array(row.success), np.array(row.failed)
     if headline == SUCCESS:
         late = np.clip(1.0 - reached - failed, 0.0, 1.0)
-        outcomes = {"success": reached, "failed": failed, "out of time": late}
+        outcomes = {"success": reached, "failed": failed, last: late}
     else:
-        outcomes = {"lasted": 1.0 - failed, "failed": failed}
+        outcomes = {last: 1.0 - failed, "failed": failed}
     cells = [spread(simulated, headline.digits) if simulated else "-"]
     for score in results.scores:
         summary = row.summary[score.measure]
@@ -68,7 +72,6 @@ def _loss(results: Results, name: str, row: MethodResults) -> Loss:
     lost = simulated.mean - row.summary[headline.measure].mean if simulated else None
     # A minus sign of a rounded zero says nothing.
     cells.append("-" if lost is None else f"{round(lost, headline.digits) + 0.0:.{headline.digits}f}")
-    last = "out of time" if headline == SUCCESS else "lasted"
     cells += [mean_std(list(outcomes[kind]), 2) for kind in ("failed", last)]
     cells.append(f"{len(row.seeds)}")
     return Loss(

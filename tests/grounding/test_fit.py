@@ -187,5 +187,6 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
         # It replaces the topple head, which is then not fitted.
         assert ("loss_topple" in metrics["epochs"][-1]) == (members == 0)
     assert grounding.failures is not None and len(grounding.failures.members) == 2
-    assert metrics["failures"].keys() == {"predicted_reward", "failure_model"}
+    # R_pred learned no failures then: there is nothing of it to compare.
+    assert metrics["failures"].keys() == {"failure_model"}
     assert "failure_members" not in config.model_dump() and asked.model_dump()["failure_members"] == 2
