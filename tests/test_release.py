@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from release import FILES, released
+from release import FILES, README, on_index, released
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {
@@ -45,3 +45,19 @@ def test_this_checkout_can_be_released() -> None:
     version = tomllib.loads(texts["pyproject.toml"])["project"]["version"].removesuffix(".dev0")
     made = released(texts, version, date(2026, 12, 1))
     assert tomllib.loads(made["pyproject.toml"])["project"]["version"] == version
+
+
+def test_links_of_the_readme_lead_to_the_released_files() -> None:
+    readme = (
+        "![A maze](maze.png), [a\nguide](docs/a.md#part), [elsewhere](https://example.org), [below](#end)"
+    )
+    assert on_index(readme, "https://host.example/it/", "0.3.0") == (
+        "![A maze](https://host.example/it/raw/v0.3.0/maze.png), "
+        "[a\nguide](https://host.example/it/blob/v0.3.0/docs/a.md#part), "
+        "[elsewhere](https://example.org), [below](#end)"
+    )
+
+
+def test_no_link_of_this_readme_is_left_relative() -> None:
+    made = on_index(README.read_text(), "https://host.example/me/it", "0.3.0")
+    assert "](docs/" not in made and "](recipes/" not in made and "](https://host.example/me/it/raw" in made

@@ -1,6 +1,7 @@
 """Make a release: version and date in the files, every check, the wheel tried by itself, a commit and a tag.
 
-From a clean checkout: `uv run python tools/release.py 0.2.0`. It publishes nothing, and ends with how to.
+From a clean checkout: `uv run python tools/release.py 0.2.0 https://github.com/OWNER/NAME`. It publishes nothing,
+and ends with how to.
 """
 
 import re
@@ -13,11 +14,13 @@ from typing import Annotated
 import typer
 
 ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
 FILES = ("pyproject.toml", "CHANGELOG.md", "CITATION.cff")
 
 
 def main(
     version: Annotated[str, typer.Argument(help="Such as 0.2.0, as in the changelog's heading.")],
+    home: Annotated[str, typer.Argument(help="Address of the repository, to which links on the index lead.")],
 ) -> None:
     """Make release `version` of this checkout."""
     if _output("git", "status", "--porcelain"):
@@ -28,7 +31,10 @@ def main(
     try:
         _output("uv", "lock")
         subprocess.run([ROOT / ".ci" / "run"], cwd=ROOT, check=True)
+        readme = README.read_text(encoding="utf-8")
+        README.write_text(on_index(readme, home, version), encoding="utf-8")
         _output("uv", "build", "--clear")
+        README.write_text(readme, encoding="utf-8")
         _try_wheel(next((ROOT / "dist").glob("*.whl")))
     except BaseException:
         _output("git", "checkout", "--", ".")
@@ -58,6 +64,20 @@ def released(texts: dict[str, str], version: str, day: date) -> dict[str, str]:
         known = re.sub(r"^(version|date-released): .*\n", "", texts[name], flags=re.MULTILINE)
         done[name] = known.replace(before, after)
     return done
+
+
+def on_index(readme: str, home: str, version: str) -> str:
+    """Return `readme` with links and pictures of its own files that lead to those of `version` at `home`.
+
+    The package index shows it away from these files.
+    """
+
+    def absolute(link: re.Match[str]) -> str:
+        text, file = link.groups()
+        kind = "raw" if text.startswith("!") else "blob"
+        return f"{text}({home.rstrip('/')}/{kind}/v{version}/{file})"
+
+    return re.sub(r"(!?\[[^]]*\])\((?![a-z]+:|#)([^)]+)\)", absolute, readme)
 
 
 def _try_wheel(wheel: Path) -> None:
