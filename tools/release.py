@@ -1,7 +1,7 @@
 """Make a release: version and date in the files, every check, the wheel tried by itself, a commit and a tag.
 
-From a clean checkout: `uv run python tools/release.py 0.2.0 https://github.com/OWNER/NAME`. It publishes nothing,
-and ends with how to.
+From a clean checkout: `uv run python tools/release.py 0.2.0 https://github.com/OWNER/NAME`. It publishes
+nothing, and ends with how to.
 """
 
 import re
