@@ -13,7 +13,6 @@ EXTRAS = {
     "safetensors": "sim",
     "scipy": "sim",
     "torchrl": "train",
-    "tensordict": "train",
     "matplotlib": "report",
     "PIL": "report",
     "rliable": "report",

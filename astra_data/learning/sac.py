@@ -1,4 +1,4 @@
-"""Soft actor-critic on a batched environment (Haarnoja et al. 2018), with TorchRL's loss.
+"""Soft actor-critic on a batched environment (Haarnoja et al. 2018, arXiv 1812.05905).
 
 Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
 whose first steps only fill the memories; otherwise they learn from single steps. At the start of a
@@ -8,7 +8,7 @@ al. 2019); that of the critics, which see only windows, is empty.
 
 import copy
 from itertools import pairwise
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import torch
 from pydantic import model_validator
@@ -20,14 +20,11 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
 from astra_data.learning.learner import Learner
-from astra_data.learning.networks.policy import features_of
-from astra_data.learning.networks.soft_actor import SoftActor, gaussian
+from astra_data.learning.networks.policy import PolicyShape, features_of
+from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.recorded import Recorded
 from astra_data.learning.replay import Replay
 from astra_data.worlds.batched import BatchedEnv
-
-if TYPE_CHECKING:
-    from torchrl.objectives import SACLoss
 
 
 class SacConfig(Config):
@@ -102,18 +99,13 @@ class Sac(Learner):
         Raises:
             BadInputError: the buffer is smaller than a window.
         """
-        from torchrl.objectives import SoftUpdate
-
         self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
-        self._loss = _sac_loss(policy, config).to(device)
-        self._memory = policy.shape.new_memory()
-        self._late_memory = copy.deepcopy(self._memory)
-        memories = nn.ModuleList(filter(None, (self._memory, self._late_memory))).to(device)
-        self._target = SoftUpdate(self._loss, tau=config.target_rate)
-        learned = [*policy.parameters(), *self._loss.qvalue_network_params.parameters(), self._loss.log_alpha]
-        learned += [] if self._memory is None else self._memory.parameters()
+        self._critics = _Critics(policy.shape).to(device)
+        self._late_critics = copy.deepcopy(self._critics).requires_grad_(False)
+        self._log_temperature = nn.Parameter(torch.tensor(config.initial_temperature, device=device).log())
+        learned = [*policy.parameters(), *self._critics.parameters(), self._log_temperature]
         self._optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
         self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
         if config.buffer_size // env.num_envs <= self._window:
@@ -128,8 +120,9 @@ class Sac(Learner):
             Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=False),
             {
                 "policy": policy,
-                "critics": self._loss,
-                "memories": memories,
+                "critics": self._critics,
+                "late_critics": self._late_critics,
+                "temperature": nn.ParameterDict({"log": self._log_temperature}),
                 "optimizer": self._optimizer,
                 "replay": self._replay,
             },
@@ -147,7 +140,7 @@ class Sac(Learner):
             if len(self._replay) > self._window:
                 for _ in range(self.config.updates_per_step):
                     self._learn()
-        return {"temperature": float(self._loss.log_alpha.detach().exp())}
+        return {"temperature": float(self._log_temperature.detach().exp())}
 
     @torch.no_grad()
     def _act(self) -> None:
@@ -172,46 +165,47 @@ class Sac(Learner):
 
     def _learn(self) -> None:
         """Update actor, critics and temperature once."""
-        from tensordict import TensorDict
-
         config = self.config
         steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
         if not bool(learned.any()):
             return
-        seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
-        nothing = self.policy.initial_hidden(len(learned))
-        acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
-        judging = features_of(self._memory, *seen, nothing, first)
-        with torch.no_grad():
-            following = features_of(self._late_memory, *seen, nothing, first)[:, 1:][learned]
-        terminated = steps["terminated"][:, :-1][learned].unsqueeze(-1)
-        table = {
-            "acting": acting[:, :-1][learned],
-            "judging": judging[:, :-1][learned],
-            "action": steps["action"][:, :-1][learned],
-            "next": {
-                "acting": acting[:, 1:][learned].detach(),
-                "judging": following,
-                "reward": steps["reward"][:, :-1][learned].unsqueeze(-1),
-                "terminated": terminated,
-                "done": terminated,
-            },
-        }
-        batch = TensorDict(table, batch_size=[int(learned.sum())])
-        wrong, _ = self._loss.qvalue_v2_loss(batch)
-        # Detached: the actor must not change the critics' memory to raise its own values.
-        costs, metadata = self._loss.actor_loss(batch.set("judging", batch["judging"].detach()))
-        total = wrong + costs + self._loss.alpha_loss(metadata["log_prob"]).mean()
+        wrong, costs, calm = self._losses(steps, learned)
+        total = wrong + costs + calm
         if self._recorded is not None:
             size = costs.detach().abs()  # almost entirely action values
             total = total + config.imitation_weight * size * self._distance(self._recorded)
         self._optimizer.zero_grad()
         total.backward()
         self._optimizer.step()
-        self._target.step()
-        if self._memory is not None and self._late_memory is not None:
-            for late, now in zip(self._late_memory.parameters(), self._memory.parameters(), strict=True):
-                late.data.lerp_(now.data, config.target_rate)
+        with torch.no_grad():
+            late, now = self._late_critics.parameters(), self._critics.parameters()
+            torch._foreach_lerp_([*late], [*now], config.target_rate)
+
+    def _losses(self, steps: dict[str, Tensor], learned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the losses of critics, eq. 5, actor, eq. 7, and temperature, eq. 18.
+
+        They are means over the steps of windows (B, T + 1) that are `learned` (B, T) from.
+        """
+        critics, temperature = self._critics, self._log_temperature.detach().exp()
+        seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
+        acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
+        judging = critics.features(*seen, first)[:, :-1][learned]
+        reward, terminated, taken = (
+            steps[name][:, :-1][learned] for name in ("reward", "terminated", "action")
+        )
+        with torch.no_grad():
+            action, log_prob = self.policy.sample(acting[:, 1:][learned])
+            late = self._late_critics.features(*seen, first)[:, 1:][learned]
+            following = self._late_critics(late, action).amin(0) - temperature * log_prob
+            wanted = reward + self.config.discount * ~terminated * following
+        wrong = (critics(judging, taken) - wanted).square().mean(1).sum()
+        action, log_prob = self.policy.sample(acting[:, :-1][learned])
+        # The actor must change neither the critics nor their memory to raise its own values.
+        critics.requires_grad_(False)
+        costs = (temperature * log_prob - critics(judging.detach(), action).amin(0)).mean()
+        critics.requires_grad_(True)
+        surplus = action.shape[-1] - log_prob.detach().mean()
+        return wrong, costs, self._log_temperature * surplus
 
     def _distance(self, recorded: Recorded) -> Tensor:
         """Return the mean squared distance of the policy's actions from the recorded ones."""
@@ -225,49 +219,33 @@ class Sac(Learner):
         return functional.mse_loss(self.policy.act(features[learned]), steps["action"][learned])
 
 
-def _sac_loss(policy: SoftActor, config: SacConfig) -> "SACLoss":
-    from tensordict.nn import TensorDictModule
-    from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-    from torchrl.objectives import SACLoss
+class _Critics(nn.Module):
+    """Two action values, and the memory that both share, if the policy has one.
 
-    actor = ProbabilisticActor(
-        TensorDictModule(_Policy(policy), in_keys=["acting"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-    )
-    loss = SACLoss(
-        actor,
-        ValueOperator(_Critic(policy), in_keys=["judging", "action"]),
-        num_qvalue_nets=2,
-        loss_function="l2",
-        target_entropy=-float(policy.shape.action_size),
-        alpha_init=config.initial_temperature,
-        deactivate_vmap=True,  # a sixth of the time, on a CPU
-    )
-    loss.make_value_estimator(gamma=config.discount)
-    return loss
+    Layer normalisation keeps them from diverging at this learning rate.
+    """
 
-
-class _Policy(nn.Module):
-    def __init__(self, policy: SoftActor) -> None:
+    def __init__(self, shape: PolicyShape) -> None:
         super().__init__()
-        self.actor = policy.actor
+        self.memory = shape.new_memory()
+        self.networks = nn.ModuleList(_action_value(shape) for _ in range(2))
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        return gaussian(self.actor(features))
-
-
-class _Critic(nn.Module):
-    """Action values; layer normalisation keeps them from diverging at this learning rate."""
-
-    def __init__(self, policy: SoftActor) -> None:
-        super().__init__()
-        shape = policy.shape
-        sizes = (shape.feature_size + shape.action_size, *shape.hidden_sizes)
-        layers: list[nn.Module] = []
-        for size_in, size_out in pairwise(sizes):
-            layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU()]
-        self.network = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+    def features(self, observation: Tensor, previous_action: Tensor, first: Tensor) -> Tensor:
+        """Return the features (B, T, F) of windows of (B, T, ...), before which nothing is remembered."""
+        nothing = observation.new_zeros(
+            len(observation), 0 if self.memory is None else self.memory.latent_size
+        )
+        return features_of(self.memory, observation, previous_action, nothing, first)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        return torch.as_tensor(self.network(torch.cat([features, action], dim=-1)))
+        """Return both values (2, ...) of features (..., F) and actions (..., A)."""
+        pair = torch.cat([features, action], dim=-1)
+        return torch.stack([network(pair).squeeze(-1) for network in self.networks])
+
+
+def _action_value(shape: PolicyShape) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    sizes = shape.feature_size + shape.action_size, *shape.hidden_sizes
+    for size_in, size_out in pairwise(sizes):
+        layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))

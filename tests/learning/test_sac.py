@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
+from torch import nn
 from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
 from astra_data.core.checkpoint import flatten, unflatten
@@ -148,12 +148,10 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(
         learning_rate=3e-3,
     )
     train(learner)
-    loss = learner._loss
-    begun = (torch.ones(1, 1, 1), torch.zeros(1, 1, 1), learner.policy.initial_hidden(1), torch.ones(1, 1))
-    judging = features_of(learner._memory, *begun)[:, 0].detach()
-    state = TensorDict({"judging": judging, "action": torch.zeros(1, 1)}, batch_size=[1])
-    with torch.no_grad(), loss.qvalue_network_params[0].to_module(loss.qvalue_network):
-        value = float(loss.qvalue_network(state)["state_action_value"])
+    begun = torch.ones(1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1)
+    with torch.no_grad():
+        features = learner._critics.features(*begun)[:, 0]
+        value = float(learner._critics(features, torch.zeros(1, 1))[0])
     assert value == pytest.approx(expected, rel=0.12)
 
 
@@ -199,20 +197,21 @@ def test_the_memory_that_values_come_from_follows_slowly() -> None:
         updates_per_step=1,
         target_rate=0.1,
     )
-    expected = [values.clone() for values in _memory_of(learner, "late")]
+    late_critics, critics = learner._late_critics, learner._critics
+    expected = _memory_of(late_critics)
     while not learner.done:
         learner.iterate()
-        now = _memory_of(learner, "now")
+        now = _memory_of(critics)
         expected = [0.9 * before + 0.1 * after for before, after in zip(expected, now, strict=True)]
-        for late, values in zip(_memory_of(learner, "late"), expected, strict=True):
+        for late, values in zip(_memory_of(late_critics), expected, strict=True):
             torch.testing.assert_close(late, values, atol=1e-6, rtol=0)
     assert any((a - b).abs().max() > 1e-4 for a, b in zip(now, expected, strict=True))
 
 
-def _memory_of(learner: Sac, which: str) -> list[torch.Tensor]:
-    memory = learner._memory if which == "now" else learner._late_memory
-    assert memory is not None
-    return [values.detach().clone() for values in memory.parameters()]
+def _memory_of(critics: nn.Module) -> list[torch.Tensor]:
+    return [
+        values.detach().clone() for name, values in critics.named_parameters() if name.startswith("memory")
+    ]
 
 
 @pytest.mark.parametrize("memory", [0, 8])
@@ -222,66 +221,52 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
     learner = sac(EndsAtZero(8), 60, horizon=9, memory=memory, reward_scale=3.0, target_rate=0.3, **settings)
     for _ in range(3):
         learner.iterate()
-    loss, policy, replay = learner._loss, learner.policy, learner._replay
+    policy, critics, replay = learner.policy, learner._critics, learner._replay
     drawn: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []
-    draw = replay.windows
+    draw, compute, sample = replay.windows, learner._losses, policy.sample
 
     def windows(count: int, length: int, burn_in: int) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         drawn.append(draw(count, length, burn_in))
         return drawn[-1]
 
+    losses: list[torch.Tensor] = []
+    memories = [] if critics.memory is None else list(critics.memory.parameters())
+    gradients: list[torch.Tensor] = []
+
+    def computed(*given: Any) -> tuple[torch.Tensor, ...]:  # noqa: ANN401
+        found = compute(*given)
+        losses.extend(loss.detach() for loss in found)
+        if memories:
+            gradients.extend(torch.autograd.grad(found[0], memories, retain_graph=True))
+        return found
+
+    def sampled(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        torch.manual_seed(11)
+        return sample(features)
+
     monkeypatch.setattr(replay, "windows", windows)
-    losses: dict[str, torch.Tensor] = {}
-    memories = [] if learner._memory is None else list(learner._memory.parameters())
-    gradients: dict[str, Any] = {}
-
-    def seeded(name: str) -> None:
-        original = getattr(loss, name)
-
-        def compute(batch: Any) -> Any:  # noqa: ANN401
-            torch.manual_seed(11)
-            found = original(batch)
-            losses[name] = found[0].detach()
-            if memories and name == "qvalue_v2_loss":
-                gradients["critics"] = torch.autograd.grad(found[0], memories, retain_graph=True)
-            if name == "actor_loss":
-                losses["log_prob"] = found[1]["log_prob"].detach()
-            return found
-
-        monkeypatch.setattr(loss, name, compute)
-
-    seeded("qvalue_v2_loss")
-    seeded("actor_loss")
-    before = copy.deepcopy((policy, learner._memory, learner._late_memory))
-    online, slow = (
-        [
-            {name: value.detach().clone() for name, value in params[index].items(True, True)}
-            for index in range(2)
-        ]
-        for params in (loss.qvalue_network_params, loss.target_qvalue_network_params)
-    )
-    temperature = float(loss.log_alpha.detach().exp())
+    monkeypatch.setattr(learner, "_losses", computed)
+    monkeypatch.setattr(policy, "sample", sampled)
+    before = copy.deepcopy((policy, critics, learner._late_critics))
+    temperature = float(learner._log_temperature.detach().exp())
     learner._learn()
     (steps, learned) = drawn[0]
-    actor, memory_now, memory_late = before
+    actor, online, slow = before
     seen = steps["observation"], steps["previous_action"]
     first, nothing = steps["first"].float(), actor.initial_hidden(len(learned))
 
-    def action_values(critics: list[Any], features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    def action_values(critics: Any, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:  # noqa: ANN401
         values = []
-        for critic in critics:
+        for network in critics.networks:
             hidden = torch.cat([features, action], dim=-1)
-            layers = sorted({int(name[2]) for name in critic})
-            for layer in layers[:-1:2]:
-                hidden = hidden @ critic["module", "network", str(layer), "weight"].T
-                hidden = hidden + critic["module", "network", str(layer), "bias"]
+            *inner, last = [layer for layer in network if not isinstance(layer, nn.ReLU)]
+            for linear, norm in zip(inner[::2], inner[1::2], strict=True):
+                hidden = hidden @ linear.weight.T + linear.bias
                 hidden = (hidden - hidden.mean(-1, keepdim=True)) / (
                     hidden.var(-1, correction=0, keepdim=True) + 1e-5
                 ).sqrt()
-                hidden = hidden * critic["module", "network", str(layer + 1), "weight"]
-                hidden = torch.relu(hidden + critic["module", "network", str(layer + 1), "bias"])
-            last = critic["module", "network", str(layers[-1]), "weight"]
-            values.append((hidden @ last.T)[..., 0] + critic["module", "network", str(layers[-1]), "bias"])
+                hidden = torch.relu(hidden * norm.weight + norm.bias)
+            values.append((hidden @ last.weight.T + last.bias)[..., 0])
         return torch.stack(values)
 
     def squashed(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -292,8 +277,8 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
 
     with torch.no_grad():
         acting = actor.remember_sequence(*seen, steps["hidden"][:, 0], first)
-        judging = features_of(memory_now, *seen, nothing, first)
-        late = features_of(memory_late, *seen, nothing, first)
+        judging = features_of(online.memory, *seen, nothing, first)
+        late = features_of(slow.memory, *seen, nothing, first)
         following, log_prob = squashed(acting[:, 1:][learned])
         beyond = action_values(slow, late[:, 1:][learned], following).amin(0) - temperature * log_prob
         over, reward = steps["terminated"][:, :-1][learned], steps["reward"][:, :-1][learned]
@@ -303,26 +288,23 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
         torch.testing.assert_close(steps["reward"][:, :-1][within], -3.0 * shown.square())
         target = reward + 0.9 * ~over * beyond
         given = action_values(online, judging[:, :-1][learned], steps["action"][:, :-1][learned])
-        torch.testing.assert_close(
-            losses["qvalue_v2_loss"], (given - target).square().sum(0).mean(), rtol=1e-4, atol=1e-4
-        )
+        wrong = (given - target).square().sum(0).mean()
         action, log_prob = squashed(acting[:, :-1][learned])
-        worst = action_values(online, judging[:, :-1][learned], action).amin(0)
-        torch.testing.assert_close(
-            losses["actor_loss"], (temperature * log_prob - worst).mean(), rtol=1e-4, atol=1e-4
-        )
-    # The temperature rises where actions are less random than one unit of entropy per dimension below 0.
-    assert loss.log_alpha.grad is not None
-    torch.testing.assert_close(
-        loss.log_alpha.grad, -(losses["log_prob"].mean() - 1.0).reshape(loss.log_alpha.shape)
-    )
+        costs = (
+            temperature * log_prob - action_values(online, judging[:, :-1][learned], action).amin(0)
+        ).mean()
+        # The temperature rises where actions are less random than one unit of entropy per dimension below 0.
+        calm = -math.log(temperature) * (log_prob.mean() - 1.0)
+    torch.testing.assert_close(torch.stack(losses), torch.stack([wrong, costs, calm]), rtol=1e-4, atol=1e-4)
+    assert learner._log_temperature.grad is not None
+    torch.testing.assert_close(learner._log_temperature.grad, 1.0 - log_prob.mean(), rtol=1e-4, atol=1e-5)
     # The critics' memory learns from their loss alone.
-    for parameter, gradient in zip(memories, gradients.get("critics", []), strict=True):
+    for parameter, gradient in zip(memories, gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
-    for index in range(2):
-        now = {n: v.detach() for n, v in loss.qvalue_network_params[index].items(True, True)}
-        for name, value in loss.target_qvalue_network_params[index].items(True, True):
-            torch.testing.assert_close(value, 0.7 * slow[index][name] + 0.3 * now[name])
+    after = zip(learner._late_critics.parameters(), slow.parameters(), critics.parameters(), strict=True)
+    for late, then, now in after:
+        torch.testing.assert_close(late, 0.7 * then + 0.3 * now)
+    assert all(parameter.requires_grad for parameter in critics.parameters())
 
 
 def test_it_learns_so_often_after_each_step_that_a_window_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,17 +7,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from astra_data.learning.networks.history import mlp
-from astra_data.learning.networks.policy import Policy, PolicyShape
+from astra_data.learning.networks.policy import Policy, PolicyShape, gaussian_log_prob
 
 _SMALLEST_SCALE = 1e-3
 _UNIT_SCALE = math.log(math.e - 1.0)
 """Its softplus is 1."""
-
-
-def gaussian(output: Tensor) -> tuple[Tensor, Tensor]:
-    """Return location and scale (..., A) from the `output` (..., 2 A) of an actor."""
-    loc, width = output.chunk(2, dim=-1)
-    return loc, functional.softplus(width + _UNIT_SCALE) + _SMALLEST_SCALE
 
 
 class SoftActor(Policy):
@@ -31,7 +25,16 @@ class SoftActor(Policy):
 
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return location and scale (..., A) of the Gaussian, before the tanh, for `features` (..., F)."""
-        return gaussian(self.actor(features))
+        loc, width = self.actor(features).chunk(2, dim=-1)
+        return loc, functional.softplus(width + _UNIT_SCALE) + _SMALLEST_SCALE
+
+    def sample(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw actions (..., A), through which gradients flow; return them and their log-density (...)."""
+        loc, scale = self.policy(features)
+        drawn = loc + scale * torch.randn_like(loc)
+        # log(1 - tanh²), without loss of precision far out.
+        narrowed = 2.0 * (math.log(2.0) - drawn - functional.softplus(-2.0 * drawn))
+        return torch.tanh(drawn), gaussian_log_prob(loc, scale, drawn) - narrowed.sum(-1)
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return the tanh of the location, (..., A), or with `generator` that of a sample."""
