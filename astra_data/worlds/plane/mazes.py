@@ -89,7 +89,7 @@ class Maze:
         free take the value of the nearest free one plus the distance to it.
         """
         free = self.clearance_field > radius
-        numbers = np.full(free.shape, -1)
+        numbers = np.full(free.shape, -1, dtype=np.int32)  # as the search takes them, in every version
         numbers[free] = np.arange(free.sum())
         cost = np.ones(free.shape)
         if margin > 0:
