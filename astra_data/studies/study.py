@@ -181,7 +181,8 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     """Fit and test the models of one case; return their errors by data size."""
     steps_config = recipe.steps
     step_s = steps_config.rows / fps
-    horizons = (1, *(round(seconds / step_s) for seconds in recipe.horizons_s))
+    rounded = [max(1, round(seconds / step_s)) for seconds in recipe.horizons_s]
+    horizons = tuple(dict.fromkeys([1, *rounded]))
     horizons_s = [horizon * step_s for horizon in horizons]
     trial = Trial.of(Walks.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
     body = trial.stretch.body

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,3 +123,15 @@ def test_a_folder_holds_one_study_at_a_time(tmp_path: Path) -> None:
 def test_recordings_of_several_rates_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="one rate, got 30, 60 per second"):
         run_study(recipe(), [A], [recording("slow", fps=30)], tmp_path, silent)
+
+
+def test_a_horizon_below_a_control_step_is_one_step(tmp_path: Path) -> None:
+    short = recipe(models=("raw",), horizons_s=(0.05, 0.5))
+    (case,) = run_study(short, [A], [B], tmp_path, silent)["cases"]
+    assert case["horizons_s"] == pytest.approx([1 / 6, 0.5])
+
+
+def test_a_recording_without_walking_is_refused(tmp_path: Path) -> None:
+    still = [replace(piece, broken=np.ones(len(piece), bool)) for piece in A.pieces]
+    with pytest.raises(BadInputError, match="expected walking after 4 control steps in a recording to test"):
+        run_study(recipe(models=("raw",)), [replace(A, pieces=tuple(still))], [B], tmp_path, silent)
