@@ -64,8 +64,8 @@ def import_dataset(
 
     Args:
         recordings: files, folders or archives of one format.
-        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy and Minari
-            need none.
+        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy, Minari
+            and PACE need none.
         out: the dataset's folder, by default its place at home.
         file_format: one of `FORMATS`, by default inferred from the recordings' names.
         name: of the dataset; like `fps` and `task`, it overrides the mapping.

@@ -1,4 +1,4 @@
-"""The page of held-out errors that ends a run which stops at its groundings."""
+"""The page of held-out errors that a run writes after its groundings."""
 
 from pathlib import Path
 

@@ -49,13 +49,15 @@ def run(
 ) -> Path:
     """Make every artefact of a recipe that is not finished yet; return the recipe's folder.
 
+    Where it grounds, the page of held-out errors is written there.
+
     Args:
         recipe_path: the recipe.
         seeds: the recipe's seeds to make and to report; by default all.
         root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
-        until: the last stage to run, by default all; after "ground" comes a page of held-out errors.
+        until: the last stage to run, by default all.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
