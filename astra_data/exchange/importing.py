@@ -80,6 +80,8 @@ def import_dataset(
         CorruptDatasetError: an export of ours was altered; nothing is written.
         RecipeError: the mapping has faults.
     """
+    if not recordings:
+        raise BadInputError("expected one recording or more to import, got none")
     began = time.perf_counter()
     given = {"name": name, "fps": fps, "task": task, "format": file_format}
     options = {key: value for key, value in given.items() if value is not None}
