@@ -131,7 +131,16 @@ def test_a_horizon_below_a_control_step_is_one_step(tmp_path: Path) -> None:
     assert case["horizons_s"] == pytest.approx([1 / 6, 0.5])
 
 
-def test_a_recording_without_walking_is_refused(tmp_path: Path) -> None:
-    still = [replace(piece, broken=np.ones(len(piece), bool)) for piece in A.pieces]
+def test_recordings_without_walking_are_refused(tmp_path: Path) -> None:
+    pieces = tuple(replace(piece, broken=np.ones(len(piece), bool)) for piece in A.pieces)
+    still = replace(A, pieces=pieces)
     with pytest.raises(BadInputError, match="expected walking after 4 control steps in a recording to test"):
-        run_study(recipe(models=("raw",)), [replace(A, pieces=tuple(still))], [B], tmp_path, silent)
+        run_study(recipe(models=("raw",)), [still], [B], tmp_path / "a", silent)
+    with pytest.raises(BadInputError, match=r"expected stretches of 4 \+ 1 steps of walking to fit to"):
+        run_study(recipe(models=("ridge",)), [B], [still], tmp_path / "b", silent)
+
+
+def test_ridge_regression_fits_to_pieces_that_are_late_as_a_whole(tmp_path: Path) -> None:
+    short = recipe(models=("ridge",), fit={"steps": 1})
+    (case,) = run_study(short, [A], [recording("short", rows=55)], tmp_path, silent)["cases"]
+    assert np.isfinite(case["sizes"][0]["models"]["ridge"]["0.5"]["forward_m"]["rmse"])
