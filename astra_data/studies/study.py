@@ -196,7 +196,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         if not path.exists():
             drawn = (minutes, recipe.seeds[0] if size == "all" else seed)
             if drawn not in walks:
-                rows = round(minutes * 60 * fps)
+                rows = max(1, round(minutes * 60 * fps))
                 pieces = case.training if size == "all" else shortened(case.training, rows, seed)
                 walks[drawn] = Walks.of_pieces(pieces, fps, steps_config)
             share = part(progress, number / len(fits), (number + 1) / len(fits))

@@ -140,6 +140,11 @@ def test_recordings_without_walking_are_refused(tmp_path: Path) -> None:
         run_study(recipe(models=("ridge",)), [B], [still], tmp_path / "b", silent)
 
 
+def test_a_size_of_less_than_a_row_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected pieces of more than 0\.8 s without a split"):
+        run_study(recipe(minutes=(1e-5,)), [A], [B], tmp_path, silent)
+
+
 def test_ridge_regression_fits_to_pieces_that_are_late_as_a_whole(tmp_path: Path) -> None:
     short = recipe(models=("ridge",), fit={"steps": 1})
     (case,) = run_study(short, [A], [recording("short", rows=55)], tmp_path, silent)["cases"]
