@@ -73,7 +73,7 @@ def _held_out(data: Sequence[Recording], share: float) -> tuple[tuple[Piece, ...
         order = generator(0, f"held-out pieces of {recording.content_hash}").permutation(
             len(recording.pieces)
         )
-        count = max(1, round(share * len(order)))
+        count = max(1, min(round(share * len(order)), len(order) - 1))
         for place, number in enumerate(order):
             (test if place < count else training).append(recording.pieces[number])
     if not training:

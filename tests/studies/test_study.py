@@ -56,6 +56,8 @@ def test_the_held_out_share_is_that_of_the_recipe() -> None:
     assert (len(only.test), len(only.training)) == (4, 4)
     (least,) = cases(recipe(held_out_share=0.01), [B], [])
     assert len(least.test) == 1
+    (most,) = cases(recipe(held_out_share=0.99), [B], [])
+    assert len(most.training) == 1
     with pytest.raises(BadInputError, match=r"at least two pieces without a split.*--train"):
         list(cases(recipe(), [recording("short", count=1)], []))
 
