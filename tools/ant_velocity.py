@@ -26,8 +26,8 @@ from astra_data.worlds.batched_mujoco import BatchedPhysics, Bools
 class AntVelocityConfig:
     """Distribution of commands, strength of the motors, and rewards.
 
-    At full torque the ant moves so violently that SAC learns to stand still (0.45 m/s after 256 k steps); at
-    0.7 of it, it learns to walk. A higher reward for staying upright also makes it stand still.
+    At full torque the ant moves so violently that SAC learns to stand still; at 0.7 of it, it learns to walk.
+    A higher reward for staying upright also makes it stand still.
     """
 
     num_envs: int = 64

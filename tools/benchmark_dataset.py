@@ -12,9 +12,8 @@ import json
 import os
 import shutil
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import cycle
@@ -30,6 +29,7 @@ from dataset_peers import BATCH, COLUMNS, DRAWN, FPS, LENGTH, Hdf5, LeRobot, Min
 from mujoco.rollout import Rollout
 from rich.console import Console
 from rich.table import Table
+from timing import Candidates, Stretch, measure
 
 from astra_data.core.cores import cores
 from astra_data.dataset import Dataset, DatasetWriter
@@ -47,10 +47,6 @@ PAIRED = 32_768
 BATCH_OF_PAIRS = 4096
 TASK = "antmaze-umaze"
 
-Stretch = Callable[[], int]
-"""Do some work; return how many frames, windows or transitions that was."""
-Candidates = dict[str, Stretch]
-
 
 def main(
     episodes: Annotated[int, typer.Option(help="Episodes.")] = 200,
@@ -64,7 +60,7 @@ def main(
     with tempfile.TemporaryDirectory() as name, quiet_libraries(Path(name)) as lerobot:
         data = random_walks(episodes, steps)
         for title, candidates in measurements(Path(name), data, lerobot):
-            figures[title] = rate(candidates, rounds)
+            figures[title] = {name: rate.clock for name, rate in measure(candidates, rounds).items()}
     table = Table(
         "", "per second", "ours is", title=f"{episodes} episodes of {steps} steps, one torch thread"
     )
@@ -258,19 +254,6 @@ def quiet_libraries(root: Path) -> Iterator[Any]:
         warnings.simplefilter("ignore")
         import_module("datasets").disable_progress_bars()
         yield import_module("lerobot.datasets.lerobot_dataset")
-
-
-def rate(candidates: Candidates, rounds: int) -> dict[str, float]:
-    """Let the candidates take turns; return what each does per second, after one turn to warm up."""
-    done, seconds = dict.fromkeys(candidates, 0), dict.fromkeys(candidates, 0.0)
-    for turn in range(rounds + 1):
-        for name, stretch in candidates.items():
-            began = time.perf_counter()
-            count = stretch()
-            if turn > 0:
-                done[name] += count
-                seconds[name] += time.perf_counter() - began
-    return {name: done[name] / seconds[name] for name in candidates}
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ ratios hold even on a machine that does other work too.
 """
 
 import json
-import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +19,7 @@ import torch
 import typer
 from rich.console import Console
 from rich.table import Table
+from timing import Candidates, Stretch, measure
 
 from astra_data.core.cores import cores
 from astra_data.worlds.ant.body import CONTROL_SUBSTEPS, VelocityController, ant_model
@@ -34,9 +33,6 @@ GYMNASIUM_ID = "AntMaze_UMaze-v5"
 
 gymnasium.register_envs(gymnasium_robotics)
 
-Stretch = Callable[[], int]
-"""Do some work; return how many control steps that was."""
-
 
 def main(
     num_envs: Annotated[int, typer.Option(help="Ants.")] = 128,
@@ -48,7 +44,7 @@ def main(
     torch.set_num_threads(1)
     threads = cores()
     figures = measure_target(num_envs, threads, rounds)
-    figures["point_mass"] = rate([point_mass_stretch(num_points, steps=100)], rounds)[0]
+    figures |= steps_per_second({"point_mass": point_mass_stretch(num_points, steps=100)}, rounds)
     ratios = {
         "target / physics limit": figures["target"] / figures["physics_limit"],
         "target / Gymnasium loop": figures["target"] / figures["gymnasium_loop"],
@@ -122,8 +118,14 @@ def measure_target(num_envs: int, threads: int, rounds: int) -> dict[str, float]
                 single.reset()
         return 100
 
-    names = ("target", "physics_limit", "gymnasium_loop")
-    return dict(zip(names, rate([target, physics_limit, gymnasium_loop], rounds), strict=True))
+    return steps_per_second(
+        {"target": target, "physics_limit": physics_limit, "gymnasium_loop": gymnasium_loop}, rounds
+    )
+
+
+def steps_per_second(candidates: Candidates, rounds: int) -> dict[str, float]:
+    """Return the steps per second of each of the candidates, which take turns."""
+    return {name: rate.clock for name, rate in measure(candidates, rounds).items()}
 
 
 def point_mass_stretch(num_points: int, steps: int) -> Stretch:
@@ -140,19 +142,6 @@ def point_mass_stretch(num_points: int, steps: int) -> Stretch:
         return steps * num_points
 
     return stretch
-
-
-def rate(stretches: list[Stretch], rounds: int) -> list[float]:
-    """Let the stretches take turns; return the steps per second of each, after one turn to warm up."""
-    done, seconds = [0] * len(stretches), [0.0] * len(stretches)
-    for turn in range(rounds + 1):
-        for index, stretch in enumerate(stretches):
-            began = time.perf_counter()
-            count = stretch()
-            if turn > 0:
-                done[index] += count
-                seconds[index] += time.perf_counter() - began
-    return [count / second for count, second in zip(done, seconds, strict=True)]
 
 
 if __name__ == "__main__":

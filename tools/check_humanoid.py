@@ -12,7 +12,6 @@ reads a finished run and prints
    itself (DAgger: Ross et al. 2011): up to there, what φ leaves out is no obstacle.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +23,9 @@ import typer
 from timing import complain
 from torch import Tensor, nn
 
-from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.errors import AstraDataError
 from astra_data.core.naming import base_method
+from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import load_grounding, load_history_model
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -257,10 +257,7 @@ def check(run: Path, seed: int, rounds: int) -> None:
     Raises:
         AstraDataError: something that is needed has not been run.
     """
-    file = run / "recipe.json"
-    if not file.is_file():
-        raise BadInputError(f"{file} does not exist: expected a run's folder, such as runs/humanoid_walker2d")
-    recipe = json.loads(file.read_text())
+    recipe = settings_of(run)
     task = task_named(recipe["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)

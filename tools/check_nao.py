@@ -3,11 +3,11 @@
     uv run python tools/check_nao.py
     uv run python tools/check_nao.py --only speeds --only lag --seed 1
 
-Robots differ as `worlds.nao.traits.Variation` says; speeds are the mean of 3.8 s after a start of 1.9 s.
+Robots differ as `worlds.nao.traits.TraitSpread` says; speeds are the mean of 3.8 s after a start of 1.9 s.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import StrEnum
 from functools import partial
 from itertools import cycle
@@ -17,6 +17,7 @@ import numpy as np
 import typer
 from rich.progress import Progress, TaskID
 
+from astra_data.reports.formatting import table
 from astra_data.worlds.nao import BatchedNao, WalkLimits
 from astra_data.worlds.nao.robot import CONTROL_STEP_S
 from astra_data.worlds.nao.steps import Floats
@@ -75,12 +76,6 @@ def main(
 def shown(progress: Progress, task: TaskID, fraction: float) -> None:
     """Advance the progress bar of a check."""
     progress.update(task, completed=fraction)
-
-
-def table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, tuple("---" for _ in head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def walked(nao: BatchedNao, command: Floats, kick: bool = False) -> Floats:

@@ -18,13 +18,13 @@ import torch
 import typer
 from torch import Tensor
 
-from astra_data.core.naming import base_method, place
+from astra_data.core.naming import place
 from astra_data.core.seeding import derive
-from astra_data.experiments.plan import grounded_as
 from astra_data.experiments.trained_policy import load_policy, policy_files, settings_of
 from astra_data.grounding.files import load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.probes import Probed, dropped_values, picking_split, probe, recent_actions
+from astra_data.methods import grounded_as
 from astra_data.training.altered_latents import ALTERATIONS, AlteredLatents, in_target
 from astra_data.training.own_world import in_simulator, own_world, started
 from astra_data.training.policy_file import PolicyFile
@@ -70,7 +70,7 @@ def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
         f"φ(s) and {steps} actions": [recent_actions(part, steps) for part in parts],
     }
     for name in rows:
-        file = run / "ground" / grounded_as(base_method(name)) / place(seed) / "grounding.safetensors"
+        file = run / "ground" / grounded_as(name) / place(seed) / "grounding.safetensors"
         model = load_history_model(file)
         inputs[f"z of {name}"] = [model.encode(part.windows)[0] for part in parts]
     found = {name: probe(*map(Probed.of, parts, given, values)) for name, given in inputs.items()}

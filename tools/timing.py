@@ -52,7 +52,7 @@ def measure(candidates: Candidates, rounds: int) -> dict[str, Rate]:
     done, clock, processor = ({name: 0.0 for name in candidates} for _ in range(3))
     for turn in range(rounds + 1):
         for name, stretch in candidates.items():
-            began, used = time.perf_counter(), processor_seconds()
+            used, began = processor_seconds(), time.perf_counter()
             amount = stretch()
             if turn > 0:
                 done[name] += amount
@@ -63,9 +63,8 @@ def measure(candidates: Candidates, rounds: int) -> dict[str, Rate]:
 
 def processor_seconds() -> float:
     """Return the time that this process and those that it started have kept processors busy."""
-    this = psutil.Process()
-    times = [process.cpu_times() for process in (this, *this.children(recursive=True))]
-    return float(sum(time.user + time.system for time in times))
+    children = [process.cpu_times() for process in psutil.Process().children(recursive=True)]
+    return time.process_time() + float(sum(times.user + times.system for times in children))
 
 
 def print_rates(figures: Mapping[str, Mapping[str, Rate]]) -> None:

@@ -45,7 +45,8 @@ def inspect(
     drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
     if not drawn:
         raise BadInputError(
-            f"{inspection.reference}: its state has no column with the role position or velocity"
+            f"{inspection.reference}: expected a state with the role position or vector, got none: give "
+            "its columns a role in the mapping, or leave --plot out"
         )
     for planar, label, unit in drawn:
         path = plot / f"{label}_coverage.png"

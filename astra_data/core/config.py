@@ -21,8 +21,18 @@ NotNegative = Annotated[float, Field(ge=0)]
 Number = Annotated[int, Field(ge=0, le=10**12)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
-
 _UNNAMED = ""
+
+
+def in_order(ends: tuple[float, float]) -> tuple[float, float]:
+    """Return the ends of a range; for annotations.
+
+    Raises:
+        ValueError: the upper end is first.
+    """
+    if ends[0] > ends[1]:
+        raise ValueError(f"expected the lower end first, got {list(ends)}")
+    return ends
 
 
 def choice(name: str) -> str:

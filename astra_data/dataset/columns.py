@@ -1,8 +1,7 @@
 """Names, types and meaning of every dataset column, and the episode that carries them.
 
-Dimension letters, used in every docstring of the toolkit:
-
-    B batch   T steps   S target state   X abstract state   A action   Z latent
+Dimension letters, in every docstring of the toolkit: B batch, T steps, E episodes, N rows, S target state,
+X abstract state, A action, G goal, O observation, Z latent.
 
 A column with one value per step has shape (T,), all others (T, size): never (T, 1), never more dimensions.
 """

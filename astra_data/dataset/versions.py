@@ -17,11 +17,13 @@ from typing import Any, Literal
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.description import NAME
 from astra_data.dataset.reader import Dataset
 
 Change = Literal["columns", "episodes", "description"]
 
-_REFERENCE = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9._-]{0,199})(@(data-)?(?P<version>\d+\.\d+\.\d+))?")
+_NUMBERS = r"\d+\.\d+\.\d+"
+_REFERENCE = re.compile(rf"(?P<name>{NAME.pattern})(@(data-)?(?P<version>{_NUMBERS}))?")
 
 
 @dataclass(frozen=True, order=True)
@@ -39,7 +41,7 @@ class Version:
         Raises:
             BadInputError: it is not three numbers.
         """
-        if not re.fullmatch(r"\d+\.\d+\.\d+", text):
+        if not re.fullmatch(_NUMBERS, text):
             raise BadInputError(f"version '{text}': expected three numbers such as 1.2.0")
         return cls(*map(int, text.split(".")))
 
@@ -51,7 +53,7 @@ class Version:
     @classmethod
     def from_tag(cls, tag: str) -> "Version | None":
         """Read "data-1.2.0"; None if it is no such tag."""
-        return cls.parse(tag[5:]) if re.fullmatch(r"data-\d+\.\d+\.\d+", tag) else None
+        return cls.parse(tag[5:]) if re.fullmatch(f"data-{_NUMBERS}", tag) else None
 
     def __str__(self) -> str:
         """Write "1.2.0"."""
@@ -85,9 +87,8 @@ def names_at_home() -> list[str]:
 
 def versions_at_home(name: str) -> list[Version]:
     """Return the versions of dataset `name` at home, the oldest first."""
-    folders = (home() / name).glob("data-*.*.*")
-    texts = (folder.name.removeprefix("data-") for folder in folders if folder.is_dir())
-    return sorted(Version.parse(text) for text in texts if re.fullmatch(r"\d+\.\d+\.\d+", text))
+    folders = (folder for folder in (home() / name).glob("data-*") if folder.is_dir())
+    return sorted(version for folder in folders if (version := Version.from_tag(folder.name)))
 
 
 def locate(dataset: str | Path) -> Path:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -130,7 +130,7 @@ def guess(paths: Sequence[Path]) -> Logs:
 
     Raises:
         BadInputError: there is no such file, it is no CSV, files differ, a time or command is not finite, two
-            fields come to the same name, or there are no commands or states.
+            fields come to the same name, or there are no commands, no states or no episodes of two rows.
     """
     files = [file for path in paths for file in (_files(path) if path.is_dir() else [path])]
     tables = {file: _numbers(file) for file in files}
@@ -145,8 +145,12 @@ def guess(paths: Sequence[Path]) -> Logs:
         raise BadInputError(f"{files[0]}: {error}") from None
     states = [field.name for field in fields if field.role == "state"]
     gaps = {name: int((~np.isfinite(joined[name])).sum()) for name in states}
-    episodes = _episodes(fields, (_whole(table, states) for table in tables.values()))
-    found = Logs(fields, tuple(episodes), {name: gaps[name] for name in states if gaps[name]})
+    episodes = tuple(_episodes(fields, (_whole(table, states) for table in tables.values())))
+    if all(len(values) < 2 for episode in episodes for values in episode.values()):
+        cut = [field.name for field in fields if field.role == "episode"]
+        why = f"{' and '.join(cut)} changes in every row: leave it out" if cut else "record longer"
+        raise BadInputError(f"{files[0]}: expected episodes of two rows or more, found none: {why}")
+    found = Logs(fields, episodes, {name: gaps[name] for name in states if gaps[name]})
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if not found.of(role):  # type: ignore[arg-type]
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
@@ -196,18 +200,17 @@ def _numbers(path: Path) -> dict[str, Floats]:
         raise BadInputError(f"{path}: there is no such file") from None
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         raise BadInputError(f"{path}: expected CSV with a header ({str(error).splitlines()[0]})") from None
-    for entry in table.schema:
-        if pa.types.is_string(entry.type) and (wrong := _no_number(table[entry.name].to_pylist())):
-            raise BadInputError(
-                f"{path} line {wrong[0] + 2}: {entry.name}: expected a number, got {wrong[1]!r}"
-            )
+    fields = list(zip(table.column_names, table.columns, strict=True))
+    for name, values in fields:
+        if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):
+            raise BadInputError(f"{path} line {wrong[0] + 2}: {name}: expected a number, got {wrong[1]!r}")
     kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
-    names = [entry.name for entry in table.schema if any(kind(entry.type) for kind in kinds)]
-    if len(table) < 2 or not names or len(set(names)) < len(names):
+    numbers = [(name, values) for name, values in fields if any(kind(values.type) for kind in kinds)]
+    if len(table) < 2 or not numbers or len(dict(numbers)) < len(numbers):
         raise BadInputError(
             f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
         )
-    return {name: table[name].cast(pa.float64(), safe=False).to_numpy() for name in names}
+    return {name: values.cast(pa.float64(), safe=False).to_numpy() for name, values in numbers}
 
 
 def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
@@ -218,6 +221,8 @@ def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
 
 def _field(name: str, values: Floats) -> Field:
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    if not plain:
+        return Field(name, "left out", plain, "1", 1.0, "no letter a to z and no digit in its name")
     body, ending = _without_unit(plain, _TIMES)
     if re.fullmatch(_NAMES[0][1], body):
         _check_finite(name, "time", values)
@@ -282,18 +287,13 @@ def _whole(table: dict[str, Floats], states: Sequence[str]) -> dict[str, Floats]
     return {name: values[kept] for name, values in table.items()} if states else table
 
 
-def _episodes(fields: Sequence[Field], tables: Iterable[dict[str, Floats]]) -> list[dict[str, Floats]]:
+def _episodes(fields: Sequence[Field], tables: Iterable[dict[str, Floats]]) -> Iterator[dict[str, Floats]]:
     """Cut the files where the field of the episode changes, and scale their values."""
-    scaled = []
     for table in tables:
         values = {field.name: table[field.name] * field.scale for field in fields}
-        length = len(next(iter(values.values())))
-        cuts = {0, length}
+        cuts = {0, len(next(iter(values.values())))}
         for field in fields:
             if field.role == "episode":
                 cuts |= set(1 + np.flatnonzero(np.diff(values[field.name])))
-        scaled += [
-            {name: column[first:last] for name, column in values.items()}
-            for first, last in pairwise(sorted(cuts))
-        ]
-    return scaled
+        for first, last in pairwise(sorted(cuts)):
+            yield {name: column[first:last] for name, column in values.items()}

@@ -64,8 +64,8 @@ def import_dataset(
 
     Args:
         recordings: files, folders or archives of one format.
-        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy and Minari
-            need none.
+        mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy, Minari
+            and PACE need none.
         out: the dataset's folder, by default its place at home.
         file_format: one of `FORMATS`, by default inferred from the recordings' names.
         name: of the dataset; like `fps` and `task`, it overrides the mapping.
@@ -80,6 +80,8 @@ def import_dataset(
         CorruptDatasetError: an export of ours was altered; nothing is written.
         RecipeError: the mapping has faults.
     """
+    if not recordings:
+        raise BadInputError("expected one recording or more to import, got none")
     began = time.perf_counter()
     given = {"name": name, "fps": fps, "task": task, "format": file_format}
     options = {key: value for key, value in given.items() if value is not None}

@@ -73,8 +73,10 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         field.short: (float(low), float(high)) for field, low, high in zip(commands, lows, highs, strict=True)
     }
     horizon = max(len(values) for values in logs.values(states))
-    time = [f'time = "{field.name}"\ntime_scale = {field.scale!r}\n' for field in logs.of("time")[:1]]
-    split = [f'field = "{field.name}"\n' for field in logs.of("episode")[:1]]
+    time = [
+        f"time = {json.dumps(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")[:1]
+    ]
+    split = [f"field = {json.dumps(field.name)}\n" for field in logs.of("episode")[:1]]
     if time:
         split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
     lines = ["| field | taken for | unit | factor | why |", "|---|---|---|---|---|"]

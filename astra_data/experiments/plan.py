@@ -23,7 +23,7 @@ from astra_data.core.naming import base_method, place, reference_of
 from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
-from astra_data.methods import METHODS
+from astra_data.methods import METHODS, grounded_as
 from astra_data.methods.method import Method
 from astra_data.reports.runs import Reported
 from astra_data.stages.registry import STAGES, Stage
@@ -62,7 +62,7 @@ def plan(
         recipe.task,
         selection.methods,
         selection.seeds,
-        {row: grounded_as(base_method(row)) for row in selection.methods},
+        {row: grounded_as(row) for row in selection.methods},
         recipe.settings,
         selection.percents,
     )
@@ -116,11 +116,6 @@ def check_stage(stage: str) -> None:
     """
     if stage not in STAGES:
         raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
-
-
-def grounded_as(base: str) -> str:
-    """Return the method whose grounding and alignment a method uses."""
-    return METHODS[base].grounded_as or base
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.durable import clean, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
-from astra_data.core.naming import base_method
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -24,10 +23,11 @@ from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.local_executor import execute
 from astra_data.experiments.own_files import record_code
 from astra_data.experiments.own_methods import OwnMethod, add_all
-from astra_data.experiments.plan import check_stage, grounded_as, plan, stage_of, stages_until
+from astra_data.experiments.plan import check_stage, plan, stage_of, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
+from astra_data.methods import grounded_as
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.own_code import is_own_code
 from astra_data.worlds.registry import task_named
@@ -49,13 +49,15 @@ def run(
 ) -> Path:
     """Make every artefact of a recipe that is not finished yet; return the recipe's folder.
 
+    Where it grounds, the page of held-out errors is written there.
+
     Args:
         recipe_path: the recipe.
         seeds: the recipe's seeds to make and to report; by default all.
         root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
-        until: the last stage to run, by default all; after "ground" comes a page of held-out errors.
+        until: the last stage to run, by default all.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
@@ -274,7 +276,7 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
     if method is not None and method not in recipe.methods:
         raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
     if method is not None and stage in ("ground", "align"):
-        method = grounded_as(base_method(method))
+        method = grounded_as(method)
 
     def is_asked_for(key: str) -> bool:
         made_by, *row_and_seed = key.split("/")
@@ -282,5 +284,5 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
 
     selected = [item for item in items if is_asked_for(item.key)]
     if not selected:
-        raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
+        raise BadInputError(f"{method or 'the recipe'} has no stage '{stage}'")
     return selected

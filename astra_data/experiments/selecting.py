@@ -8,13 +8,11 @@ from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.core.manifest import read_manifest
-from astra_data.core.naming import base_method
 from astra_data.core.progress import Progress, silent
 from astra_data.experiments.own_methods import add_all
-from astra_data.experiments.plan import grounded_as
 from astra_data.experiments.run import set_aside
 from astra_data.experiments.trained_policy import settings_of
-from astra_data.methods import method_named
+from astra_data.methods import grounded_as
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
 from astra_data.stages.select import FOLDER, SelectConfig, benches, digests, judge_of
@@ -51,14 +49,12 @@ def select(
     asked = asked | {key: value for key, value in given.items() if value is not None}
     config = validated(asked, SelectConfig, f"{folder}: select")
     methods = tuple(rows) or tuple(settings["methods"])
-    for row in methods:
-        method_named(row)
     recipe = Reported(
         folder.name,
         settings["task"],
         methods,
         tuple(settings["seeds"]),
-        {row: grounded_as(base_method(row)) for row in methods},
+        {row: grounded_as(row) for row in methods},
         settings,
         tuple(settings.get("sweep", {}).get("percent", ())),
     )

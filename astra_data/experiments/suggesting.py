@@ -11,15 +11,14 @@ from astra_data.core.config import Config, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
-from astra_data.core.naming import base_method, place, reference_of
+from astra_data.core.naming import place, reference_of
 from astra_data.core.progress import Progress, part, silent
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.own_methods import add_all
-from astra_data.experiments.plan import grounded_as
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.committee import Committee
 from astra_data.grounding.files import load_grounding
-from astra_data.methods import method_named
+from astra_data.methods import grounded_as, method_named
 from astra_data.reports.suggestion import maps_of, suggestion_page
 from astra_data.training.proposals import SuggestConfig, Suggestion, suggested
 from astra_data.worlds.registry import task_named
@@ -110,7 +109,7 @@ def _grounding_row(row: str | None, rows: tuple[str, ...]) -> str:
         raise BadInputError(
             f"expected a row that grounds its simulator, such as nas, got {asked or ', '.join(rows)}"
         )
-    return grounded_as(base_method(asked))
+    return grounded_as(asked)
 
 
 def _places(folder: Path, recipe: dict[str, Any], base: str) -> list[str]:

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import base_method, place
+from astra_data.core.naming import place
 from astra_data.experiments.own_methods import add_all
-from astra_data.experiments.plan import grounded_as
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.methods import method_named
+from astra_data.methods import grounded_as, method_named
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.worlds.registry import task_named
@@ -73,13 +72,12 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     Raises:
         BadInputError: as `load_policy`.
     """
-    task_of(run)
-    settings = json.loads((Path(run) / "recipe.json").read_text())
+    settings = settings_of(run)
     add_all(settings.get("own_methods", {}))
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")
-    folder, base, where = Path(run), grounded_as(base_method(row)), place(seed, percent)
+    folder, base, where = Path(run), grounded_as(row), place(seed, percent)
     files = {"train": folder / "train" / row / where / "policy.safetensors"}
     if method.grounds:
         files["ground"] = folder / "ground" / base / where / "grounding.safetensors"

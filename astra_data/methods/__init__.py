@@ -123,6 +123,15 @@ def method_named(row: str) -> Method:
     return METHODS[name]
 
 
+def grounded_as(row: str) -> str:
+    """Return the method whose grounding and alignment a row uses.
+
+    Raises:
+        BadInputError: as `method_named`.
+    """
+    return method_named(row).grounded_as or base_method(row)
+
+
 def _installed() -> dict[str, str]:
     """Return where the methods are that installed packages offer, by name."""
     return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}

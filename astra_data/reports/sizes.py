@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Literal
 
-from astra_data.methods import method_title
+from astra_data.reports.choice_page import named
 from astra_data.reports.cost_and_origin import provenance
 from astra_data.reports.formatting import fill, interval, spread
 from astra_data.reports.schema import Results, Section
@@ -94,7 +94,7 @@ def _choice(size: SizeResults) -> list[str]:
     best = choice.candidates[0]
     known = [best.target, choice.regret, choice.random_regret]
     return [
-        *(f"{size.percent} %", f"{method_title(best.row)}, seed {best.seed}"),
+        *(f"{size.percent} %", named(best.row, best.seed)),
         interval(best.predicted, best.low, best.high),
         *("-" if value is None else f"{value:.2f}" for value in known),
     ]

@@ -1,7 +1,7 @@
 """Where the rows of results were tested: in the target or, of a task without one, in simulators."""
 
-from astra_data.core.naming import base_method, reference_of
-from astra_data.methods import METHODS, method_title
+from astra_data.core.naming import reference_of
+from astra_data.methods import grounded_as, method_title
 from astra_data.reports.schema import Results
 
 
@@ -25,8 +25,7 @@ def warning(results: Results) -> str:
             "With a row of NAS, all would be tested in one simulator."
         )
     else:
-        grounds = {row: METHODS[base_method(row)].grounded_as or base_method(row) for row in results.methods}
-        there = [method_title(row) for row, owner in grounds.items() if owner == reference]
+        there = [method_title(row) for row in results.methods if grounded_as(row) == reference]
         place = (
             f"the abstract simulator as {method_title(reference)} grounded it, in which no row was trained "
             f"but {' and '.join(there)}. What is in no abstract state, it cannot show."

@@ -22,11 +22,13 @@ from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.behaviors import (
     Behavior,
+    HoldTimes,
     MixedBehavior,
     PolicyBehavior,
     RandomCommands,
     StressCommands,
     WallWatch,
+    held_steps,
 )
 from astra_data.training.plan import Plan, PlannedCommands
 from astra_data.training.policy_file import PolicyFile, deploy
@@ -59,7 +61,7 @@ class CollectConfig(Config):
     """Episodes recorded in one batch; also decides which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
     """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does."""
-    hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
+    hold_s: HoldTimes = (0.5, 3.0)
     """How long a random command is held; not in the paper."""
     clearance_m: NotNegative = 0.0
     """A random command is replaced once it would lead closer to a wall than this within a second, as
@@ -95,8 +97,6 @@ class CollectConfig(Config):
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
         if self.random_share and self.behavior in {"random", "stress", "planned"}:
             raise ValueError(f'random_share: expected the behavior of a policy, got "{self.behavior}"')
-        if self.hold_s[0] > self.hold_s[1]:
-            raise ValueError(f"hold_s: expected the shorter time first, got {list(self.hold_s)}")
         if self.episodes * self.max_steps > MOST_STEPS:
             raise ValueError(
                 f"episodes: {self.episodes} of up to {self.max_steps} steps take terabytes, expected at most "
@@ -273,9 +273,8 @@ def _behavior(
 
 
 def _random(task: Task, config: CollectConfig, commands: type[RandomCommands]) -> RandomCommands:
-    fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
     watch = WallWatch(task, config.clearance_m) if config.clearance_m else None
-    return commands(task.objective.action_size, (fewest, most), watch)
+    return commands(task.objective.action_size, held_steps(config.hold_s, task.timestep_s), watch)
 
 
 def _saved_files(config: CollectConfig) -> dict[str, Path]:

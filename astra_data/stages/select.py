@@ -16,7 +16,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
-from astra_data.core.naming import base_method, place, reference_of
+from astra_data.core.naming import place, reference_of
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -25,7 +25,7 @@ from astra_data.dataset.meta_files import read_description
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.methods import method_named
+from astra_data.methods import grounded_as, method_named
 from astra_data.reports.choice import SELECTED, Candidate, Judged
 from astra_data.reports.choice_page import select_page
 from astra_data.reports.runs import Reported
@@ -109,7 +109,7 @@ def judge_of(judge: str | None, rows: tuple[str, ...]) -> str:
     if asked is None or not method_named(asked).grounds:
         known = "none, and NAS is not among the rows" if asked is None else asked
         raise BadInputError(f"expected a row that grounds its simulator as judge, got {known}")
-    return _owner(asked)
+    return grounded_as(asked)
 
 
 def benches(recipe: Reported, judge: str) -> list[Bench]:
@@ -187,11 +187,6 @@ def select(
     progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")
 
 
-def _owner(row: str) -> str:
-    """Return the method whose grounding a row uses."""
-    return method_named(row).grounded_as or base_method(row)
-
-
 def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
     dataset = "pair" if percent is None else "subset"
     where = {seed: place(seed, percent) for seed in recipe.seeds}
@@ -201,7 +196,7 @@ def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -
             seed,
             percent,
             f"train/{row}/{where[seed]}",
-            f"ground/{_owner(row)}/{where[seed]}" if method_named(row).grounds else None,
+            f"ground/{grounded_as(row)}/{where[seed]}" if method_named(row).grounds else None,
         )
         for row in rows
         for seed in recipe.seeds

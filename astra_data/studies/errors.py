@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
 from astra_data.studies.predictors import Predictor
 from astra_data.studies.rollouts import predict
@@ -35,8 +36,16 @@ class Trial:
 
     @classmethod
     def of(cls, walks: Walks, history: int, horizons: Sequence[int]) -> "Trial":
-        """Start at every row of `walks` with a history before it; of too many, at `MOST_STARTS` evenly."""
+        """Start at every row of `walks` with a history before it; of too many, at `MOST_STARTS` evenly.
+
+        Raises:
+            BadInputError: the robot never walks for the shortest horizon after a history.
+        """
         sequence, step = walks.starts(history, min(horizons))
+        if len(step) == 0:
+            raise BadInputError(
+                f"expected walking after {history} control steps in a recording to test on, found none"
+            )
         # In order of time, so that an even spacing covers every piece.
         order = torch.argsort(walks.piece[sequence] * 10**6 + step, stable=True)
         order = order[torch.linspace(0, len(order) - 1, min(len(order), MOST_STARTS)).long()]

@@ -23,7 +23,7 @@ class GapRecipe(Config):
     minutes: tuple[Positive, ...] = ()
     """Sizes of the training data, besides all of it; each is a subset of the larger ones."""
     horizons_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.5, 1.0, 2.0, 3.0)
-    """Prediction horizons, besides one step; rounded to control steps."""
+    """Prediction horizons, besides one step; rounded to control steps, at least one."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Share of each recording's pieces held out for testing, if no other recordings are given."""
     notes: tuple[str, ...] = ()

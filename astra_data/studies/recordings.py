@@ -13,6 +13,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
+from astra_data.dataset.endings import is_terminated, stands_still
 from astra_data.dataset.format import INFO_PATH
 from astra_data.exchange.importing import import_dataset, log_suffixes
 from astra_data.exchange.mapping import ImportMapping
@@ -149,8 +150,9 @@ def _pieces(name: str, dataset: Dataset, fps: int, config: Reading) -> Iterator[
     body = config.body(dataset)
     columns = [STATE, NEXT_STATE, TERMINATED, *([ACTION] if body.given_size else [])]
     for episode in dataset.episodes(columns):
-        # A terminated episode has no next state at its end in the log: the state itself stands in.
-        rows = len(episode) - int(episode.columns[TERMINATED][-1])
+        ends = (episode.columns[name][-1] for name in (STATE, NEXT_STATE))
+        # At its end the state may stand for a next state that the log does not have: that is no step.
+        rows = len(episode) - (is_terminated(episode.columns) and stands_still(*ends))
         if rows == 0:
             continue
         following = episode.columns[NEXT_STATE][rows - 1 : rows]

@@ -97,7 +97,7 @@ def _gains(walks: Walks, history: int, config: FitConfig, progress: Progress) ->
 
 def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) -> WindowModel:
     """Solve ridge regression with the penalty that is best on the last quarter of each sequence."""
-    sequence, step = walks.starts(history, 1)
+    sequence, step = _starts(walks, history, 1)
     is_late = step > 0.75 * walks.lengths[sequence]
     everything, early = (
         walks.stretches(sequence[chosen], step[chosen], history, 1)
@@ -115,7 +115,8 @@ def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) ->
 
     model = WindowModel(history, body=walks.body).requires_grad_(False)
     model.set_scales(everything)
-    model.solve(everything, min(STRENGTHS, key=error) if len(test) > 1 else STRENGTHS[-1])
+    can_choose = len(early) > 0 and len(test) > 1
+    model.solve(everything, min(STRENGTHS, key=error) if can_choose else STRENGTHS[-1])
     return model
 
 
@@ -154,13 +155,24 @@ _SAMPLE = 20_000
 
 def _sample(walks: Walks, history: int, steps: int) -> Stretch:
     """Return at most `_SAMPLE` stretches with `steps` steps of walking, evenly spaced over all."""
+    sequence, step = _starts(walks, history, steps)
+    chosen = torch.linspace(0, len(sequence) - 1, min(len(sequence), _SAMPLE)).long()
+    return walks.stretches(sequence[chosen], step[chosen], history, steps)
+
+
+def _starts(walks: Walks, history: int, steps: int) -> tuple[Tensor, Tensor]:
+    """Return the starts of stretches to fit to, as `Walks.starts` does.
+
+    Raises:
+        BadInputError: there are fewer than two.
+    """
     sequence, step = walks.starts(history, steps)
     if len(sequence) < 2:
         raise BadInputError(
-            f"expected stretches of {history} + {steps} steps of walking to fit to, found none"
+            f"expected stretches of {history} + {steps} steps of walking to fit to, found {len(sequence)}: "
+            "take longer recordings"
         )
-    chosen = torch.linspace(0, len(sequence) - 1, min(len(sequence), _SAMPLE)).long()
-    return walks.stretches(sequence[chosen], step[chosen], history, steps)
+    return sequence, step
 
 
 def _descend[M: (WindowModel, HistoryModel)](

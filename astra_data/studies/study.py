@@ -73,7 +73,7 @@ def _held_out(data: Sequence[Recording], share: float) -> tuple[tuple[Piece, ...
         order = generator(0, f"held-out pieces of {recording.content_hash}").permutation(
             len(recording.pieces)
         )
-        count = max(1, round(share * len(order)))
+        count = max(1, min(round(share * len(order)), len(order) - 1))
         for place, number in enumerate(order):
             (test if place < count else training).append(recording.pieces[number])
     if not training:
@@ -181,7 +181,8 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     """Fit and test the models of one case; return their errors by data size."""
     steps_config = recipe.steps
     step_s = steps_config.rows / fps
-    horizons = (1, *(round(seconds / step_s) for seconds in recipe.horizons_s))
+    rounded = [max(1, round(seconds / step_s)) for seconds in recipe.horizons_s]
+    horizons = tuple(dict.fromkeys([1, *rounded]))
     horizons_s = [horizon * step_s for horizon in horizons]
     trial = Trial.of(Walks.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
     body = trial.stretch.body
@@ -195,7 +196,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         if not path.exists():
             drawn = (minutes, recipe.seeds[0] if size == "all" else seed)
             if drawn not in walks:
-                rows = round(minutes * 60 * fps)
+                rows = max(1, round(minutes * 60 * fps))
                 pieces = case.training if size == "all" else shortened(case.training, rows, seed)
                 walks[drawn] = Walks.of_pieces(pieces, fps, steps_config)
             share = part(progress, number / len(fits), (number + 1) / len(fits))

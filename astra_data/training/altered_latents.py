@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from astra_data.learning.networks.history import LatentEncoder
+from astra_data.training import target_episodes
 from astra_data.training.deployment import DeployedPolicy
-from astra_data.training.episode_record import EpisodeRecord, Outcome
+from astra_data.training.episode_record import Outcome
+from astra_data.training.own_world import Act, started
 
 Alteration = Callable[[Tensor], Tensor]
 """Latents (B, Z) to those that the policy is shown."""
@@ -55,16 +57,9 @@ class AlteredLatents(DeployedPolicy):
 
 def in_target(policy: DeployedPolicy, episodes: int, seed: int, num_threads: int | None = None) -> Outcome:
     """Run a policy in B = `episodes` target environments, from the task's starts."""
-    task = policy.task
-    env = task.target(episodes, seed=seed, num_threads=num_threads)
-    env.reset()
-    torch.manual_seed(seed)
-    policy.start(episodes)
-    record = EpisodeRecord(env.position)
-    for step in range(task.objective.horizon):
-        outcome = env.step(policy.act(env.state, env.goal), record.active)
-        success = task.objective.succeeded(outcome.success, env.failed, step + 1)
-        record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
-        if not record.active.any():
-            break
-    return record.outcome()
+
+    def begin(goal: Tensor) -> Act:
+        torch.manual_seed(seed)
+        return started(policy, policy.act, goal)
+
+    return target_episodes.in_target(policy.task, begin, episodes, seed, num_threads=num_threads).outcome

@@ -1,12 +1,14 @@
 """Behaviours: controllers that act in the target while data is collected."""
 
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 from torch import Tensor
 
+from astra_data.core.config import NotNegative, in_order
 from astra_data.core.seeding import derive, generator
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.worlds.task import Task
@@ -14,6 +16,15 @@ from astra_data.worlds.task import Task
 _FORESIGHT_S = 1.0
 _CHOICES = 16
 """Random commands to choose one from that stays clear of walls."""
+
+HoldTimes = Annotated[tuple[NotNegative, NotNegative], AfterValidator(in_order)]
+"""The shortest and the longest time for which a random command is held."""
+
+
+def held_steps(hold_s: HoldTimes, timestep_s: float) -> tuple[int, int]:
+    """Return the fewest and the most control steps for which a command is held."""
+    shortest, longest = (max(1, round(seconds / timestep_s)) for seconds in hold_s)
+    return shortest, longest
 
 
 class Behavior(Protocol):

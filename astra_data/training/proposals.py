@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.config import AtOnce, Config, NotNegative, Positive
+from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.committee import Committee, Rollouts
-from astra_data.training.behaviors import RandomCommands
+from astra_data.training.behaviors import HoldTimes, RandomCommands, held_steps
 from astra_data.training.plan import Plan, PlannedEpisode, names_of
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.task import Task
@@ -38,7 +38,7 @@ class SuggestConfig(Config):
     """Length of an episode, in control steps."""
     start: Literal["anywhere", "task"] = "anywhere"
     """Where episodes may start: anywhere in the free space, or where the task does."""
-    hold_s: tuple[NotNegative, NotNegative] = (0.5, 3.0)
+    hold_s: HoldTimes = (0.5, 3.0)
     """How long a command is held."""
     proposals: AtOnce = Field(default=2000, ge=2)
     """Episodes to choose from."""
@@ -132,15 +132,15 @@ def drawn(task: Task, config: SuggestConfig, seed: int) -> Proposals:
         BadInputError: starts are to be anywhere, and there is no maze.
     """
     objective, count = task.objective, config.proposals
-    if config.start == "anywhere" and not isinstance(objective, PlanarObjective):
-        raise task.without_maze()
-    draw = objective.draw_anywhere if isinstance(objective, PlanarObjective) else objective.draw_starts
     if config.start == "task":
         draw = objective.draw_starts
+    elif isinstance(objective, PlanarObjective):
+        draw = objective.draw_anywhere
+    else:
+        raise task.without_maze()
     start = torch.from_numpy(draw(generator(seed, "proposed starts"), count)).float()
     goal = torch.from_numpy(objective.draw_goals(generator(seed, "proposed goals"), count)).float()
-    fewest, most = (max(1, round(seconds / task.timestep_s)) for seconds in config.hold_s)
-    commands = RandomCommands(objective.action_size, (fewest, most))
+    commands = RandomCommands(objective.action_size, held_steps(config.hold_s, task.timestep_s))
     commands.start(count, derive(seed, "proposed commands"))
     action = [commands.act(start, goal).clone() for _ in range(config.max_steps)]
     return Proposals(start, goal, torch.stack(action))

@@ -55,6 +55,9 @@ def code_digest(name: str) -> str | None:
     """Return a digest of the code that `name` begins with; None where it is no file.
 
     The files beside it that it imports count too; comments and layout do not.
+
+    Raises:
+        BadInputError: one of these files is no Python.
     """
     place = Path(name.rpartition(":")[0])
     if place.suffix != ".py" or not place.is_file():
@@ -63,7 +66,10 @@ def code_digest(name: str) -> str | None:
     while todo:
         path = todo.pop()
         seen.add(path)
-        tree = ast.parse(path.read_bytes())
+        try:
+            tree = ast.parse(path.read_bytes())
+        except SyntaxError as error:
+            raise BadInputError(f"{path}, line {error.lineno}: expected Python, got {error.msg}") from None
         digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
         beside = {path.with_name(f"{module}.py") for module in sorted(_imported(tree))}
         todo += sorted(file for file in beside - seen - set(todo) if file.is_file())

@@ -138,6 +138,11 @@ class Task:
                 f"objective: action_size {self.objective.action_size}, expected that of commands, "
                 f"{len(commands)}"
             )
+        if not 0 < self.timestep_s < 2:
+            faults.append(
+                f"timestep_s: expected above 0 and below 2 s, for datasets have a whole number of steps per "
+                f"second: got {self.timestep_s}"
+            )
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]

@@ -8,15 +8,9 @@ import torch
 from pydantic import AfterValidator
 from torch import Tensor
 
-from astra_data.core.config import Config
+from astra_data.core.config import Config, in_order
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.protocols import VariableSimulator, WalledSimulator
-
-
-def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
-    if ends[0] > ends[1]:
-        raise ValueError(f"expected the lower end first, got {list(ends)}")
-    return ends
 
 
 def _above_zero(ends: tuple[float, float]) -> tuple[float, float]:
@@ -31,7 +25,7 @@ def _not_below_zero(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Range = Annotated[tuple[float, float], AfterValidator(in_order)]
 FactorRange = Annotated[Range, AfterValidator(_above_zero)]
 NoiseRange = Annotated[Range, AfterValidator(_not_below_zero)]
 

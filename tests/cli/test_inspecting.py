@@ -49,7 +49,10 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     write_fake(tmp_path / "mute", columns=[replace(column, astra=None) for column in COLUMNS])
     for arguments, told in (
         ([str(tmp_path / "none")], "no such folder"),
-        ([str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")], "no column with the role position"),
+        (
+            [str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")],
+            "expected a state with the role position or vector",
+        ),
         ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: a file is where"),
     ):
         error = call("inspect", *arguments).exception

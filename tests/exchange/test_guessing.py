@@ -206,3 +206,23 @@ def test_texts_are_no_field(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("x,mode,cmd_x\n" + "".join(f"{row}.5,driving,{row % 3}\n" for row in range(20)))
     assert [field.name for field in guess([log]).fields] == ["x", "cmd_x"]
+
+
+def test_a_name_without_letters_or_digits_is_left_out(tmp_path: Path) -> None:
+    columns = {"": RAMP, "t": RAMP / 10, "x": RAMP, "θ": RAMP, "cmd": RAMP}
+    (tmp_path / "log.csv").write_text(write(tmp_path / "log.txt", columns).read_text("latin-1"), "utf-8")
+    fields = guess([tmp_path / "log.csv"]).fields
+    assert [field.role for field in fields] == ["left out", "time", "state", "left out", "command"]
+
+
+def test_texts_may_share_a_name(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("note,x,note,cmd\n" + "".join(f"a,{row},b,{row}\n" for row in range(6)))
+    assert [field.name for field in guess([log]).fields] == ["x", "cmd"]
+
+
+@pytest.mark.parametrize("time", [{}, {"t": RAMP / 10}])
+def test_a_number_of_the_row_makes_no_episodes(tmp_path: Path, time: dict[str, object]) -> None:
+    log = write(tmp_path / "log.csv", {**time, "trial": RAMP, "x": RAMP, "cmd": RAMP})
+    with pytest.raises(BadInputError, match=r"episodes of two rows .* trial changes in every row: leave it"):
+        guess([log])

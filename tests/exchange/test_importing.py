@@ -10,6 +10,7 @@ from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
 from astra_data.exchange.cutting import Cutter
+from astra_data.exchange.importing import import_dataset
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -128,6 +129,11 @@ def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path:
     os.rename(os.fsencode(path), os.fsencode(tmp_path) + b"/log\xff.csv")
     with pytest.raises(BadInputError, match=r"'log\\udcff\.csv': expected a name in UTF-8; rename the file"):
         imported(tmp_path, [tmp_path / os.fsdecode(b"log\xff.csv")], PER_FILE)
+
+
+def test_no_recordings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="expected one recording or more to import, got none"):
+        import_dataset(sorted(tmp_path.glob("*.csv")))
 
 
 def test_an_episode_that_does_not_fit_into_memory_is_told(

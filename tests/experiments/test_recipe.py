@@ -120,7 +120,7 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ({"align": {"bandwidths": [1.0, 0.0]}}, "align.bandwidths.1: expected greater than 0"),
         (
             {"collect": {"start": "task", "hold_s": [3.0, 0.5]}},
-            "collect: hold_s: expected the shorter time first, got [3.0, 0.5]",
+            "collect.hold_s: expected the lower end first, got [3.0, 0.5]",
         ),
         ({"collect": {"start": "task", "episodes": 10**18}}, "collect.episodes: expected less than or equal"),
         ({"collect": {"start": "task", "episodes": 10**10}}, "collect: episodes: 10000000000 of up to 500"),

@@ -202,6 +202,8 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     [
         ({"stage": "trian"}, "unknown stage 'trian': did you mean 'train'?"),
         ({"stage": "train", "method": "astr"}, "the recipe has no method 'astr': did you mean 'astra'?"),
+        ({"stage": "augment"}, "the recipe has no stage 'augment'"),
+        ({"stage": "pair", "method": "astra"}, "astra has no stage 'pair'"),
         ({"stage": "train", "seeds": [0, 3]}, "the recipe has no seed 3; its seeds: 0"),
         ({"stage": "collect", "device": "gpu"}, "expected a device such as cpu, cuda or cuda:1, got 'gpu'"),
     ],

@@ -39,6 +39,18 @@ def test_long_episodes_become_pieces_that_share_a_state(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pieces[0].state[-1], pieces[1].state[0])
 
 
+@pytest.mark.parametrize("terminal", ["drop", "stand_still"])
+def test_only_a_next_state_that_was_made_up_is_no_step(tmp_path: Path, terminal: str) -> None:
+    mapping, recorded = tmp_path / "m.toml", tmp_path / "run.log"
+    ends = '\n[columns."next.terminated"]\nfields = ["fell"]\n'
+    mapping.write_text(f'terminal = "{terminal}"\n{MAPPING.read_text()}{ends}')
+    walk = log(200, 3)
+    recorded.write_text(json.dumps({**walk, "fell": [[row == 199] for row in range(200)]}))
+    (one,) = read_recordings(recorded, mapping, tmp_path / "home", CONFIG)
+    assert one.rows == 199
+    np.testing.assert_allclose(one.pieces[0].state[-1, :2] * 1000, walk["observations"][-1][:2], rtol=1e-5)
+
+
 def test_jumps_and_carried_stretches_are_no_walking() -> None:
     state = np.zeros((301, 5))
     state[:, 0] = np.arange(301) * 0.004  # 0.24 m/s

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,8 @@ def test_the_held_out_share_is_that_of_the_recipe() -> None:
     assert (len(only.test), len(only.training)) == (4, 4)
     (least,) = cases(recipe(held_out_share=0.01), [B], [])
     assert len(least.test) == 1
+    (most,) = cases(recipe(held_out_share=0.99), [B], [])
+    assert len(most.training) == 1
     with pytest.raises(BadInputError, match=r"at least two pieces without a split.*--train"):
         list(cases(recipe(), [recording("short", count=1)], []))
 
@@ -122,3 +125,29 @@ def test_a_folder_holds_one_study_at_a_time(tmp_path: Path) -> None:
 def test_recordings_of_several_rates_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="one rate, got 30, 60 per second"):
         run_study(recipe(), [A], [recording("slow", fps=30)], tmp_path, silent)
+
+
+def test_a_horizon_below_a_control_step_is_one_step(tmp_path: Path) -> None:
+    short = recipe(models=("raw",), horizons_s=(0.05, 0.5))
+    (case,) = run_study(short, [A], [B], tmp_path, silent)["cases"]
+    assert case["horizons_s"] == pytest.approx([1 / 6, 0.5])
+
+
+def test_recordings_without_walking_are_refused(tmp_path: Path) -> None:
+    pieces = tuple(replace(piece, broken=np.ones(len(piece), bool)) for piece in A.pieces)
+    still = replace(A, pieces=pieces)
+    with pytest.raises(BadInputError, match="expected walking after 4 control steps in a recording to test"):
+        run_study(recipe(models=("raw",)), [still], [B], tmp_path / "a", silent)
+    with pytest.raises(BadInputError, match=r"expected stretches of 4 \+ 1 steps of walking to fit to"):
+        run_study(recipe(models=("ridge",)), [B], [still], tmp_path / "b", silent)
+
+
+def test_a_size_of_less_than_a_row_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"expected pieces of more than 0\.8 s without a split"):
+        run_study(recipe(minutes=(1e-5,)), [A], [B], tmp_path, silent)
+
+
+def test_ridge_regression_fits_to_pieces_that_are_late_as_a_whole(tmp_path: Path) -> None:
+    short = recipe(models=("ridge",), fit={"steps": 1})
+    (case,) = run_study(short, [A], [recording("short", rows=55)], tmp_path, silent)["cases"]
+    assert np.isfinite(case["sizes"][0]["models"]["ridge"]["0.5"]["forward_m"]["rmse"])

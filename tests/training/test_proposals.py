@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from small_cart import TASK
 from toy_corrections import OFFSETS_M, shifted
 
@@ -50,6 +51,11 @@ def test_proposals_are_drawn_as_episodes_are_collected() -> None:
     for commands in first.action[..., 0].T:
         held = np.diff(np.flatnonzero(np.diff(commands, prepend=np.nan, append=np.nan) != 0))
         assert set(held[:-1]) <= {2, 3, 4}
+
+
+def test_the_shorter_hold_comes_first() -> None:
+    with pytest.raises(ValidationError, match=r"expected the lower end first, got \[3\.0, 0\.5\]"):
+        SuggestConfig(hold_s=(3.0, 0.5))
 
 
 def test_starts_are_anywhere_in_a_maze_and_only_there() -> None:

@@ -97,6 +97,9 @@ def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> 
     (tmp_path / "wheel.py").write_text("import cart\nR = 2\n")
     assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
     assert code_digest("antmaze-umaze") is code_digest("some.module:TASK") is None
+    (tmp_path / "wheel.py").write_text("R = 1\nR = = 2\n")
+    with pytest.raises(BadInputError, match=r"wheel\.py, line 2: expected Python, got invalid syntax"):
+        code_digest(f"{tmp_path}/cart.py:TASK")
 
 
 def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) -> None:

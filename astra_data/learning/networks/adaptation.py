@@ -57,7 +57,7 @@ class Teacher(ActorCritic):
     def remember_sequence(
         self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
     ) -> Tensor:
-        """Return the features (B, T, F) of `observation` (B, T, O + P); see `ActorCritic`."""
+        """Return the features (B, T, F) of `observation` (B, T, O + P); see `Policy`."""
         seen = observation[..., : self.shape.observation_size]
         features = super().remember_sequence(seen, previous_action, hidden, start)
         return torch.cat([features, self.extrinsics(observation)], dim=-1)

@@ -53,7 +53,6 @@ class Walking(Objective):
     """
 
     action_size = len(COMMANDED)
-    goal_size = 0
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]
     """Typical deviation of each entry of a state from standing, (X,)."""
@@ -80,10 +79,6 @@ class Walking(Objective):
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, X) as the target does: almost upright and at rest."""
         return self.abstracted(self.locomotion.draw_starts(rng, count))
-
-    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Return no goals, (count, 0)."""
-        return np.empty((count, 0))
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return False for all states (B, X), (B,): there is no goal to reach."""

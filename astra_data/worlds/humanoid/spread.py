@@ -1,13 +1,8 @@
 """Typical deviations of the walking humanoid's state from standing: they scale inputs of networks to about 1.
 
 They are rough standard deviations of walking. Joints that no command moves give way by hundredths of a
-radian, which shows the forces on them: a network fitted to recorded actions lasts 566 steps on angles in
-radians and a fifth of rates in rad/s, 698 on inputs scaled by these (64 episodes of `humanoid-extended`).
-
-Recorded humanoids walk forward at 0.7 m/s on average, and faster than 1.5 m/s, where inputs are clipped, in a
-twentieth of all steps and most of the 40 before a fall. Clipping at 3 m/s instead helped at the extended
-simulator, if at all, and not at the planar walker: behavior cloning, NAS+ and ASTRA+ lasted 370, 724 and 824
-steps in place of 384, 639 and 768 (seed 2), and 141, 138 and 140 in place of 138, 159 and 153 (seed 0).
+radian, which shows the forces on them. Recorded humanoids walk forward at 0.7 m/s on average, and faster than
+1.5 m/s, where inputs are clipped, in a twentieth of all steps.
 """
 
 from torch import Tensor

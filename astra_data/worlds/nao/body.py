@@ -79,11 +79,11 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False, friction: float =
     )
     world = ElementTree.SubElement(root, "worldbody")
     _geom(world, "floor", "plane", (0, 0, 1), friction=(friction, 0.005, 0.0), collides=(_FLOOR, 0))
-    for row, column in maze.wall_cells() if maze else ():
-        x, y = maze.cell_centre(row, column) if maze else (0.0, 0.0)
-        half = 0.5 * maze.scale if maze else 0.0
-        size = (half, half, WALL_HEIGHT_M / 2)
-        _geom(world, f"block_{row}_{column}", "box", size, at=(x, y, WALL_HEIGHT_M / 2), collides=(_WALL, 0))
+    if maze:
+        size = (0.5 * maze.scale, 0.5 * maze.scale, WALL_HEIGHT_M / 2)
+        for row, column in maze.wall_cells():
+            place = (*maze.cell_centre(row, column), WALL_HEIGHT_M / 2)
+            _geom(world, f"block_{row}_{column}", "box", size, at=place, collides=(_WALL, 0))
     torso = _body(world, TORSO, "Torso", 1.0)
     ElementTree.SubElement(torso, "freejoint", name="root")
     _geom(torso, "chest", "capsule", (0.06, 0.075), at=(0, 0, 0.06), euler=(90, 0, 0), collides=(0, _WALL))
