@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.parquet import first_line
 from astra_data.exchange.importers.csv import SUFFIXES
 
 Floats = NDArray[np.float64]
@@ -195,7 +196,7 @@ def _numbers(path: Path) -> dict[str, Floats]:
     except FileNotFoundError:
         raise BadInputError(f"{path}: there is no such file") from None
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path}: expected CSV with a header ({str(error).splitlines()[0]})") from None
+        raise BadInputError(f"{path}: expected CSV with a header ({first_line(error)})") from None
     for entry in table.schema:
         if pa.types.is_string(entry.type) and (wrong := _no_number(table[entry.name].to_pylist())):
             raise BadInputError(

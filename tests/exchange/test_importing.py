@@ -10,6 +10,7 @@ from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
 from astra_data.exchange.cutting import Cutter
+from astra_data.exchange.importing import import_dataset
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -140,3 +141,13 @@ def test_an_episode_that_does_not_fit_into_memory_is_told(
     monkeypatch.setattr(Cutter, "finish", none_left)
     with pytest.raises(BadInputError, match=r"does not fit into memory \(Unable to .*\[split\]"):
         imported(tmp_path, write_table(tmp_path / "log.npz", rows()))
+
+
+def test_a_refused_import_leaves_no_folder_of_its_name(tmp_path: Path) -> None:
+    fields = rows()
+    fields["x"][3] = np.nan
+    log = write_table(tmp_path / "log.csv", fields)
+    (tmp_path / "mapping.toml").write_text(MAPPING)
+    with pytest.raises(BadInputError, match="not finite"):
+        import_dataset([log], tmp_path / "mapping.toml", out=tmp_path / "home/walks/data-1.0.0")
+    assert not (tmp_path / "home/walks").exists()
