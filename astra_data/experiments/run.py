@@ -282,5 +282,5 @@ def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str |
 
     selected = [item for item in items if is_asked_for(item.key)]
     if not selected:
-        raise BadInputError(f"{method or 'no method of the recipe'} has no stage '{stage}'")
+        raise BadInputError(f"{method or 'the recipe'} has no stage '{stage}'")
     return selected
