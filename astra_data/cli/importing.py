@@ -9,13 +9,14 @@ from astra_data.cli.arguments import Out
 
 Recordings = Annotated[
     list[Path],
-    typer.Argument(metavar="SOURCE...", help="Files, folders or archives of one format.", show_default=False),
+    typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.", show_default=False),
 ]
 MappingFile = Annotated[
     Path | None,
     typer.Option(
         "--mapping",
-        help="TOML file: which fields become which columns. D4RL, robomimic and Minari need none.",
+        help="TOML file: which fields become which columns. D4RL, robomimic, d3rlpy, Minari and PACE "
+        "need none.",
         show_default=False,
     ),
 ]
@@ -50,7 +51,7 @@ def import_(
     task: Task = None,
     max_bytes: MaxBytes = None,
 ) -> None:
-    """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON) to a dataset."""
+    """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
     from astra_data.exchange.importing import import_dataset
 
     report = import_dataset(
