@@ -108,7 +108,10 @@ def import_dataset(
     first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
-        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes ({losses(cutter.tally)})")
+        raise BadInputError(
+            f"{', '.join(map(str, recordings))}: no episodes, "
+            f"each of which needs two rows where logs have no next states ({losses(cutter.tally)})"
+        )
     description = {
         "name": settings.name,
         "version": settings.version,
