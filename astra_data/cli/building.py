@@ -71,7 +71,7 @@ Plan = Annotated[
     typer.Option(help="Planned episodes to record: plan.json of `astra-data suggest`.", show_default=False),
 ]
 Name = Annotated[
-    str | None, typer.Option(help="Name of the dataset.", show_default="task, behaviour and seed")
+    str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted call of the same command.")]
 

@@ -43,7 +43,10 @@ def validate(
 
 def repair(
     folder: Annotated[
-        Path, typer.Argument(help="The folder of a LeRobot dataset; it is not changed.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="The folder of a LeRobot dataset; it is not changed.", show_default=False
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
     like: Annotated[

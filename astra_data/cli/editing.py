@@ -75,7 +75,7 @@ def merge(
     datasets: Annotated[
         list[str],
         typer.Argument(
-            metavar="DATASET...",
+            metavar="DATASET",
             help="Two or more, with equal columns, fps, task, environment and simulator.",
         ),
     ],

@@ -9,14 +9,14 @@ from astra_data.cli.arguments import Out
 
 Recordings = Annotated[
     list[Path],
-    typer.Argument(metavar="SOURCE...", help="Files, folders or archives of one format.", show_default=False),
+    typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.", show_default=False),
 ]
 MappingFile = Annotated[
     Path | None,
     typer.Option(
         "--mapping",
-        help="TOML file: which fields become which columns. D4RL, robomimic, d3rlpy, Minari and PACE need "
-        "none.",
+        help="TOML file: which fields become which columns. D4RL, robomimic, d3rlpy, Minari and PACE "
+        "need none.",
         show_default=False,
     ),
 ]

@@ -57,11 +57,13 @@ def inspect(
 def list_(
     folders: Annotated[
         list[Path] | None,
-        typer.Argument(help="Further folders to --clean, such as runs.", show_default=False),
+        typer.Argument(
+            metavar="FOLDER", help="Further folders to --clean, such as runs.", show_default=False
+        ),
     ] = None,
     clean: Annotated[
         bool,
-        typer.Option("--clean", help="Remove instead what killed commands left at home and in FOLDERS."),
+        typer.Option("--clean", help="Remove instead what killed commands left at home and in FOLDER."),
     ] = False,
 ) -> None:
     """List the datasets at home and their versions."""
@@ -73,16 +75,26 @@ def list_(
     from rich.console import Console
     from rich.table import Table
 
+    from astra_data.core.errors import CorruptDatasetError
     from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
 
+    faults: list[str] = []
     table = Table("dataset", "stage", "episodes", "steps", "content", title=str(home()))
     for name in names_at_home():
         for version in versions_at_home(name):
-            found = open_dataset(f"{name}@data-{version}")
+            reference = f"{name}@data-{version}"
+            try:
+                found = open_dataset(reference)
+            except CorruptDatasetError as error:
+                table.add_row(reference, "damaged", "", "", "")
+                faults.append(str(error))
+                continue
             steps = int(found.lengths.sum())
             facts = (found.description["stage"], f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
             table.add_row(found.reference, *facts)
     Console().print(table)
+    if faults:
+        raise CorruptDatasetError("\n".join(faults))
 
 
 def _clean(folders: list[Path]) -> None:
@@ -94,6 +106,8 @@ def _clean(folders: list[Path]) -> None:
         "in use": ": another command is writing it",
         "kept": ": the command that was interrupted goes on with it, or delete it",
     }
+    if missing := [str(folder) for folder in folders if not folder.is_dir()]:
+        raise BadInputError(f"list --clean: expected folders, got {', '.join(missing)}")
     found = dict(item for folder in (home(), *folders) for item in clean(folder))
     for path, state in found.items():
         typer.echo(f"{state}: {path}{notes[state]}")

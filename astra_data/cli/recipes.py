@@ -12,7 +12,7 @@ from astra_data.core.errors import AstraDataError, BadInputError
 RecipePath = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="A recipe, a TOML file.", show_default=False)
 ]
-RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE...", help="Recipes, TOML files.")]
+RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE", help="Recipes, TOML files.")]
 Method = Annotated[str | None, typer.Option(help="Only this row of the recipe.", show_default=False)]
 Seeds = Annotated[
     list[int] | None,

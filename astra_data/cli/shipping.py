@@ -24,8 +24,10 @@ def list_() -> None:
 
 @app.command()
 def copy(
-    name: Annotated[str, typer.Argument(help="Of a recipe that `recipes list` shows.", show_default=False)],
-    folder: Annotated[Path, typer.Argument(help="Where to.")] = Path("recipes"),
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Of a recipe that `recipes list` shows.", show_default=False)
+    ],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to.")] = Path("recipes"),
 ) -> None:
     """Copy a recipe, with the recipe that it is based on and the code of its task."""
     from astra_data.experiments.shipped import copy_recipe, shipped

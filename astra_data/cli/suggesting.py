@@ -22,7 +22,7 @@ def suggest(
         int | None, typer.Option(help="Length of an episode, in steps.", min=1, show_default="the recipe's")
     ] = None,
     proposals: Annotated[int, typer.Option(help="Episodes to choose from.", min=2)] = 2000,
-    output: Annotated[
+    out: Annotated[
         Path | None, typer.Option(help="A new folder.", show_default="suggest in that of the run")
     ] = None,
     root: Root = RUNS,
@@ -38,9 +38,7 @@ def suggest(
     given |= {} if max_steps is None else {"max_steps": max_steps}
     torch.set_num_threads(1)
     with shown("suggest") as progress:
-        folder, found, task = write(
-            run, row=row, seed=seed, out=output, root=root, progress=progress, **given
-        )
+        folder, found, task = write(run, row=row, seed=seed, out=out, root=root, progress=progress, **given)
     expected = found.rollouts.expected.sum(0)
     nats, average = expected[found.taken].mean(), expected.mean()
     number = f"{len(found.taken)} of {len(expected)}"

@@ -11,7 +11,7 @@ def tasks(
     task: Annotated[
         str | None,
         typer.Argument(
-            metavar="[TASK]",
+            metavar="TASK",
             help="Walk through this one, by name or place, cart.py:TASK, and name what is wrong with it.",
             show_default=False,
         ),

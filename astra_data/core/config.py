@@ -160,6 +160,9 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{key}: expected a value, but the key is missing"
     if kind == "value_error":
         return f"{key}: {message.removeprefix('Value error, ')}"
+    if kind == "too_short":
+        least, got = error["ctx"]["min_length"], error["ctx"]["actual_length"]
+        return f"{key}: expected {least} or more, got {got or 'none'}"
     expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
     if expected == message:
         return f"{key}: {message[0].lower()}{message[1:]}"
@@ -180,6 +183,8 @@ def _choice_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str
 
 def _key_hint(key: str, section: type[BaseModel] | None, model: type[BaseModel]) -> str:
     fields = list(section.model_fields) if section else []
+    if section is not model and key in model.model_fields:
+        return f": '{key}' belongs to no table: move it above the first [table]"
     if get_close_matches(key, fields):
         return did_you_mean(key, fields)
     elsewhere = {dotted.rpartition(".")[2]: dotted for dotted in _dotted_keys(model)}

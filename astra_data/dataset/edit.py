@@ -237,6 +237,10 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
     if key == "success" and (successes := source.successes()) is not None:
         return successes
     if key not in source.metadata:
+        if key in ("success", "return"):
+            raise BadInputError(
+                f"the episodes of {source.reference} have no {key!r}: compute it by `astra-data label --task`"
+            )
         known = ["length", *source.metadata]
         raise BadInputError(f"the episodes of {source.reference} have no {key!r}{did_you_mean(key, known)}")
     return source.metadata[key]

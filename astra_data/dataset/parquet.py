@@ -113,9 +113,15 @@ def read_arrays(
         yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
 
 
+_LONGEST = 300
+"""Characters of an error message of a library that are shown."""
+
+
 def first_line(error: Exception) -> str:
-    """Return the first sentence of an error message."""
-    return str(error).split("\n")[0].split(". ")[0].rstrip(".")
+    """Return the first sentence of an error message, of bounded length and printable."""
+    line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
+    shown = "".join(sign if sign.isprintable() else "\ufffd" for sign in line)
+    return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}…"
 
 
 class RotatingWriter:

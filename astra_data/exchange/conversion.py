@@ -13,6 +13,7 @@ from astra_data.exchange.recording import Block
 Mask = NDArray[np.bool_]
 EXACT = 2**53
 """Floats represent whole numbers below this exactly."""
+_KINDS = {"U": "text", "S": "text", "O": "what no number can hold, such as nothing"}
 
 
 class Converter:
@@ -108,7 +109,7 @@ def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]
 def _as_rows(name: str, values: Array, faults: list[str]) -> Array:
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
-        faults.append(f"field '{name}': expected numbers, got {array.dtype}")
+        faults.append(f"field '{name}': expected numbers, got {_KINDS.get(array.dtype.kind, array.dtype)}")
     elif 0 in array.shape:
         faults.append(f"field '{name}' has no values, its shape is {array.shape}")
     return array.reshape(len(array), -1)

@@ -12,6 +12,7 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
+from astra_data.dataset.parquet import first_line
 
 BLOCK_ROWS = 2**13
 """Rows that an importer reads at once, if the format allows it."""
@@ -141,7 +142,7 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
         with tarfile.open(archive) as opened:
             members = [member for member in opened if not member.isdir()]
     except (tarfile.TarError, OSError, EOFError, ValueError, ArithmeticError) as error:
-        raise BadInputError(f"{archive} cannot be read as an archive: {error}") from error
+        raise BadInputError(f"{archive} cannot be read as an archive: {first_line(error)}") from error
     faults = []
     for member in members:
         path = PurePosixPath(member.name)
@@ -165,7 +166,11 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     Raises:
         BadInputError: lists the fields that are missing or have no rows, and differing numbers of rows.
     """
-    faults = [f"no field '{field}'{did_you_mean(field, shapes)}" for field in fields if field not in shapes]
+    hints = {field: did_you_mean(field, shapes) for field in fields if field not in shapes}
+    if len(hints) > 1 and len(set(hints.values())) == 1:  # all are listed, once
+        faults = [f"no fields {', '.join(map(repr, hints))}{next(iter(hints.values()))}"]
+    else:
+        faults = [f"no field '{field}'{hint}" for field, hint in hints.items()]
     found = {field: shapes[field] for field in fields if field in shapes}
     faults += [f"field '{field}' is a single value, expected rows" for field in found if not found[field]]
     lengths = {field: shape[0] for field, shape in found.items() if shape}

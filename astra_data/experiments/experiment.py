@@ -212,6 +212,10 @@ def load_experiment(path: Path, root: Path) -> Experiment:
 def _tables(path: Path) -> dict[str, Any]:
     """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
     tables = with_current_keys(load_tables(path), path)
+    if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
+        raise RecipeError(
+            f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
+        )
     task, data = tables.get("task"), tables.get("data")
     if isinstance(task, str):
         tables["task"] = place_beside(task, path.parent)

@@ -47,7 +47,7 @@ class ShippedRecipe:
 
     @property
     def files(self) -> set[Path]:
-        """The files that it needs, below `RECIPES`: with what it is based on, code and mappings."""
+        """The files that it needs, below `RECIPES`: its base, code, mappings, and what its head names."""
         files = {self.path}
         if base := self.table.get("based_on"):
             files |= shipped(base).files
@@ -57,6 +57,9 @@ class ShippedRecipe:
             if place.is_file():
                 files.add(place.resolve().relative_to(RECIPES))
                 folders.append(place.resolve().parent)
+        text = (RECIPES / self.path).read_text().partition("\n\n")[0]
+        named = {Path(name) for name in re.findall(r"recipes/(\S+\.(?:py|toml))", text)}
+        files |= {path for path in named if (RECIPES / path).is_file()}
         return files | {code.relative_to(RECIPES) for folder in folders for code in folder.glob("*.py")}
 
 

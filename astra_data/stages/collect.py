@@ -1,4 +1,4 @@
-"""Collect: record a behaviour in the target environment as a LeRobot dataset."""
+"""Collect: record a behavior in the target environment as a LeRobot dataset."""
 
 import time
 from functools import partial
@@ -44,7 +44,7 @@ MOST_STEPS = 10**10
 
 
 class CollectConfig(Config):
-    """What to collect; the paper uses 200 episodes of random behaviour of up to 500 steps."""
+    """What to collect; the paper uses 200 episodes of random behavior of up to 500 steps."""
 
     behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac", "planned"] = "random"
     """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": at the bounds, often
@@ -53,7 +53,7 @@ class CollectConfig(Config):
     episodes: Count = 200
     """Episodes in all; with `least_steps` at most; of a plan at most as many as it has, its first ones."""
     least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
-    """Only as many episodes as have these steps together, so that datasets of different behaviours are of one
+    """Only as many episodes as have these steps together, so that datasets of different behaviors are of one
     size."""
     max_steps: Count = 500
     """Longest episode, in control steps; longer ones are truncated. A plan has its own."""
@@ -127,11 +127,11 @@ def collect(
         out: the dataset's folder, by default its place at home.
         progress: called with the fraction done.
         num_threads: of the physics.
-        name: of the dataset, by default made of task, behaviour and seed.
+        name: of the dataset, by default made of task, behavior and seed.
         resume: keep the finished episodes of an interrupted call and record the rest.
 
     Raises:
-        BadInputError: the task is unknown, `out` exists, or an artefact of the behaviour is missing.
+        BadInputError: the task is unknown, `out` exists, or an artefact of the behavior is missing.
     """
     world = task_named(task)
     plan = None if config.plan is None else Plan.load(config.plan, world)
@@ -241,7 +241,7 @@ def _behavior(
     num_threads: int | None,
     progress: Progress,
 ) -> tuple[Behavior, dict[str, Any]]:
-    """Return the behaviour and its metadata; a policy trained for it is stored in the dataset."""
+    """Return the behavior and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         return _random(task, config, commands), {}
     if config.behavior.startswith("suboptimal"):

@@ -32,6 +32,10 @@ def load_gap_recipe(recipe_path: Path) -> GapRecipe:
     Raises:
         RecipeError: the recipe has faults, or the mapping is missing.
     """
+    if {"methods", "based_on"} & load_tables(recipe_path).keys() and not is_gap_recipe(recipe_path):
+        raise RecipeError(
+            f"{recipe_path}: expected a recipe for `astra-data gap`, got one for `astra-data run`"
+        )
     recipe = load_recipe(recipe_path, GapRecipe)
     mapping = recipe_path.parent / recipe.mapping
     if not mapping.is_file():
@@ -71,7 +75,8 @@ def measure_gap(
     recipe = load_gap_recipe(recipe_path)
     unknown = sorted(set(seeds) - set(recipe.seeds))
     if unknown:
-        raise BadInputError(f"the recipe has no seed {', '.join(map(str, unknown))}; it has {recipe.seeds}")
+        listed, known = (", ".join(map(str, seeds)) for seeds in (unknown, recipe.seeds))
+        raise BadInputError(f"the recipe has no seed {listed}; its seeds: {known}")
     if seeds:
         recipe = recipe.model_copy(update={"seeds": tuple(dict.fromkeys(seeds))})
     name = recipe_path.stem

@@ -50,10 +50,13 @@ class Plan(Config):
         """
         try:
             plan = cls.model_validate_json(Path(path).read_bytes())
-        except (OSError, ValidationError) as error:
-            first = str(error).splitlines()[0]
+        except OSError as error:
+            raise BadInputError(f"{path} cannot be read as a plan: {error.strerror}") from None
+        except ValidationError as error:
+            fault = error.errors(include_url=False)[0]
+            place = ".".join(map(str, fault["loc"])) or "the file"
             raise BadInputError(
-                f"{path}: expected a plan as `astra-data suggest` writes it: {first}"
+                f"{path}: expected a plan as `astra-data suggest` writes it: {place}: {fault['msg']}"
             ) from None
         expected = names_of(task)
         if (plan.start_names, plan.command_names) != expected or plan.timestep_s != task.timestep_s:
@@ -93,14 +96,14 @@ class Plan(Config):
 
 
 class PlannedCommands:
-    """A behaviour that plays commands whatever the robot does."""
+    """A behavior that plays commands whatever the robot does."""
 
     def __init__(self, action: Tensor) -> None:
         """Play `action` (T, B, A) of ±1."""
         self._action = action
 
     def of(self, rows: range) -> "PlannedCommands":
-        """Return the behaviour of the episodes `rows` alone."""
+        """Return the behavior of the episodes `rows` alone."""
         return PlannedCommands(self._action[:, rows.start : rows.stop])
 
     def start(self, count: int, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Recording episodes of a behaviour in the target."""
+"""Recording episodes of a behavior in the target."""
 
 import time
 

@@ -32,7 +32,7 @@ _SAC_SIZES = (256, 256)
 """Hidden layers of actor and critics."""
 
 type Metadata = dict[str, Any]
-"""What a dataset records about the behaviour."""
+"""What a dataset records about the behavior."""
 
 _TRIALS = 32
 """Test episodes after each iteration."""
@@ -121,7 +121,7 @@ def _train(
         share, note = judge(learner.iterate())
         logbook.points.append({"steps": learner.steps, "share": share})
         rate = learner.steps / logbook.stopwatch.seconds
-        progress(min(1.0, share), f"training the behaviour: {rate:,.0f} steps/s  {note}")
+        progress(min(1.0, share), f"training the behavior: {rate:,.0f} steps/s  {note}")
         if logbook.is_due or share >= 1.0:
             logbook.keep({"learner": learner.state_dict(), "world": world.state_dict()})
     return logbook.stopwatch.spent()

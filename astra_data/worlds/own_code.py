@@ -17,6 +17,7 @@ from astra_data.core.errors import AstraDataError, BadInputError
 
 _PREFIX = "astra_data_own_"
 """Of the names of modules that are files of the user's."""
+_PACKAGE = Path(__file__).parents[1]
 
 
 def is_own_code(name: str) -> bool:
@@ -123,6 +124,8 @@ def _own_names(module: ModuleType) -> list[str]:
 
 
 def _of_package(name: str) -> ModuleType:
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise BadInputError(f"{name}: expected a Python file, such as cart.py, or a module, package.module")
     with explained(f"importing {name}"):
         return importlib.import_module(name)
 
@@ -138,13 +141,25 @@ def explained(what: str) -> Iterator[None]:
         yield
     except AstraDataError:
         raise
+    except SystemExit as error:
+        raise BadInputError(
+            f"{what} ends the program{_place(error)}: expected code that defines things and does not exit, "
+            'such as a script behind `if __name__ == "__main__":`'
+        ) from error
     except Exception as error:
-        raise BadInputError(f"{what} fails with {type(error).__name__}: {error} ({_place(error)})") from error
+        raise BadInputError(f"{what} fails with {type(error).__name__}: {error}{_place(error)}") from error
 
 
-def _place(error: Exception) -> str:
-    """Return the file and line of the user's code at which `error` was raised, or else where it was."""
+def _place(error: BaseException) -> str:
+    """Return the file and line of the user's code at which `error` was raised, or else where it was.
+
+    Nothing is returned where that is this package or the import system, or where the message has it already.
+    """
+    if isinstance(error, SyntaxError):
+        return ""
     own = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
     frames = traceback.extract_tb(error.__traceback__)
     last = next((frame for frame in reversed(frames) if frame.filename in own), frames[-1])
-    return f"{Path(last.filename).name}, line {last.lineno}"
+    if last.filename.startswith("<frozen") or Path(last.filename).is_relative_to(_PACKAGE):
+        return ""
+    return f" ({Path(last.filename).name}, line {last.lineno})"

@@ -78,3 +78,19 @@ def test_what_killed_commands_left_is_removed_on_request(
     staged.rmdir()
     assert call("list", "--clean").output == "nothing was left by killed commands\n"
     assert "folders are for --clean" in str(call("list", str(tmp_path / "runs")).exception)
+
+
+def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path))
+    for name in ("broken", "whole"):
+        write_fake(tmp_path / name / "data-1.0.0")
+    (tmp_path / "broken/data-1.0.0/meta/info.json").write_text("{")
+    result = call("list")
+    assert isinstance(result.exception, AstraDataError)
+    assert "broken/data-1.0.0 is incomplete or was altered" in str(result.exception)
+    assert result.output.count("@data-1.0.0") == 2 and "damaged" in result.output
+
+
+def test_a_folder_to_clean_that_is_not_there_is_told(tmp_path: Path) -> None:
+    result = call("list", "--clean", str(tmp_path / "nowhere"))
+    assert str(result.exception) == f"list --clean: expected folders, got {tmp_path / 'nowhere'}"

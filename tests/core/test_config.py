@@ -127,3 +127,10 @@ def test_hostile_toml_is_one_line(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(RecipeError, match=told) as error:
         load_recipe(path, Experiment)
     assert "\n" not in str(error.value)
+
+
+def test_a_key_that_stands_below_a_table_by_mistake_is_told_where_it_belongs(tmp_path: Path) -> None:
+    told = fault(tmp_path, 'task = "maze"\n[train]\nseeds = [1]\n')
+    assert (
+        told == "FILE: train.seeds: unknown key: 'seeds' belongs to no table: move it above the first [table]"
+    )

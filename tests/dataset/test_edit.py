@@ -146,7 +146,7 @@ def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) ->
         filter_episodes(forty, min_length=100, out=tmp_path / "set")
     with writer(tmp_path / "bare") as open_writer:
         open_writer.add(fake_episode(1, 3).__class__(1, fake_episode(1, 3).columns))
-    with pytest.raises(BadInputError, match="have no 'return'"):
+    with pytest.raises(BadInputError, match="have no 'return': compute it by `astra-data label --task`"):
         filter_episodes(Dataset.open(tmp_path / "bare"), min_return=0, out=tmp_path / "set")
 
 

@@ -71,7 +71,12 @@ def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
         ({"take": (2,)}, [[1, 2]], r"take \[2\]: f hold 2 values, counted from 0"),
         ({"scale": (1.0, 2.0, 3.0)}, [[1, 2]], "scale has 3 numbers for 2 values"),
         ({"offset": (1.0, 2.0)}, [1], "offset has 2 numbers for 1 values"),
-        ({}, ["a"], "field 'f': expected numbers, got <U1"),
+        ({}, ["a"], "field 'f': expected numbers, got text$"),
+        (
+            {},
+            np.array([1, None]),
+            "field 'f': expected numbers, got what no number can hold, such as nothing",
+        ),
         ({}, np.zeros((2, 0)), r"field 'f' has no values, its shape is \(2, 0\)"),
     ],
 )

@@ -146,3 +146,13 @@ def test_an_episode_that_does_not_fit_into_memory_is_told(
     monkeypatch.setattr(Cutter, "finish", none_left)
     with pytest.raises(BadInputError, match=r"does not fit into memory \(Unable to .*\[split\]"):
         imported(tmp_path, write_table(tmp_path / "log.npz", rows()))
+
+
+def test_a_refused_import_leaves_no_folder_of_its_name(tmp_path: Path) -> None:
+    fields = rows()
+    fields["x"][3] = np.nan
+    log = write_table(tmp_path / "log.csv", fields)
+    (tmp_path / "mapping.toml").write_text(MAPPING)
+    with pytest.raises(BadInputError, match="not finite"):
+        import_dataset([log], tmp_path / "mapping.toml", out=tmp_path / "home/walks/data-1.0.0")
+    assert not (tmp_path / "home/walks").exists()

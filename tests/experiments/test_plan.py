@@ -193,7 +193,7 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
             HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
             "recipe: sweep.percent: 5 % of 9 episodes are none: expected more",
         ),
-        (HEAD.replace("[0, 7]", "[]"), "seeds: tuple should have at least 1 item after validation, not 0"),
+        (HEAD.replace("[0, 7]", "[]"), "seeds: expected 1 or more, got none"),
     ],
 )
 def test_faults_are_told(tmp_path: Path, fake_recipe: type[Recipe], text: str, expected: str) -> None:

@@ -58,6 +58,7 @@ def test_a_copy_brings_nothing_but_what_is_needed(tmp_path: Path) -> None:
     assert copied("nao_real") == ["imports/nao_guda.toml", "nao_real.toml"]
     assert copied("quickstart") == ["examples/cart/cart.py", "examples/cart/robot.py", "quickstart.toml"]
     assert "examples/cart/robot.py" in copied("methods")
+    assert "examples/cart/logs.toml" in copied("cart")  # its head names it
     for path in (tmp_path / "quickstart").rglob("*.*"):
         assert path.read_bytes() == (RECIPES / path.relative_to(tmp_path / "quickstart")).read_bytes()
 

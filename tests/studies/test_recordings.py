@@ -71,5 +71,5 @@ def test_nothing_usable_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"found none: it has no datasets, no archives"):
         read_recordings(tmp_path, MAPPING, tmp_path / "home", CONFIG)
     (tmp_path / "other.json").write_text('{"speed": [1, 2]}')
-    with pytest.raises(BadInputError, match="no field 'observations'"):
+    with pytest.raises(BadInputError, match="no fields 'observations', 'actions'; known: speed"):
         read_recordings(tmp_path, MAPPING, tmp_path / "home", CONFIG)

@@ -103,3 +103,17 @@ def test_a_gap_recipe_is_checked(recipe: Path) -> None:
     assert call()[0] == 1 and "fit.update: unknown key: did you mean 'updates'?" in call()[1]
     recipe.write_text(RECIPE.replace("nao_guda.toml", "nowhere.toml"))
     assert call()[0] == 1 and "expected a file of `astra-data import`" in call()[1]
+
+
+def test_a_recipe_for_run_is_told_from_others(tmp_path: Path) -> None:
+    path = tmp_path / "walks.toml"
+    path.write_text('task = "antmaze-umaze"\nmethods = ["nas"]\nseeds = [0]\n')
+    with pytest.raises(
+        RecipeError, match="expected a recipe for `astra-data gap`, got one for `astra-data run`"
+    ):
+        measure_gap(path, tmp_path)
+
+
+def test_seeds_of_a_recipe_are_listed(recipe: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"the recipe has no seed 9; its seeds: \d"):
+        measure_gap(recipe, tmp_path / "logs", seeds=[9], root=tmp_path / "runs")

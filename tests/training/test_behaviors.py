@@ -74,7 +74,7 @@ def test_each_axis_of_a_command_is_drawn_by_itself() -> None:
 
 
 def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
-    """Return the commands (steps, B, A) of a behaviour that was started."""
+    """Return the commands (steps, B, A) of a behavior that was started."""
     return torch.stack([behavior.act(torch.zeros(200, 47), torch.zeros(200, 0)) for _ in range(steps)])
 
 

@@ -48,7 +48,7 @@ def test_they_are_played_step_by_step_and_again_from_the_start() -> None:
         ({"timestep_s": 0.2}, r"plan for rail-cart.*0\.1 s of rail-cart"),
         ({"command_names": ["w"]}, r"\('w',\).*expected \('x',\), \('v',\)"),
         ({"start_names": ["y"]}, r"\('y',\).*expected \('x',\), \('v',\)"),
-        ({"episodes": []}, "expected a plan as `astra-data suggest` writes it"),
+        ({"episodes": []}, r"expected a plan as `astra-data suggest` writes it: episodes: .*at least 1"),
         (
             {"episodes": [{"start": [0.0, 1.0], "commands": [[0.0]], "hold_steps": [1]}]},
             "episode 0: .* of 1 val",
@@ -69,5 +69,5 @@ def test_a_plan_of_another_robot_is_refused(tmp_path: Path, changed: dict[str, o
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"nowhere\.json: expected a plan"):
+    with pytest.raises(BadInputError, match=r"nowhere\.json cannot be read as a plan: No such file"):
         Plan.load(tmp_path / "nowhere.json", TASK)

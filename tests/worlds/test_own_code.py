@@ -109,3 +109,24 @@ def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) 
     told = r"^rolling fails with ValueError: .* \(wheel.py, line 5\)$"
     with pytest.raises(BadInputError, match=told), explained("rolling"):
         roll()
+
+
+def test_a_file_that_exits_is_an_error_and_not_an_end(tmp_path: Path) -> None:
+    file = tmp_path / "script.py"
+    file.write_text("import sys\nsys.exit(0)\n")
+    with pytest.raises(BadInputError, match=r"importing .*script.py ends the program \(script.py, line 2\)"):
+        own_object(f"{file}:TASK")
+
+
+def test_a_place_is_named_once_and_only_where_it_is_the_users(tmp_path: Path) -> None:
+    file = tmp_path / "wrong.py"
+    file.write_text("clas Cart:\n")
+    with pytest.raises(BadInputError, match=r"SyntaxError: .* \(wrong.py, line 1\)$"):
+        own_object(f"{file}:TASK")
+    with pytest.raises(BadInputError, match=r"No module named 'no'$"):
+        own_object("no.such:TASK")
+
+
+def test_a_file_of_another_kind_is_no_module(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"cart.csv: expected a Python file"):
+        own_object(f"{tmp_path / 'cart.csv'}:TASK")

@@ -81,8 +81,10 @@ def repair(
 
     Raises:
         CorruptDatasetError: meta/info.json is missing, or no episode is intact.
-        BadInputError: `out` exists, or episodes cannot be joined with `like`.
+        BadInputError: there is no `folder`, `out` exists, or episodes cannot be joined with `like`.
     """
+    if not folder.is_dir():
+        raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")
     info = read_object(folder / INFO_PATH)
     if isinstance(info, str):
         raise CorruptDatasetError(f"{folder}: {INFO_PATH} {info}; without it columns and fps are unknown")

@@ -13,6 +13,8 @@ from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block, Source, row_count
 
 SUFFIXES = (".csv", ".tsv")
+_MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
+_LONGEST_HEADER = 2**20
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -46,8 +48,15 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def _checked(source: Source, mapping: ImportMapping) -> list[str]:
+    delimiter, mark = ("\t", "tabs") if str(source).endswith(".tsv") else (",", "commas")
     with source.open() as stream:
-        delimiter = "\t" if str(source).endswith(".tsv") else ","
+        first = stream.readline(_LONGEST_HEADER).decode("utf-8", "replace")
+    if delimiter not in first and (others := [name for part, name in _MARKS.items() if part in first]):
+        raise BadInputError(
+            f"{source}: expected fields parted by {mark}, got {others[0]} in its header: "
+            "write it with commas, or with tabs as .tsv"
+        )
+    with source.open() as stream:
         options = csv.ParseOptions(delimiter=delimiter)
         header = csv.open_csv(stream, parse_options=options).schema.names
     row_count(str(source), mapping.all_fields, dict.fromkeys(header, (0,)))

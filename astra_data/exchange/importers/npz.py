@@ -32,7 +32,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             for field in mapping.all_fields
             if field in known
         }
-        headers = {field: _header(file) for field, file in files.items()}
+        headers = {field: _header(file, source) for field, file in files.items()}
         shapes = {field: (0,) for field in known} | {field: shape for field, (shape, _) in headers.items()}
         n = row_count(str(source), mapping.all_fields, shapes)
         for first in range(0, n, BLOCK_ROWS):
@@ -44,12 +44,12 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             yield Block(values, str(source))
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _header(file: IO[bytes], source: Source) -> tuple[tuple[int, ...], np.dtype[Any]]:
     version = npy.read_magic(file)  # type: ignore[no-untyped-call]
     read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, is_fortran, dtype = read_header(file)  # type: ignore[no-untyped-call]
     if dtype.hasobject:
-        raise BadInputError(f"{file.name}: holds Python objects, which are never unpickled")
+        raise BadInputError(f"{source}: {file.name} holds Python objects, which are never unpickled")
     if is_fortran and len(shape) > 1:
         raise BadInputError(f"{file.name}: rows are not consecutive; save np.ascontiguousarray of it")
     return shape, dtype

@@ -347,3 +347,8 @@ def test_new_uids_alone_keep_the_metadata(tmp_path: Path) -> None:
     whole = write_fake(tmp_path / "set")
     repair(whole.root, out=tmp_path / "saved", new_uids=True)
     assert Dataset.open(tmp_path / "saved").metadata == whole.metadata
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"nowhere: expected the folder of a dataset, got no folder"):
+        repair(tmp_path / "nowhere", out=tmp_path / "out")

@@ -79,3 +79,22 @@ def test_the_text_among_numbers_is_quoted(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows() | {"x": np.array(["0.5", "abc"] + ["1.5"] * 18)})
     with pytest.raises(BadInputError, match=r"field 'x' and below: expected numbers.*'abc'"):
         imported(tmp_path, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "mark", "told"),
+    [("log.csv", ";", "commas, got semicolons"), ("log.tsv", ",", "tabs, got commas")],
+)
+def test_another_separator_is_told(tmp_path: Path, name: str, mark: str, told: str) -> None:
+    log = tmp_path / name
+    log.write_text("x;y;command\n1,5;2;3\n".replace(";", mark))
+    with pytest.raises(BadInputError, match=rf"{name}: expected fields parted by {told} in its header"):
+        imported(tmp_path, log)
+
+
+def test_fields_of_a_log_without_names_are_listed_once(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("10,20,30\n1,2,3\n")
+    with pytest.raises(BadInputError) as caught:
+        imported(tmp_path, log)
+    assert str(caught.value).count("known: 10, 20, 30") == 1

@@ -17,7 +17,7 @@ from astra_data.exchange.recording import Source
 def test_npz_is_never_unpickled(tmp_path: Path) -> None:
     with (tmp_path / "log.npz").open("wb") as file:
         np.savez(file, **rows() | {"reward": np.array([{}] * 20)})  # type: ignore[arg-type]
-    with pytest.raises(BadInputError, match=r"reward\.npy: holds Python objects"):
+    with pytest.raises(BadInputError, match=r"\.npz: reward\.npy holds Python objects"):
         imported(tmp_path, tmp_path / "log.npz")
 
 
