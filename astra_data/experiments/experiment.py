@@ -15,20 +15,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import did_you_mean, load_tables, validated
+from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import base_method, is_plus
-from astra_data.dataset.format import INFO_PATH
 from astra_data.experiments.own_files import changed_code
-from astra_data.experiments.own_methods import looked_up
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
-from astra_data.experiments.renamed import with_current_keys
+from astra_data.experiments.recipe_file import read_tables
 from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
 from astra_data.stages.registry import STAGES
-from astra_data.worlds.own_code import place_beside
 from astra_data.worlds.registry import task_named
 
 ALWAYS_NEW = {"report"}
@@ -191,7 +188,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     Raises:
         RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
     """
-    tables = _tables(path)
+    tables = read_tables(path)
     folder = root / path.stem
     if "based_on" not in tables:
         return Experiment(validated(tables, Recipe, str(path)), path, folder)
@@ -200,30 +197,13 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     if name not in known:
         raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
     base_path = path.with_name(f"{name}.toml")
-    base_tables = _tables(base_path)
+    base_tables = read_tables(base_path)
     if "based_on" in base_tables:
         raise RecipeError(f"{path}: based_on: expected a recipe that is based on none itself, got '{name}'")
     base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)
     recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
     _check_fit(recipe, base, path)
     return Experiment(recipe, path, folder, base)
-
-
-def _tables(path: Path) -> dict[str, Any]:
-    """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
-    tables = with_current_keys(load_tables(path), path)
-    if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
-        raise RecipeError(
-            f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
-        )
-    task, data = tables.get("task"), tables.get("data")
-    if isinstance(task, str):
-        tables["task"] = place_beside(task, path.parent)
-    if isinstance(own := tables.get("own_methods"), dict):
-        tables["own_methods"] = looked_up(own, path.parent)
-    if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
-        tables["data"] = str(path.parent / data)
-    return tables
 
 
 def _reads(row: str, table: str) -> bool:

@@ -1,0 +1,61 @@
+"""The file of a recipe: its tables, with keys that were renamed since under their names of today."""
+
+import sys
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.config import load_tables
+from astra_data.core.errors import RecipeError
+from astra_data.dataset.format import INFO_PATH
+from astra_data.experiments.own_methods import looked_up
+from astra_data.training.build_env import RENAMED
+from astra_data.worlds.own_code import place_beside
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it.
+
+    Raises:
+        RecipeError: it cannot be read, is a recipe of `gap`, or has a key by two names.
+    """
+    tables = _with_current_keys(load_tables(path), path)
+    if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
+        raise RecipeError(
+            f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
+        )
+    task, data = tables.get("task"), tables.get("data")
+    if isinstance(task, str):
+        tables["task"] = place_beside(task, path.parent)
+    if isinstance(own := tables.get("own_methods"), dict):
+        tables["own_methods"] = looked_up(own, path.parent)
+    if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
+        tables["data"] = str(path.parent / data)
+    return tables
+
+
+def _with_current_keys(tables: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return the `tables` of the recipe at `path` with renamed keys under their current names.
+
+    A message on standard error says so, once for each key.
+
+    Raises:
+        RecipeError: a table has a key by both names.
+    """
+    current = dict(tables)
+    for name, table in tables.items():
+        for old, new in RENAMED.items():
+            if isinstance(table, dict) and old in table:
+                if new in table:
+                    raise RecipeError(
+                        f"{path}: {name} has both {old} and {new}, its current name: remove {old}"
+                    )
+                current[name] = {new if key == old else key: value for key, value in table.items()}
+                _say(f"{path}: {name}.{old} is now called {new}: please rename it")
+    return current
+
+
+@cache
+def _say(message: str) -> None:
+    print(message, file=sys.stderr)
