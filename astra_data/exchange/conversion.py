@@ -87,7 +87,9 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
     lists: dict[str, Sequence[str]] = {"unit": spec.unit, "frame": spec.frame, "role": spec.role}
     astra = {key: list(words) * (size if len(words) == 1 else 1) for key, words in lists.items() if words}
     dtype = spec.dtype or ("bool" if name in FLAGS else "float32")
-    return Column(name, dtype, size, spec.names or None, spec.meaning, astra or None)
+    # Fields of one value each name what they hold; `size` tells that none holds more.
+    names = spec.names or (spec.fields if len(spec.fields) == size > 1 and not spec.take else None)
+    return Column(name, dtype, size, names, spec.meaning, astra or None)
 
 
 def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]:

@@ -44,7 +44,7 @@ class ColumnMapping(Config):
     clip: tuple[float, float] | None = None
     """Range to which values are clipped; values that are not finite are rejected, not clipped."""
     names: tuple[str, ...] = ()
-    """A name for each value."""
+    """A name for each value; by default those of the fields, where each has one value."""
     unit: tuple[str, ...] = ()
     """Units after scaling."""
     frame: tuple[str, ...] = ()

@@ -143,6 +143,16 @@ def test_one_unit_holds_for_every_value() -> None:
     assert column_of("c", spec, 2).astra == {"unit": ["m", "m"], "frame": ["world", "body"]}
 
 
+def test_values_are_called_as_their_fields_are_unless_the_mapping_says() -> None:
+    spec = ColumnMapping(fields=("x", "y"))
+    assert column_of("c", spec, 2).names == ("x", "y")
+    assert column_of("c", spec.model_copy(update={"names": ("east", "north")}), 2).names == ("east", "north")
+    # A field of several values, or the values that are taken of it, has no name for each.
+    assert column_of("c", spec, 3).names is None
+    assert column_of("c", spec.model_copy(update={"take": (0, 2)}), 2).names is None
+    assert column_of("c", ColumnMapping(fields=("reward",)), 1).names is None
+
+
 @pytest.mark.parametrize("spec", ['fields = ["stamp", "x"]', 'fields = ["stamp"]\nscale = [1.0]'])
 def test_integers_that_become_floats_on_their_way_are_told(tmp_path: Path, spec: str) -> None:
     fields = rows() | {"stamp": np.full(20, 2**60 + 1), "x": np.zeros(20)}
