@@ -4,7 +4,8 @@
     python tools/probe_latents.py runs/antmaze_long --row nas --policies target --episodes 100
 
 The first table has R² on held-out episodes of linear probes from φ(s), from φ(s) with the actions of the last
-steps, and from each row's z, to each entry of the target state that φ drops. The second has the success of
+steps, and from each row's z, to each entry of the target state that φ drops, and to where the way to the goal
+leads. The second has the success of
 each row's policy with its own latents, with those of other robots, drawn anew at every step, and with zeros.
 """
 
@@ -23,11 +24,19 @@ from astra_data.core.seeding import derive
 from astra_data.experiments.trained_policy import load_policy, policy_files, settings_of
 from astra_data.grounding.files import load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.probes import Probed, dropped_values, picking_split, probe, recent_actions
+from astra_data.grounding.probes import (
+    Probed,
+    dropped_values,
+    picking_split,
+    probe,
+    recent_actions,
+    way_to_goal,
+)
 from astra_data.methods import grounded_as
 from astra_data.training.altered_latents import ALTERATIONS, AlteredLatents, in_target
 from astra_data.training.own_world import in_simulator, own_world, started
 from astra_data.training.policy_file import PolicyFile
+from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import task_named
 
 
@@ -60,11 +69,15 @@ def main(
 @torch.no_grad()
 def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
     settings = settings_of(run)
-    column = task_named(settings["task"]).state
+    task = task_named(settings["task"])
     paired = PairedEpisodes.load(run / "pair" / place(seed))
     training, held_out = paired.split(settings["ground"]["held_out_share"], seed)
     parts = (*picking_split(training, seed), held_out)
-    values = [dropped_values(column, part) for part in parts]
+    values = [dropped_values(task.state, part) for part in parts]
+    if isinstance(task.objective, Navigation):
+        values = [
+            known | way_to_goal(task.objective, part) for known, part in zip(values, parts, strict=True)
+        ]
     inputs: dict[str, list[Tensor]] = {
         "φ(s)": [part.windows.state for part in parts],
         f"φ(s) and {steps} actions": [recent_actions(part, steps) for part in parts],

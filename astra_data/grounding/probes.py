@@ -8,9 +8,12 @@ from torch import Tensor
 
 from astra_data.dataset.columns import Column
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.worlds.plane.navigation import Navigation
 
 _PENALTIES = torch.logspace(-6, 2, 9, dtype=torch.float64)
 """Of squared weights, in units of the inputs' and values' variance."""
+_STRIDE_M = 0.25
+"""To each side of a position, to see where the way to the goal leads."""
 _PICKING_SHARE = 0.2
 """Share of the training episodes on which the penalty is picked."""
 
@@ -50,6 +53,21 @@ def _turned(quaternion: Tensor) -> dict[str, Tensor]:
         "lean, y": 2 * (y * z + w * x),
         "lean, z": 1 - 2 * (x * x + y * y),
     }
+
+
+def way_to_goal(objective: Navigation, episodes: PairedEpisodes) -> dict[str, Tensor]:
+    """Return where the way to the goal leads: the progress in m of a metre along each axis, (E, T).
+
+    φ(s) holds it, but as no linear function: around corners the way turns.
+    """
+    windows = episodes.windows
+    position, goal = windows.state[..., :2].flatten(0, 1), windows.goal.flatten(0, 1)
+    values = {}
+    for name, axis in (("way, x", (_STRIDE_M, 0.0)), ("way, y", (0.0, _STRIDE_M))):
+        stride = torch.tensor(axis, device=position.device)
+        progress = objective.progress(position - stride, position + stride, goal) / (2 * _STRIDE_M)
+        values[name] = progress.reshape(windows.state.shape[:2])
+    return values
 
 
 def recent_actions(episodes: PairedEpisodes, steps: int) -> Tensor:

@@ -8,7 +8,15 @@ from toy_episodes import toy_episodes
 
 from astra_data.dataset.columns import Column
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.probes import Probed, dropped_values, picking_split, probe, recent_actions
+from astra_data.grounding.probes import (
+    Probed,
+    dropped_values,
+    picking_split,
+    probe,
+    recent_actions,
+    way_to_goal,
+)
+from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import TASKS
 
 STEPS = 2000
@@ -110,3 +118,17 @@ def test_probes_see_real_steps_of_episodes_that_are_not_shared() -> None:
     whole = Probed.of(episodes, episodes.windows.state, {"a": episodes.reward, "b": episodes.windows.mask})
     assert whole.inputs.shape == (28, 4) and whole.inputs.dtype == torch.float64
     assert whole.values[:, 1].tolist() == [1.0] * 28
+
+
+def test_the_way_to_the_goal_cuts_the_corner_of_the_u() -> None:
+    objective = TASKS["antmaze-umaze"].objective
+    assert isinstance(objective, Navigation)
+    # Half a cell before the inner corner, and half a cell behind it, the way leads there at 45 degrees.
+    maze = objective.maze
+    state = torch.zeros(1, 2, 4)
+    state[0, :, :2] = torch.tensor([maze.cell_centre(1, 2), maze.cell_centre(2, 3)])
+    goal = torch.tensor(maze.cell_centre(*maze.goal)).float().expand(1, 2, 2)
+    found = way_to_goal(objective, toy_episodes(state, torch.zeros(1, 2, 2), next_state=state, goal=goal))
+    down = math.copysign(1.0, maze.cell_centre(2, 3)[1] - maze.cell_centre(1, 3)[1])
+    way = torch.stack([found["way, x"][0], found["way, y"][0] * down], dim=-1)
+    torch.testing.assert_close(way, torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / 2**0.5, atol=0.01, rtol=0)
