@@ -29,6 +29,6 @@ def test_a_small_run_is_probed_and_its_policy_run(tmp_path: Path, capsys: pytest
             lines = capsys.readouterr().out.splitlines()
             assert lines[0] == "| R² of | φ(s) | φ(s) and 3 actions | z of astra |"
             names = [line.split("|")[1].strip() for line in lines[2:] if line]
-            assert names[:2] == ["z", "yaw, cosine"] and names.index("mean") == 26
+            assert names[:2] == ["z", "yaw, cosine"] and names[26:29] == ["way, x", "way, y", "mean"]
             assert lines[-3] == f"| success in the {where} with latents | own | another's | zeros |"
             assert lines[-1].startswith("| astra | 0.")

@@ -20,7 +20,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     Raises:
         RecipeError: it cannot be read, is a recipe of `gap`, or has a key by two names.
     """
-    tables = _with_current_keys(load_tables(path), path)
+    tables = with_current_keys(load_tables(path), path)
     if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
         raise RecipeError(
             f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
@@ -35,7 +35,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     return tables
 
 
-def _with_current_keys(tables: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def with_current_keys(tables: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Return the `tables` of the recipe at `path` with renamed keys under their current names.
 
     A message on standard error says so, once for each key.

@@ -5,7 +5,7 @@ import pytest
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
 from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.renamed import with_current_keys
+from astra_data.experiments.recipe_file import with_current_keys
 
 RECIPE = """
 task = "antmaze-umaze"
