@@ -230,14 +230,12 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
         return drawn[-1]
 
     losses: list[torch.Tensor] = []
-    memories = [] if critics.memory is None else list(critics.memory.parameters())
     gradients: list[torch.Tensor] = []
 
     def computed(*given: Any) -> tuple[torch.Tensor, ...]:  # noqa: ANN401
         found = compute(*given)
         losses.extend(loss.detach() for loss in found)
-        if memories:
-            gradients.extend(torch.autograd.grad(found[0], memories, retain_graph=True))
+        gradients.extend(torch.autograd.grad(found[0], [*critics.parameters()], retain_graph=True))
         return found
 
     def sampled(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -298,8 +296,8 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
     torch.testing.assert_close(torch.stack(losses), torch.stack([wrong, costs, calm]), rtol=1e-4, atol=1e-4)
     assert learner._log_temperature.grad is not None
     torch.testing.assert_close(learner._log_temperature.grad, 1.0 - log_prob.mean(), rtol=1e-4, atol=1e-5)
-    # The critics' memory learns from their loss alone.
-    for parameter, gradient in zip(memories, gradients, strict=True):
+    # The critics and their memory learn from their own loss alone.
+    for parameter, gradient in zip(critics.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
     after = zip(learner._late_critics.parameters(), slow.parameters(), critics.parameters(), strict=True)
     for late, then, now in after:
