@@ -36,3 +36,14 @@ class SharingError(AstraDataError):
 
 class DiskError(AstraDataError):
     """A disk is full, read-only, failing or gone; the message names the file and what to do."""
+
+
+_LONGEST = 300
+"""Characters of an error message of a library that are shown."""
+
+
+def first_line(error: Exception) -> str:
+    """Return the first sentence of an error message, of bounded length and printable."""
+    line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
+    shown = "".join(sign if sign.isprintable() else "\ufffd" for sign in line)
+    return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}…"

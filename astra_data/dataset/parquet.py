@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.errors import CorruptDatasetError, first_line
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
 
@@ -111,17 +111,6 @@ def read_arrays(
     """Yield the blocks of `read_blocks` as contiguous arrays by name, (n,) or (n, size)."""
     for table in read_blocks(paths, [column.name for column in columns], wanted):
         yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
-
-
-_LONGEST = 300
-"""Characters of an error message of a library that are shown."""
-
-
-def first_line(error: Exception) -> str:
-    """Return the first sentence of an error message, of bounded length and printable."""
-    line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
-    shown = "".join(sign if sign.isprintable() else "\ufffd" for sign in line)
-    return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}…"
 
 
 class RotatingWriter:

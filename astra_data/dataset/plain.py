@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.errors import CorruptDatasetError, first_line
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import STATS_PATH, TASKS_PATH
-from astra_data.dataset.parquet import UNREADABLE, first_line, open_parquet, to_numpy
+from astra_data.dataset.parquet import UNREADABLE, open_parquet, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own."""

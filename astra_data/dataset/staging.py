@@ -17,13 +17,13 @@ import pyarrow as pa
 
 from astra_data.core.disk import writing
 from astra_data.core.durable import discard, make_folder, move, sweep, sync, write_file
-from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, first_line
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import changed_values
-from astra_data.dataset.parquet import first_line, to_arrow, to_numpy
+from astra_data.dataset.parquet import to_arrow, to_numpy
 from astra_data.dataset.plain import read_object
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter

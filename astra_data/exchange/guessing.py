@@ -13,8 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from astra_data.core.errors import BadInputError
-from astra_data.dataset.parquet import first_line
+from astra_data.core.errors import BadInputError, first_line
 from astra_data.exchange.importers.csv import SUFFIXES
 
 Floats = NDArray[np.float64]

@@ -11,10 +11,9 @@ from types import ModuleType
 from typing import Any
 
 from astra_data.core.config import did_you_mean, load_recipe, validated
-from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.errors import AstraDataError, BadInputError, first_line
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
-from astra_data.dataset.parquet import first_line
 from astra_data.dataset.versions import place
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter, Tally

@@ -10,9 +10,8 @@ from typing import IO
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.digest import file_digest
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, first_line
 from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import first_line
 
 BLOCK_ROWS = 2**13
 """Rows that an importer reads at once, if the format allows it."""

@@ -8,7 +8,7 @@ import pytest
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import parquet
 from astra_data.dataset.columns import Array
-from astra_data.dataset.parquet import RotatingWriter, first_line, read_blocks, to_arrow, to_lists, to_numpy
+from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_lists, to_numpy
 
 
 @pytest.mark.parametrize(
@@ -105,9 +105,3 @@ def test_full_files_are_followed_by_the_next(tmp_path: Path, monkeypatch: pytest
     assert [pq.read_metadata(file).num_row_groups for file in files] == [2, 2, 1]
     found = [x for file in files for x in pq.read_table(file).column("x").to_pylist()]
     assert found == numbers.ravel().tolist()
-
-
-def test_the_first_line_of_an_error_is_short_and_printable() -> None:
-    shown = first_line(ValueError(f"Expected 2 columns, got 1: \x1b[2J\0{'x' * 5000}\nand more"))
-    assert shown.startswith("Expected 2 columns, got 1: ")
-    assert shown.isprintable() and len(shown) < 400
