@@ -113,9 +113,11 @@ def replayed_inputs(
 
     The simulator moves more smoothly than the target, so that a failure announces itself less. Replays of
     `_REPLAYED` steps begin at every `RISK_STEPS`-th recorded moment. What is seen of a step is from the one
-    that began longest before it: nearly all that the averages remember is simulated then.
+    that began longest before it: nearly all that the averages remember is simulated then. They go as near to
+    walls as a judge's episodes do: see `HistoryGrounding.foreseeing`.
     """
-    windows, grounding = episodes.windows, grounding.reduced(members=False, failures=False)
+    windows = episodes.windows
+    grounding = grounding.foreseeing(task.objective).reduced(members=False, failures=False)
     moments = Moments.every(windows, RISK_STEPS)
     simulator = grounding.corrected(task.simulator(len(moments), str(windows.mask.device)), None)
     hidden = grounding.hidden_before(windows, RISK_STEPS)

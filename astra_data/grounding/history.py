@@ -15,6 +15,7 @@ from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
+from astra_data.worlds.objective import Objective
 from astra_data.worlds.protocols import PlacedSimulator
 
 _FAILURES, _MEMBERS, _SCATTER = "failures", "members", "scatter"
@@ -50,6 +51,15 @@ class HistoryGrounding(FittedGrounding):
         return replace(
             self, failures=self.failures if failures else None, members=self.members if members else ()
         )
+
+    def foreseeing(self, objective: Objective) -> "HistoryGrounding":
+        """Return the grounding for a failure model to tell failures in.
+
+        Where touching a wall is one, corrections end as close to walls as the simulator itself: within the
+        recorded clearance the robot mostly touched nothing, and whoever ended episodes there would fail it
+        several times too often.
+        """
+        return replace(self, clearance_m=None) if objective.ends_at_walls else self
 
     def for_replay(self) -> "HistoryGrounding":
         """Return the model alone."""

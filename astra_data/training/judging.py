@@ -39,6 +39,8 @@ class Judge:
         foresees = history is not None and history.failures is not None
         scatters = history is not None and history.scatters is not None
         scatter = None if foresees or scatters else self.scatter
+        if history is not None and foresees:
+            made = history.foreseeing(self.task.objective)
         simulator = made.simulator(self.task, episodes, scatter=scatter)
         return SimulatorEnv(self.task.objective, simulator, topple=foresees)
 

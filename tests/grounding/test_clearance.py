@@ -8,10 +8,12 @@ import torch
 from toy_episodes import no_episodes, toy_episodes
 
 from astra_data.core.progress import silent
+from astra_data.grounding.failures import replayed_inputs
 from astra_data.grounding.files import load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.failure import AHEAD_S, FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
@@ -63,6 +65,32 @@ def test_there_is_none_without_walls() -> None:
 def test_corrected_states_come_no_closer() -> None:
     assert highest_m(HistoryGrounding(pushed_up())) == pytest.approx(TOP_M - 0.2, abs=0.11)
     assert highest_m(HistoryGrounding(pushed_up(), clearance_m=0.7)) == pytest.approx(TOP_M - 0.7, abs=0.01)
+
+
+def test_where_touches_are_failures_they_are_foreseen_as_close_to_walls_as_the_simulator_comes() -> None:
+    """A failure model sees 0.2 m to the wall, where corrections for policies end 0.7 m from it."""
+    ends_there = replace(TASK, objective=replace(TASK.objective, ends_at_walls=True))
+    maze = TASK.objective.layout
+    assert maze is not None
+    failures = FailureModel(
+        FailureShape(
+            *(4, 2, TASK.timestep_s, (len(maze.fine_walls), len(maze.fine_walls[0])), maze.fine_m), members=1
+        )
+    ).eval()
+    failures.clearance.copy_(torch.from_numpy(maze.clearance_field))
+    failures.half_extent.copy_(torch.from_numpy(maze.half_extent))
+    grounding = HistoryGrounding(pushed_up(), clearance_m=0.7)
+    assert grounding.foreseeing(TASK.objective) is grounding
+    assert grounding.foreseeing(ends_there.objective) == replace(grounding, clearance_m=None)
+    upwards = toy_episodes(
+        recorded(*[2.0] * 60).windows.state,
+        torch.tensor([0.0, 1.0]).expand(1, 60, 2),
+        next_state=recorded(*[2.0] * 60).windows.state,
+    )
+    for task, clearance in ((TASK, 0.7), (ends_there, 0.2)):
+        seen = replayed_inputs(task, grounding, failures, upwards)[0, 40:]
+        from_walls = seen[:, -1 - 2 * len(AHEAD_S)]
+        assert float(from_walls.min()) == pytest.approx(clearance, abs=0.11)
 
 
 def test_files_hold_it_and_are_as_before_without_it(tmp_path: Path) -> None:

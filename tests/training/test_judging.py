@@ -6,8 +6,10 @@ import pytest
 import torch
 from rail_run import make_rail_run
 from small_cart import TASK
+from torch import Tensor
 
 from astra_data.grounding.files import load_grounding
+from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
@@ -16,6 +18,7 @@ from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
 from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.worlds.protocols import PlacedSimulator
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +77,27 @@ def test_a_judge_that_scatters_by_the_moment_adds_no_other_scatter(judge: Judge)
         simulator: Any = made.simulator(2).simulator
         assert simulator.scatters is known
         assert (simulator.scatter is None) == (known is not None)
+
+
+@pytest.mark.parametrize("foresees", [True, False])
+@pytest.mark.parametrize("touches_fail", [True, False])
+def test_where_a_failure_model_tells_touches_a_judge_keeps_no_distance_from_walls(
+    foresees: bool, touches_fail: bool, judge: Judge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, kept = HistoryGrounding.corrected, list[float | None]()
+
+    def noted(
+        grounding: HistoryGrounding, simulator: PlacedSimulator, scatter: Tensor | None
+    ) -> GroundedSimulator:
+        kept.append(grounding.clearance_m)
+        return made(grounding, simulator, scatter)
+
+    monkeypatch.setattr(HistoryGrounding, "corrected", noted)
+    whole: Any = judge.grounding
+    grounding = replace(whole.reduced(members=True, failures=foresees), clearance_m=0.3)
+    task = replace(TASK, objective=replace(TASK.objective, ends_at_walls=touches_fail))
+    replace(judge, task=task, grounding=grounding).simulator(2)
+    assert kept == [None if foresees and touches_fail else 0.3]
 
 
 def test_success_is_the_share_of_the_episodes(
