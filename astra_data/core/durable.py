@@ -49,12 +49,16 @@ def move(source: Path, target: Path) -> None:
     sync(target.parent)
 
 
-def make_folder(folder: Path) -> None:
-    """Make `folder` and those that it is in; when this returns, the disk knows."""
+def make_folder(folder: Path) -> list[Path]:
+    """Make `folder` and those that it is in; return what was made, the innermost first.
+
+    When this returns, the disk knows.
+    """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for path in missing:
         sync(path.parent)
+    return missing
 
 
 def write_file(path: Path, content: str | bytes) -> None:
@@ -80,13 +84,13 @@ def hidden_folder(target: Path) -> Iterator[Path]:
     """Yield an empty hidden folder beside `target`, which is removed when the block ends.
 
     After a kill it stays until the next call with the same target: the folder of a live process is locked.
+    If the block fails, folders made for `target` go, too.
 
     Raises:
         BadInputError: this process is writing `target` already.
         DiskError: it cannot be written.
     """
-    with writing(target):
-        make_folder(target.parent)
+    with writing(target), _folder_for(target):
         sweep(target)
         with _own_folder(target) as folder:
             try:
@@ -142,6 +146,19 @@ def _remove_dead(path: Path) -> bool:
     return not path.exists()
 
 
+@contextmanager
+def _folder_for(target: Path) -> Iterator[None]:
+    """Make the folder that `target` is in; if the block fails, remove what was made and holds nothing."""
+    made = make_folder(target.parent)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for path in made:
+                path.rmdir()
+        raise
+
+
 def _hidden_names(target: Path) -> Iterator[Path]:
     for attempt in itertools.count():
         yield target.with_name(f".{target.name}.tmp-{os.getpid()}{f'-{attempt}' if attempt else ''}")
@@ -152,7 +169,7 @@ def _own_folder(target: Path) -> Iterator[Path]:
     """Make a hidden folder beside `target` and hold its lock."""
     for folder in _hidden_names(target):
         try:
-            folder.mkdir()
+            folder.mkdir(parents=True)  # another process may have removed a folder that it had made
         except FileExistsError:
             raise BadInputError(
                 f"{target} is being written right now; wait or choose another folder."

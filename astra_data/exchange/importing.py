@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -121,12 +121,9 @@ def import_dataset(
     }
     root = place(description) if out is None else out
     frames = count = 0
-    with (
-        _no_empty_folder(root.parent),
-        DatasetWriter(
-            root, cutter.columns, fps=settings.fps, task=settings.task, description=description
-        ) as writer,
-    ):
+    with DatasetWriter(
+        root, cutter.columns, fps=settings.fps, task=settings.task, description=description
+    ) as writer:
         for count, (columns, metadata) in enumerate(chain([first], cuts), start=1):
             writer.add(Episode(count - 1, columns, metadata))
             frames += len(columns[TRUNCATED])
@@ -135,19 +132,6 @@ def import_dataset(
         seconds = time.perf_counter() - began
         writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
     return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began)
-
-
-@contextmanager
-def _no_empty_folder(folder: Path) -> Iterator[None]:
-    """Remove `folder` after an exception, if it was made since and holds nothing."""
-    was_there = folder.exists()
-    try:
-        yield
-    except BaseException:
-        if not was_there:
-            with suppress(OSError):
-                folder.rmdir()
-        raise
 
 
 def _record(source: Source, file_format: str) -> ExportRecord | None:

@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 from failing_disk import Killed, failing
 
-from astra_data.core.durable import NO_FSYNC, clean, discard, make_folder, sync_tree, write_file
+from astra_data.core.durable import (
+    NO_FSYNC,
+    clean,
+    discard,
+    hidden_folder,
+    make_folder,
+    sync_tree,
+    write_file,
+)
 from astra_data.core.errors import DiskError
 from astra_data.core.lock import held
 
@@ -127,6 +135,30 @@ def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path
         tmp_path
     )
     assert names(tmp_path) == []
+
+
+def test_a_failure_removes_the_folders_that_were_made_for_it_alone(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    with pytest.raises(KeyError), hidden_folder(home / "walks/data-1.0.0"):
+        raise KeyError
+    assert not home.exists()
+    home.mkdir()
+    with pytest.raises(KeyError), hidden_folder(home / "walks/data-1.0.0"):
+        raise KeyError
+    assert home.is_dir() and not list(home.iterdir())
+    with pytest.raises(KeyError), hidden_folder(home / "walks/data-1.0.0"):
+        write_file(home / "walks/notes.txt", "of somebody else")
+        raise KeyError
+    assert [path.name for path in (home / "walks").iterdir()] == ["notes.txt"]
+
+
+def test_a_folder_that_another_process_removed_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "walks/data-1.0.0"
+    monkeypatch.setattr("astra_data.core.durable.sweep", lambda target: target.parent.rmdir())
+    with hidden_folder(place) as folder:
+        assert folder.parent == place.parent
 
 
 def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
