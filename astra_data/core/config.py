@@ -22,6 +22,8 @@ Number = Annotated[int, Field(ge=0, le=10**12)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 _UNNAMED = ""
+_MOST_FAULTS = 5
+"""Of a file that no user writes by hand."""
 
 
 def in_order(ends: tuple[float, float]) -> tuple[float, float]:
@@ -121,6 +123,14 @@ def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: s
     if len(faults) == 1:
         raise RecipeError(f"{origin}: {faults[0]}")
     raise RecipeError("\n  ".join([f"{origin} has {len(faults)} faults:", *faults]))
+
+
+def faults_of(error: ValidationError) -> str:
+    """Return what is wrong in a file that no user writes by hand: where, and what was expected."""
+    all_of = error.errors(include_url=False)
+    faults = [f"{'.'.join(map(str, one['loc'])) or 'file'}: {one['msg']}" for one in all_of[:_MOST_FAULTS]]
+    more = len(all_of) - len(faults)
+    return "; ".join([*faults, f"and {more} more"] if more else faults)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -10,14 +10,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from astra_data.core.config import Config, Count, Number
+from astra_data.core.config import Config, Count, Number, faults_of
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
 from astra_data.dataset.description import NAME
 from astra_data.dataset.reader import Dataset
 
-MOST_FAULTS = 3
-"""Faults of a record that are listed."""
 Uid = Annotated[int, Field(ge=0, lt=2**63)]
 Fact = bool | int | float | str | None
 
@@ -102,11 +100,8 @@ class ExportRecord(Config):
         try:
             return cls.model_validate_json(text)
         except ValidationError as error:
-            faults = [
-                f"{'.'.join(map(str, details['loc']))} {details['msg']}".strip() for details in error.errors()
-            ]
             raise CorruptDatasetError(
-                f"{origin}: its record of the export is malformed ({'; '.join(faults[:MOST_FAULTS])}); "
+                f"{origin}: its record of the export is malformed ({faults_of(error)}); "
                 "export it again, or restore a copy"
             ) from None
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, m
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from astra_data.core.config import faults_of
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Machine
 
@@ -189,15 +190,14 @@ def read_json[T: Artefact](model: type[T], path: Path) -> T:
     """Read one of the files above.
 
     Raises:
-        BadInputError: the file does not hold what its stage writes; the message lists every mismatch.
+        BadInputError: the file does not hold what its stage writes; the message lists mismatches.
     """
     try:
         return model.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        wrong = "; ".join(
-            f"{'.'.join(map(str, item['loc'])) or 'file'}: {item['msg']}" for item in error.errors()
-        )
-        raise BadInputError(f"{path} is not what its stage writes: {wrong}; run that stage again") from None
+        raise BadInputError(
+            f"{path} is not what its stage writes: {faults_of(error)}; run that stage again"
+        ) from None
 
 
 def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from astra_data.core.config import faults_of
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
@@ -34,7 +35,9 @@ def read_published(path: Path) -> Found:
     try:
         return TypeAdapter[Found](Found).validate_json(path.read_bytes())
     except ValidationError as error:
-        raise BadInputError(f"{path} does not hold results as they are written now: {error}") from None
+        raise BadInputError(
+            f"{path} does not hold results as they are written now: {faults_of(error)}"
+        ) from None
 
 
 def published_figures(folder: Path, recipe: str) -> dict[str, bytes]:

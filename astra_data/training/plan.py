@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from torch import Tensor
 
-from astra_data.core.config import AtOnce, Config
+from astra_data.core.config import AtOnce, Config, faults_of
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.task import Task
 
@@ -53,10 +53,8 @@ class Plan(Config):
         except OSError as error:
             raise BadInputError(f"{path} cannot be read as a plan: {error.strerror}") from None
         except ValidationError as error:
-            fault = error.errors(include_url=False)[0]
-            place = ".".join(map(str, fault["loc"])) or "the file"
             raise BadInputError(
-                f"{path}: expected a plan as `astra-data suggest` writes it: {place}: {fault['msg']}"
+                f"{path}: expected a plan as `astra-data suggest` writes it: {faults_of(error)}"
             ) from None
         expected = names_of(task)
         if (plan.start_names, plan.command_names) != expected or plan.timestep_s != task.timestep_s:

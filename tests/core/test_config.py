@@ -4,7 +4,7 @@ from typing import Literal
 import pytest
 from pydantic import Field, ValidationError
 
-from astra_data.core.config import Config, did_you_mean, load_recipe, own_settings
+from astra_data.core.config import Config, did_you_mean, faults_of, load_recipe, own_settings
 from astra_data.core.errors import BadInputError, RecipeError
 
 
@@ -134,3 +134,19 @@ def test_a_key_that_stands_below_a_table_by_mistake_is_told_where_it_belongs(tmp
     assert (
         told == "FILE: train.seeds: unknown key: 'seeds' belongs to no table: move it above the first [table]"
     )
+
+
+def test_of_a_file_that_nobody_wrote_by_hand_the_first_faults_are_told() -> None:
+    class Made(Config):
+        numbers: tuple[int, ...]
+
+    def told(text: str) -> str:
+        with pytest.raises(ValidationError) as caught:
+            Made.model_validate_json(text)
+        return faults_of(caught.value)
+
+    assert told('{"numbers": [1, "two"]}') == "numbers.1: Input should be a valid integer"
+    assert told("{").startswith("file: Invalid JSON")
+    five = "; ".join(f"numbers.{place}: Input should be a valid integer" for place in range(5))
+    assert told('{"numbers": ["a", "b", "c", "d", "e"]}') == five
+    assert told('{"numbers": ["a", "b", "c", "d", "e", "f", "g"]}') == f"{five}; and 2 more"

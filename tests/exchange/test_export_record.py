@@ -35,10 +35,10 @@ def test_a_record_says_what_the_dataset_is(record: dict[str, Any], tmp_path: Pat
     [
         ({"uids": [1]}, "expected as many entries in each"),
         ({"sums": {}}, "expected the same columns in all of them"),
-        ({"fps": 0}, "fps Input should be greater"),
+        ({"fps": 0}, "fps: Input should be greater"),
         ({"metadata": {"return": [float("inf")]}}, "metadata"),
-        ({"name": "../up"}, "name String should match"),
-        ({"more": 1}, "more Extra inputs"),
+        ({"name": "../up"}, "name: String should match"),
+        ({"more": 1}, "more: Extra inputs"),
     ],
 )
 def test_a_malformed_record_is_one_line(record: dict[str, Any], change: dict[str, Any], fault: str) -> None:
