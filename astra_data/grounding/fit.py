@@ -120,12 +120,12 @@ class HistoryFit:
     latent: bool
     reward: bool
 
-    def weights(self, config: GroundConfig, *, topple: bool = True) -> LossWeights:
-        """Return the weights of the losses; `topple` is whether the topple head is needed."""
+    def weights(self, config: GroundConfig, *, failures: bool = True) -> LossWeights:
+        """Return the weights of the losses; `failures` is whether failures are learned."""
         return LossWeights(
             latent=config.latent_weight if self.latent else 0.0,
             reward=config.reward_weight if self.reward else 0.0,
-            topple=float(topple),
+            failures=float(failures),
         )
 
     def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
@@ -147,7 +147,7 @@ class HistoryFit:
                 held_out=residual_rewards(fitting.task, fitting.held_out),
             )
         foresees = bool(config.failure_members) and tells_failures(fitting.training)
-        weights, count = self.weights(config, topple=not foresees), 1 + config.members
+        weights, count = self.weights(config, failures=not foresees), 1 + config.members
         first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
         (model, metrics), members = first, tuple(other for other, _ in others)
         _fit_scatter(model, members, fitting.held_out)
@@ -209,9 +209,8 @@ def _fitted(
         }
     )
     rewards, goes_on = training.steps(windows.reward), training.steps(windows.goes_on)
-    # A failure model that replaces the topple head replaces R_pred's failure part, too: fitted in vain, that
-    # would fill the latent with the failures of the data.
-    model.set_reward_scales(rewards, goes_on, config.failure_weight if weights.topple else 0.0)
+    # Where a failure model tells them, R_pred would fill the latent with the failures of the data in vain.
+    model.set_reward_scales(rewards, goes_on, config.failure_weight * weights.failures)
     fitting = replace(whole, training=training, seed=seed, progress=progress)
     return model, _optimise(model, weights, fitting, whole.folder / name)
 

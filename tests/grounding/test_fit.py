@@ -163,10 +163,10 @@ def test_a_methods_weights_are_zero_where_it_predicts_nothing() -> None:
     config = GroundConfig(latent_weight=0.3, reward_weight=2.0)
     for latent in (False, True):
         for reward in (False, True):
-            for topple in (False, True):
-                weights = HistoryFit(latent=latent, reward=reward).weights(config, topple=topple)
+            for failures in (False, True):
+                weights = HistoryFit(latent=latent, reward=reward).weights(config, failures=failures)
                 assert (weights.latent, weights.reward) == (0.3 * latent, 2.0 * reward)
-                assert (weights.state, weights.topple) == (1.0, float(topple))
+                assert (weights.state, weights.failures) == (1.0, float(failures))
 
 
 def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: Path) -> None:

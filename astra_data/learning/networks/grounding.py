@@ -24,12 +24,12 @@ _BALL_M = 0.1
 
 @dataclass(frozen=True)
 class LossWeights:
-    """λ1, λ2, λ3 of the paper's total loss, and the weight of the topple head's own."""
+    """λ1, λ2, λ3 of the paper's total loss, and the weight of failures: what R_pred and the topple head learn."""
 
     latent: float = 1.0
     reward: float = 1.0
     state: float = 1.0
-    topple: float = 1.0
+    failures: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -252,13 +252,13 @@ class GroundingModel(nn.Module):
             total = total + weights.reward * parts["reward"]
         parts["state"] = self._correction_loss(latent, windows)
         total = total + weights.state * parts["state"]
-        if weights.topple > 0:
+        if weights.failures > 0:
             logit = self.topple_logit(latent.detach(), action, windows.next_state)
             surprise = functional.binary_cross_entropy_with_logits(
                 logit, windows.topples_soon, reduction="none"
             )
             parts["topple"] = _masked_mean(surprise, mask)
-            total = total + weights.topple * parts["topple"]
+            total = total + weights.failures * parts["topple"]
         return total, parts
 
     def _reward_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
