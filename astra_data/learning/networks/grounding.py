@@ -24,7 +24,7 @@ _BALL_M = 0.1
 
 @dataclass(frozen=True)
 class LossWeights:
-    """λ1, λ2, λ3 of the paper's total loss, and the weight of failures: what R_pred and the topple head learn."""
+    """λ1, λ2, λ3 of the paper's total loss, and of what R_pred and the topple head learn of failures."""
 
     latent: float = 1.0
     reward: float = 1.0
