@@ -1,17 +1,17 @@
 """Select: choose among a recipe's policies without the target, by simulators of other episodes.
 
-A judge is the grounding of another seed, which has episodes of its own. Where it has a failure model, that
-ends episodes; otherwise its states are scattered as the target's are around it.
+A judge is the grounding of another seed, which has episodes of its own. A failure model ends episodes, the
+grounding's own or one that is fitted to these; where nothing fails in them, states are scattered.
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from astra_data.core.checkpoint import finished_folder
-from astra_data.core.config import AtOnce, Config
+from astra_data.core.config import AtOnce, Config, Number
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
@@ -47,6 +47,9 @@ class SelectConfig(Config):
     """Of each policy with each judge, in one batch."""
     judge: str | None = None
     """Row whose groundings judge; by default the reference, NAS."""
+    failure_members: Number = 5
+    """Networks of the failure model that a judge gets whose grounding has none, where some of its episodes
+    fail; 0 for none: its states are then scattered as the target's are around the correction."""
 
 
 DEFAULTS = SelectConfig()
@@ -155,16 +158,16 @@ def select(
         begun = folder / _BEGUN
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
-            judges = dict(_judges(bench, recipe.task, root))
+            judge_of_seed = cache(partial(_judge, bench, recipe.task, root, config.failure_members))
             for entry in bench.entries:
                 policy, success = entry.load(root, recipe.task), {}
-                for other, one in judges.items():
+                for other in bench.judges:
                     if other == entry.seed:
                         continue
                     read = f"{made_from[entry.policy]}/{made_from[bench.judges[other][0]]}"
                     if read not in known:
                         drawn = derive(other, f"judged: {entry.seed}")
-                        known[read] = one.success(policy, config.episodes, drawn)
+                        known[read] = judge_of_seed(other).success(policy, config.episodes, drawn)
                     success[other] = known[read]
                 write_file(begun, json.dumps(known))
                 found.append(
@@ -217,11 +220,10 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
         )
 
 
-def _judges(bench: Bench, task: str, root: Path) -> Iterator[tuple[int, Judge]]:
-    """Yield the judges by their seeds."""
-    for seed, (grounding, dataset) in bench.judges.items():
-        made = load_grounding(root / grounding / _GROUNDING)
-        yield seed, Judge.of(task_named(task), made, PairedEpisodes.load(root / dataset))
+def _judge(bench: Bench, task: str, root: Path, failure_members: int, seed: int) -> Judge:
+    grounding, dataset = bench.judges[seed]
+    made, episodes = load_grounding(root / grounding / _GROUNDING), PairedEpisodes.load(root / dataset)
+    return Judge.of(task_named(task), made, episodes, failure_members)
 
 
 def _digest(folder: Path) -> str:

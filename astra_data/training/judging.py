@@ -1,11 +1,12 @@
 """Judge policies without the target: by a simulator that was fitted to other episodes than theirs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
 
 from torch import Tensor
 
+from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -24,9 +25,19 @@ class Judge:
     scatter: Tensor
 
     @classmethod
-    def of(cls, task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> "Judge":
-        """Return the judge that a grounding makes, with the scatter of the `episodes` it was fitted to."""
-        return cls(task, grounding, grounding.scatter(episodes))
+    def of(
+        cls, task: Task, grounding: FittedGrounding, episodes: PairedEpisodes, failure_members: int = 0
+    ) -> "Judge":
+        """Return the judge that a grounding makes, with the scatter of the `episodes` it was fitted to.
+
+        Where these tell failures and it has no failure model, one of `failure_members` networks is fitted.
+        """
+        scatter = grounding.scatter(episodes)
+        can_tell = bool(failure_members) and tells_failures(episodes)
+        if can_tell and isinstance(grounding, HistoryGrounding) and grounding.failures is None:
+            failures = fit_failures(task, grounding, episodes, failure_members, seed=0)
+            grounding = replace(grounding, failures=failures)
+        return cls(task, grounding, scatter)
 
     def simulator(self, episodes: int) -> SimulatorEnv:
         """Return its simulator, in which its failure model ends episodes, if it has one.

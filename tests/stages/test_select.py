@@ -155,6 +155,22 @@ def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
     assert "## 100 %" in page and "## 150 %" in page and page.count("**NAS, seed") == 2
 
 
+def test_judges_without_a_failure_model_get_one_of_the_recipes_size_when_they_are_asked_first(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, made = list[int](), Judge.of
+
+    def of(*given: Any) -> Judge:  # noqa: ANN401
+        begun.append(given[-1])
+        return made(*given)
+
+    monkeypatch.setattr(Judge, "of", of)
+    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
+    judged(root, failure_members=7)
+    assert begun == [7, 7, 7]  # once for each of three judges of six policies
+    assert SelectConfig().failure_members == 5
+
+
 def test_judges_of_the_same_episodes_are_named(root: Path) -> None:
     found = judged(root, reported(root, methods=("nas",), settings={"data": "logs@data-1.0.0"}))
     assert found.shares_episodes

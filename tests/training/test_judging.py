@@ -8,10 +8,12 @@ from rail_run import make_rail_run
 from small_cart import TASK
 from torch import Tensor
 
+from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.failure import FailureModel
 from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
 from astra_data.training import judging
 from astra_data.training.deployment import DeployedPolicy
@@ -98,6 +100,27 @@ def test_where_a_failure_model_tells_touches_a_judge_keeps_no_distance_from_wall
     task = replace(TASK, objective=replace(TASK.objective, ends_at_walls=touches_fail))
     replace(judge, task=task, grounding=grounding).simulator(2)
     assert kept == [None if foresees and touches_fail else 0.3]
+
+
+def test_a_judge_without_a_failure_model_gets_one_where_its_episodes_fail(folder: Path, judge: Judge) -> None:
+    episodes = PairedEpisodes.load(folder / "pair/seed_0")
+    known: Any = judge.grounding
+    lacking = known.reduced(members=True, failures=False)
+
+    def failures_of(grounding: HistoryGrounding, of: PairedEpisodes, members: int) -> FailureModel | None:
+        made: Any = Judge.of(TASK, grounding, of, members).grounding
+        assert isinstance(made, HistoryGrounding) and made.model is grounding.model
+        return made.failures
+
+    assert tells_failures(episodes) and known.failures is not None
+    fitted = failures_of(lacking, episodes, 3)
+    assert fitted is not None and len(fitted.members) == 3
+    expected = fit_failures(TASK, lacking, episodes, 3, seed=0)
+    assert all(torch.equal(one, expected.state_dict()[key]) for key, one in fitted.state_dict().items())
+    assert failures_of(known, episodes, 3) is known.failures
+    assert failures_of(lacking, episodes, 0) is None
+    never = replace(episodes.windows, topples_soon=torch.zeros_like(episodes.windows.topples_soon))
+    assert failures_of(lacking, replace(episodes, windows=never), 3) is None
 
 
 def test_success_is_the_share_of_the_episodes(
