@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,18 @@ _WEIGHT_DECAY = 1.0
 _DESCENT = DescentConfig(updates=200, learning_rate=3e-3)
 BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
+
+
+def only_unseen(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
+    """Return the episodes without the failures that abstract states show, such as a ball beside the goal.
+
+    Simulators end episodes there themselves, and a failure model would end them twice.
+    """
+    windows, last = episodes.windows, episodes.lengths - 1
+    each = torch.arange(len(episodes), device=last.device)
+    is_seen = task.objective.missed(windows.next_state[each, last], windows.goal[each, last])
+    unseen = torch.where(is_seen[:, None], 0.0, windows.topples_soon)
+    return replace(episodes, windows=replace(windows, topples_soon=unseen))
 
 
 def tells_failures(episodes: PairedEpisodes) -> bool:

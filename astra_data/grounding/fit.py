@@ -16,7 +16,7 @@ from astra_data.core.progress import Progress, part
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.diagnostics import telemetry
-from astra_data.grounding.failures import compared_foresight, fit_failures, tells_failures
+from astra_data.grounding.failures import compared_foresight, fit_failures, only_unseen, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -146,7 +146,8 @@ class HistoryFit:
                 training=residual_rewards(fitting.task, fitting.training),
                 held_out=residual_rewards(fitting.task, fitting.held_out),
             )
-        foresees = bool(config.failure_members) and tells_failures(fitting.training)
+        failing = only_unseen(fitting.task, fitting.training)
+        foresees = bool(config.failure_members) and tells_failures(failing)
         weights, count = self.weights(config, failures=not foresees), 1 + config.members
         first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
         (model, metrics), members = first, tuple(other for other, _ in others)
@@ -165,12 +166,11 @@ class HistoryFit:
             )
             grounding = replace(grounding, scatters=scatters)
         if foresees:
-            failures = fit_failures(
-                fitting.task, grounding, fitting.training, config.failure_members, fitting.seed
-            )
+            failures = fit_failures(fitting.task, grounding, failing, config.failure_members, fitting.seed)
             grounding = replace(grounding, failures=failures)
         if config.failure_members:
-            metrics["failures"] = compared_foresight(fitting.task, grounding, fitting.held_out, self.reward)
+            unseen = only_unseen(fitting.task, fitting.held_out)
+            metrics["failures"] = compared_foresight(fitting.task, grounding, unseen, self.reward)
         return grounding, metrics
 
 

@@ -6,7 +6,7 @@ from statistics import fmean
 
 from torch import Tensor
 
-from astra_data.grounding.failures import fit_failures, tells_failures
+from astra_data.grounding.failures import fit_failures, only_unseen, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -33,9 +33,10 @@ class Judge:
         Where these tell failures and it has no failure model, one of `failure_members` networks is fitted.
         """
         scatter = grounding.scatter(episodes)
-        can_tell = bool(failure_members) and tells_failures(episodes)
+        failing = only_unseen(task, episodes)
+        can_tell = bool(failure_members) and tells_failures(failing)
         if can_tell and isinstance(grounding, HistoryGrounding) and grounding.failures is None:
-            failures = fit_failures(task, grounding, episodes, failure_members, seed=0)
+            failures = fit_failures(task, grounding, failing, failure_members, seed=0)
             grounding = replace(grounding, failures=failures)
         return cls(task, grounding, scatter)
 

@@ -6,7 +6,13 @@ import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.failures import fit_failures, foresight, replayed_inputs, tells_failures
+from astra_data.grounding.failures import (
+    fit_failures,
+    foresight,
+    only_unseen,
+    replayed_inputs,
+    tells_failures,
+)
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.failure import FailureModel, FailureShape
@@ -74,6 +80,23 @@ def test_nothing_is_told_where_nothing_fails_or_everything(soon: float) -> None:
     assert tells_failures(episodes)
     alike = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.full((4, 100), soon)))
     assert not tells_failures(alike)
+
+
+def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
+    """A ball beside the goal is one, wherever the padding of its episode goes; a fall is none."""
+    kick = TASKS["nao-kick"]
+    goal = torch.from_numpy(kick.objective.draw_goals(np.random.default_rng(0), 1)).float()
+    state = torch.zeros(3, 30, 8)
+    state[0, 19, 4:6] = state[2, 25:, 4:6] = goal + torch.tensor([0.1, 1.5])
+    mask = torch.ones(3, 30)
+    mask[0, 20:] = mask[2, 20:] = 0
+    made = toy_episodes(
+        state, torch.zeros(3, 30, 2), next_state=state, mask=mask, goal=goal.expand(3, 30, 2).contiguous()
+    )
+    made = replace(made, windows=replace(made.windows, topples_soon=mask))
+    unseen = only_unseen(kick, made)
+    assert torch.equal(unseen.windows.topples_soon, mask * torch.tensor([[0.0], [1.0], [1.0]]))
+    assert torch.equal(unseen.windows.state, state) and tells_failures(unseen)
 
 
 def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before() -> None:

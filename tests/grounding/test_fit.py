@@ -169,6 +169,26 @@ def test_a_methods_weights_are_zero_where_it_predicts_nothing() -> None:
                 assert (weights.state, weights.failures) == (1.0, float(failures))
 
 
+def test_no_failure_model_is_fitted_to_failures_that_abstract_states_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = episodes(0)
+    soon = torch.zeros_like(training.windows.mask)
+    soon[0, -4:] = 1
+    training = replace(training, windows=replace(training.windows, topples_soon=soon))
+    task = TASKS["antmaze-umaze"]
+    monkeypatch.setattr(type(task.objective), "missed", lambda _, state, goal: state[:, 0] == state[:, 0])
+    config = GroundConfig(updates=1, batch_windows=4, window=5, latent_size=8, failure_members=2)
+    fitting = Fitting(task, config, None, training, training, 0, "cpu", tmp_path, silent)
+    grounding, metrics = HistoryFit(latent=False, reward=False)(fitting)
+    assert grounding.failures is None and metrics["failures"]["topple_head"] == {
+        "failures": 0,
+        "auc": None,
+        "brier_skill": None,
+        "reliability": None,
+    }
+
+
 def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: Path) -> None:
     config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8)
     training, held_out = episodes(0), episodes(1, 3)
