@@ -10,8 +10,8 @@ from astra_data.cli.recipes import RUNS, Publish, RecipePath, Root, Seeds, resum
 Data = Annotated[
     Path,
     typer.Option(
-        help="Recordings to predict: a dataset, or a log, an archive or a folder of them as the recipe's "
-        "mapping describes them.",
+        help="Recordings to predict: a dataset or its name, or a log, an archive or a folder of them as the "
+        "recipe's mapping describes them.",
         show_default=False,
     ),
 ]

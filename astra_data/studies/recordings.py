@@ -15,6 +15,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
 from astra_data.dataset.endings import is_terminated, stands_still
 from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.versions import locate
 from astra_data.exchange.importing import import_dataset, log_suffixes
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import find_sources, is_archive
@@ -80,8 +81,8 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
     """Read every recording in `place`, and import by `mapping` those that are not datasets yet.
 
     Args:
-        place: a dataset, a log, an archive of logs, or a folder of any of these; each archive and each
-            dataset is one recording, and each loose log of a folder, or all of these where the mapping has
+        place: a dataset or its name, a log, an archive of logs, or a folder of any of these; each archive and
+            each dataset is one recording, and each loose log of a folder, or all of these where the mapping has
             `split.files = false`.
         mapping: how logs become columns.
         home: folder where imported datasets are kept, so that none is imported twice.
@@ -91,7 +92,12 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
         BadInputError: a part of `place` is not usable, or there is none; the message says why.
     """
     if not place.exists():
-        raise BadInputError(f"{place} does not exist: expected a dataset, or logs that {mapping} describes")
+        try:
+            place = locate(place)
+        except BadInputError as error:
+            raise BadInputError(
+                f"{place} does not exist: expected a dataset, or logs that {mapping} describes ({error})"
+            ) from None
     settings = load_recipe(mapping, ImportMapping)
     suffixes = log_suffixes(settings)
     found, faults = [], []

@@ -6,6 +6,8 @@ import pytest
 from toy_walks import actions, log, states, write_archive
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
+from astra_data.exchange.importing import import_dataset
 from astra_data.studies.recordings import read_recordings
 from astra_data.studies.walking import WalkingConfig
 
@@ -29,6 +31,21 @@ def test_archives_and_loose_logs_are_recordings(tmp_path: Path) -> None:
     (one,) = read_recordings(tmp_path / "loose", MAPPING, home, CONFIG)
     assert one.name == "loose"
     np.testing.assert_allclose(one.pieces[0].state[:200], states(actions(200, 3))[:-1], atol=1e-5)
+
+
+def test_a_dataset_at_home_is_a_recording_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "datasets"))
+    archive = write_archive(tmp_path / "a.tar.gz", 200, seed=0)
+    root = import_dataset([archive], MAPPING).root
+    name = root.parent.name
+    expected = Dataset.open(root).content_hash
+    for called in (name, f"{name}@{root.name}"):
+        (one,) = read_recordings(Path(called), MAPPING, tmp_path / "home", CONFIG)
+        assert one.content_hash == expected
+    with pytest.raises(BadInputError, match=rf"walls does not exist.*no dataset 'walls'.*{name}"):
+        read_recordings(Path("walls"), MAPPING, tmp_path / "home", CONFIG)
 
 
 def test_long_episodes_become_pieces_that_share_a_state(tmp_path: Path) -> None:
