@@ -82,8 +82,8 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
 
     Args:
         place: a dataset or its name, a log, an archive of logs, or a folder of any of these; each archive and
-            each dataset is one recording, and each loose log of a folder, or all of these where the mapping has
-            `split.files = false`.
+            each dataset is one recording, and each loose log of a folder, or all of these where the mapping
+            has `split.files = false`.
         mapping: how logs become columns.
         home: folder where imported datasets are kept, so that none is imported twice.
         config: which body they are of, and which rows count.
