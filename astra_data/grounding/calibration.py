@@ -4,8 +4,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.learning.networks.paired_windows import RISK_STEPS
-
 _MOST_FOLDS = 5
 
 
@@ -23,10 +21,10 @@ def folds(fails: Tensor) -> list[Tensor]:
     return [numbers == fold for fold in range(count)]
 
 
-def calibration(odds: Tensor, fails: Tensor) -> tuple[Tensor, Tensor]:
+def calibration(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, Tensor]:
     """Return by how much to scale and shift log-odds (K, N) so that they come true on steps (N,) (Platt).
 
-    The logarithm of the scale has a standard normal prior, and the `RISK_STEPS` before a failure count as one
+    The logarithm of the scale has a standard normal prior, and the `risk_steps` before a failure count as one
     step: where failures are few, little is changed.
     """
     odds, fails = odds.double(), fails.double().expand_as(odds)
@@ -37,7 +35,7 @@ def calibration(odds: Tensor, fails: Tensor) -> tuple[Tensor, Tensor]:
     def loss() -> Tensor:
         optimizer.zero_grad()
         surprise = functional.binary_cross_entropy_with_logits(scale.exp() * odds + shift, fails)
-        total: Tensor = surprise + 0.5 * scale.square() * RISK_STEPS / odds.shape[1]
+        total: Tensor = surprise + 0.5 * scale.square() * risk_steps / odds.shape[1]
         total.backward()
         return total
 

@@ -33,16 +33,19 @@ BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
 
 
-def only_unseen(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
-    """Return the episodes without the failures that abstract states show, such as a ball beside the goal.
+def failing(task: Task, episodes: PairedEpisodes, risk_steps: int) -> PairedEpisodes:
+    """Return the episodes with what a failure model learns of them as `topples_soon`.
 
-    Simulators end episodes there themselves, and a failure model would end them twice.
+    That is the last `risk_steps` before a failure that no abstract state shows. Where one does, as with a
+    ball beside the goal, simulators end episodes themselves, and a failure model would end them twice.
     """
     windows, last = episodes.windows, episodes.lengths - 1
     each = torch.arange(len(episodes), device=last.device)
-    is_seen = task.objective.missed(windows.next_state[each, last], windows.goal[each, last])
-    unseen = torch.where(is_seen[:, None], 0.0, windows.topples_soon)
-    return replace(episodes, windows=replace(windows, topples_soon=unseen))
+    is_shown = task.objective.missed(windows.next_state[each, last], windows.goal[each, last])
+    fails = windows.topples_soon.any(1) & ~is_shown
+    left = episodes.lengths[:, None] - torch.arange(windows.mask.shape[1], device=last.device)
+    soon = fails[:, None] & (left >= 1) & (left <= risk_steps)
+    return replace(episodes, windows=replace(windows, topples_soon=soon.float()))
 
 
 def tells_failures(episodes: PairedEpisodes) -> bool:
@@ -51,15 +54,20 @@ def tells_failures(episodes: PairedEpisodes) -> bool:
 
 
 def fit_failures(
-    task: Task, grounding: HistoryGrounding, training: PairedEpisodes, members: int, seed: int
+    task: Task,
+    grounding: HistoryGrounding,
+    training: PairedEpisodes,
+    members: int,
+    seed: int,
+    risk_steps: int = RISK_STEPS,
 ) -> FailureModel:
     """Fit a failure model of `members` networks to replays of whole episodes; calibrate it by cross-fitting.
 
-    The episodes are such that `tells_failures`.
+    The episodes are what `failing` returns for `risk_steps`, and such that `tells_failures`.
     """
     fails = training.windows.topples_soon
     torch.manual_seed(derive(seed, "failure model"))
-    untrained = _untrained(task, training, members)
+    untrained = _untrained(task, training, members, risk_steps)
     inputs = replayed_inputs(task, grounding, untrained, training)
     seen = training.steps(inputs)
     untrained.set_input_scales(seen)
@@ -74,7 +82,7 @@ def fit_failures(
         odds.append(fitted.log_odds(own.steps(inputs[fold])).detach())
         happened.append(own.steps(own.windows.topples_soon))
     if odds and _has_both(torch.cat(happened)):
-        model.calibrate(*calibration(torch.cat(odds, dim=1), torch.cat(happened)))
+        model.calibrate(*calibration(torch.cat(odds, dim=1), torch.cat(happened), risk_steps))
     return model.requires_grad_(False).eval()
 
 
@@ -82,7 +90,7 @@ def _has_both(fails: Tensor) -> bool:
     return bool(fails.any() and not fails.all())
 
 
-def _untrained(task: Task, training: PairedEpisodes, members: int) -> FailureModel:
+def _untrained(task: Task, training: PairedEpisodes, members: int, risk_steps: int) -> FailureModel:
     windows, maze = training.windows, task.objective.layout
     shape = FailureShape(
         state_size=windows.state.shape[-1],
@@ -91,6 +99,7 @@ def _untrained(task: Task, training: PairedEpisodes, members: int) -> FailureMod
         maze_cells=(len(maze.fine_walls), len(maze.fine_walls[0])) if maze else (0, 0),
         cell_m=maze.fine_m if maze else 1.0,
         members=members,
+        risk_steps=risk_steps,
     )
     model = FailureModel(shape).to(windows.mask.device)
     if maze is not None:
@@ -178,7 +187,7 @@ def compared_foresight(
 def foresight(
     probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
 ) -> dict[str, Any]:
-    """Measure probabilities (E, T) of a failure within `RISK_STEPS` on episodes that were not fitted.
+    """Measure probabilities (E, T) of what `topples_soon` marks on episodes that were not fitted.
 
     Returns:
         "failures": of the episodes. "auc": by window `ahead` of the failure, the probability that a step

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -15,8 +14,9 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import REWARD
+from astra_data.grounding.clearance import recorded_clearance_m
 from astra_data.grounding.diagnostics import telemetry
-from astra_data.grounding.failures import compared_foresight, fit_failures, only_unseen, tells_failures
+from astra_data.grounding.failures import compared_foresight, failing, fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -24,10 +24,10 @@ from astra_data.grounding.raw import scatter_factor
 from astra_data.grounding.scatter import fit_scatter
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights, TargetKind
+from astra_data.learning.networks.paired_windows import RISK_STEPS
 from astra_data.worlds.task import Task
 
 _KEEP_EVERY = 250
-_CLOSEST_SHARE = 0.01
 """Of the recorded steps: those that were closer to a wall are not what a robot can rely on."""
 
 
@@ -70,6 +70,8 @@ class GroundConfig(DescentConfig):
     failure_members: Number = Field(default=0, exclude_if=lambda members: not members)
     """Networks of a failure model, which foresees failures from how the last second went, and replaces what
     R_pred and the topple head say of them; 0 for none. Without effect where no episode fails."""
+    failure_steps: AtOnce = Field(default=RISK_STEPS, exclude_if=lambda steps: steps == RISK_STEPS)
+    """Within how many steps the failure model foresees failures: fewer tell when they come, more warn."""
     recorded_clearance: bool = Field(default=False, exclude_if=lambda used: not used)
     """Let corrected states come no closer to walls than the robot did in 99 of 100 recorded steps: a body
     slimmer than the robot's slides where nothing was recorded. Without effect where a task has no walls."""
@@ -146,8 +148,10 @@ class HistoryFit:
                 training=residual_rewards(fitting.task, fitting.training),
                 held_out=residual_rewards(fitting.task, fitting.held_out),
             )
-        failing = only_unseen(fitting.task, fitting.training)
-        foresees = bool(config.failure_members) and tells_failures(failing)
+        training, held_out = (
+            failing(fitting.task, one, config.failure_steps) for one in (fitting.training, fitting.held_out)
+        )
+        foresees = bool(config.failure_members) and tells_failures(training)
         weights, count = self.weights(config, failures=not foresees), 1 + config.members
         first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
         (model, metrics), members = first, tuple(other for other, _ in others)
@@ -166,11 +170,11 @@ class HistoryFit:
             )
             grounding = replace(grounding, scatters=scatters)
         if foresees:
-            failures = fit_failures(fitting.task, grounding, failing, config.failure_members, fitting.seed)
+            sizes = config.failure_members, fitting.seed, config.failure_steps
+            failures = fit_failures(fitting.task, grounding, training, *sizes)
             grounding = replace(grounding, failures=failures)
         if config.failure_members:
-            unseen = only_unseen(fitting.task, fitting.held_out)
-            metrics["failures"] = compared_foresight(fitting.task, grounding, unseen, self.reward)
+            metrics["failures"] = compared_foresight(fitting.task, grounding, held_out, self.reward)
         return grounding, metrics
 
 
@@ -213,14 +217,6 @@ def _fitted(
     model.set_reward_scales(rewards, goes_on, config.failure_weight * weights.failures)
     fitting = replace(whole, training=training, seed=seed, progress=progress)
     return model, _optimise(model, weights, fitting, whole.folder / name)
-
-
-def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:
-    """Return the distance in m from walls that the robot kept in 99 of 100 steps; None without walls."""
-    if task.plane is None:
-        return None
-    positions = episodes.steps(episodes.windows.state)[:, :2].numpy(force=True)
-    return float(np.quantile(task.maze.clearance(positions), _CLOSEST_SHARE))
 
 
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:

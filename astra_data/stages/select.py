@@ -50,6 +50,8 @@ class SelectConfig(Config):
     failure_members: Number = 5
     """Networks of the failure model that a judge gets whose grounding has none, where some of its episodes
     fail; 0 for none: its states are then scattered as the target's are around the correction."""
+    failure_steps: AtOnce = 2
+    """Within how many steps that failure model foresees failures."""
 
 
 DEFAULTS = SelectConfig()
@@ -158,7 +160,7 @@ def select(
         begun = folder / _BEGUN
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
-            judge_of_seed = cache(partial(_judge, bench, recipe.task, root, config.failure_members))
+            judge_of_seed = cache(partial(_judge, bench, recipe.task, root, config))
             for entry in bench.entries:
                 policy, success = entry.load(root, recipe.task), {}
                 for other in bench.judges:
@@ -220,10 +222,10 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
         )
 
 
-def _judge(bench: Bench, task: str, root: Path, failure_members: int, seed: int) -> Judge:
+def _judge(bench: Bench, task: str, root: Path, config: SelectConfig, seed: int) -> Judge:
     grounding, dataset = bench.judges[seed]
     made, episodes = load_grounding(root / grounding / _GROUNDING), PairedEpisodes.load(root / dataset)
-    return Judge.of(task_named(task), made, episodes, failure_members)
+    return Judge.of(task_named(task), made, episodes, config.failure_members, config.failure_steps)
 
 
 def _digest(folder: Path) -> str:

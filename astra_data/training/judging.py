@@ -6,7 +6,7 @@ from statistics import fmean
 
 from torch import Tensor
 
-from astra_data.grounding.failures import fit_failures, only_unseen, tells_failures
+from astra_data.grounding.failures import failing, fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -26,17 +26,23 @@ class Judge:
 
     @classmethod
     def of(
-        cls, task: Task, grounding: FittedGrounding, episodes: PairedEpisodes, failure_members: int = 0
+        cls,
+        task: Task,
+        grounding: FittedGrounding,
+        episodes: PairedEpisodes,
+        failure_members: int = 0,
+        failure_steps: int = 1,
     ) -> "Judge":
         """Return the judge that a grounding makes, with the scatter of the `episodes` it was fitted to.
 
-        Where these tell failures and it has no failure model, one of `failure_members` networks is fitted.
+        Where these tell failures and it has no failure model, one of `failure_members` networks is fitted,
+        which foresees failures within `failure_steps`.
         """
         scatter = grounding.scatter(episodes)
-        failing = only_unseen(task, episodes)
-        can_tell = bool(failure_members) and tells_failures(failing)
+        before = failing(task, episodes, failure_steps)
+        can_tell = bool(failure_members) and tells_failures(before)
         if can_tell and isinstance(grounding, HistoryGrounding) and grounding.failures is None:
-            failures = fit_failures(task, grounding, failing, failure_members, seed=0)
+            failures = fit_failures(task, grounding, before, failure_members, 0, failure_steps)
             grounding = replace(grounding, failures=failures)
         return cls(task, grounding, scatter)
 

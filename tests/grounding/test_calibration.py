@@ -10,7 +10,7 @@ def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
     true = 1.5 * torch.randn(40_000) - 2.0
     happens = (torch.rand(len(true)) < true.sigmoid()).float()
     for factor in (2.0, 0.5):
-        scale, shift = calibration((factor * (true + 1.0)).expand(2, -1), happens)
+        scale, shift = calibration((factor * (true + 1.0)).expand(2, -1), happens, 1)
         assert float(scale) == pytest.approx(1 / factor, rel=0.05)
         assert float(shift) == pytest.approx(-1.0, abs=0.05)
 
@@ -20,12 +20,13 @@ def test_the_scale_of_few_failures_changes_little_and_never_turns_around() -> No
     torch.manual_seed(0)
     odds = torch.randn(1, 400)
     fails = (torch.arange(400) < 20).float()  # whatever was said
-    few, shift = calibration(odds, fails)
-    many, _ = calibration(odds.repeat(1, 1000), fails.repeat(1000))
+    few, shift = calibration(odds, fails, 20)
+    many, _ = calibration(odds.repeat(1, 1000), fails.repeat(1000), 20)
+    assert float(calibration(odds, fails, 1)[0]) < float(few)
     assert float(few) > 0.6 and 0.0 < float(many) < 0.2
     said = (few * odds + shift).sigmoid().mean()
     assert float(said) == pytest.approx(0.05, rel=1e-3)
-    against, _ = calibration(-5.0 * fails[None] + 0.1 * odds, fails)
+    against, _ = calibration(-5.0 * fails[None] + 0.1 * odds, fails, 20)
     assert float(against) > 0
 
 

@@ -8,9 +8,10 @@ import torch
 from toy_episodes import no_episodes, toy_episodes
 
 from astra_data.core.progress import silent
+from astra_data.grounding.clearance import recorded_clearance_m
 from astra_data.grounding.failures import replayed_inputs
 from astra_data.grounding.files import load_grounding, save_grounding
-from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m
+from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.failure import AHEAD_S, FailureModel, FailureShape
@@ -127,12 +128,15 @@ def test_the_failure_model_is_fitted_to_replays_that_keep_clear(
 
     monkeypatch.setattr("astra_data.grounding.fit.fit_failures", noted)
     monkeypatch.setattr("astra_data.grounding.fit.compared_foresight", lambda *_: {})
-    failed = torch.zeros(1, 10, 1)
+    failed = torch.zeros(1, 10)
     failed[0, -1] = 1.0
     training = recorded(*[1.0] * 10)
     training = replace(training, windows=replace(training.windows, topples_soon=failed))
     config = GroundConfig(
-        updates=1, batch_windows=1, window=2, latent_size=8, recorded_clearance=True, failure_members=1
+        **{"updates": 1, "batch_windows": 1, "window": 2, "latent_size": 8},
+        recorded_clearance=True,
+        failure_members=1,
+        failure_steps=3,
     )
     fitting = Fitting(TASK, config, None, training, training, 0, "cpu", tmp_path, silent)
     HistoryFit(latent=False, reward=False)(fitting)

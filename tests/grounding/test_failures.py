@@ -7,9 +7,9 @@ from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.failures import (
+    failing,
     fit_failures,
     foresight,
-    only_unseen,
     replayed_inputs,
     tells_failures,
 )
@@ -94,9 +94,44 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
         state, torch.zeros(3, 30, 2), next_state=state, mask=mask, goal=goal.expand(3, 30, 2).contiguous()
     )
     made = replace(made, windows=replace(made.windows, topples_soon=mask))
-    unseen = only_unseen(kick, made)
-    assert torch.equal(unseen.windows.topples_soon, mask * torch.tensor([[0.0], [1.0], [1.0]]))
+    unseen = failing(kick, made, 20)
+    expected = torch.zeros(3, 30)
+    expected[1, 10:] = expected[2, :20] = 1
+    assert torch.equal(unseen.windows.topples_soon, expected)
     assert torch.equal(unseen.windows.state, state) and tells_failures(unseen)
+
+
+def test_the_last_steps_before_a_failure_are_as_many_as_asked_for() -> None:
+    episodes = hurried(4, 0)
+    for steps in (1, 3, RISK_STEPS, 50):
+        marked = failing(TASK, episodes, steps).windows.topples_soon
+        assert torch.equal(
+            marked.bool(), episodes.windows.topples_soon.any(1, True) & (left(episodes) <= steps)
+        )
+    assert torch.equal(
+        failing(TASK, episodes, RISK_STEPS).windows.topples_soon, episodes.windows.topples_soon
+    )
+
+
+def left(episodes: PairedEpisodes) -> Tensor:
+    """Steps to the end of each episode, its last one included, (E, T); many where there is none."""
+    mask = episodes.windows.mask
+    return torch.where(mask.bool(), mask.flip(1).cumsum(1).flip(1), 1000.0)
+
+
+def test_a_model_of_fewer_steps_knows_the_moment_and_expects_as_many_failures() -> None:
+    """Robots that hurry fail after 30 steps of it: within 3 steps is told later than within 20."""
+    training, fresh = hurried(40, 0), hurried(40, 1)
+    hazards = {}
+    for steps in (3, RISK_STEPS):
+        before = failing(TASK, training, steps)
+        model = fit_failures(TASK, HistoryGrounding(grounding_model()), before, 3, 0, steps)
+        assert model.shape.risk_steps == steps
+        hazards[steps] = model.hazard(said_of(model, fresh)) * fresh.windows.mask
+        assert float(hazards[steps].sum()) == pytest.approx(20, rel=0.35)
+    last = fresh.windows.topples_soon.any(1, True) & (left(fresh) <= 3)
+    late = {steps: float(hazard[last].sum() / hazard.sum()) for steps, hazard in hazards.items()}
+    assert late[3] > 1.5 * late[RISK_STEPS]
 
 
 def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before() -> None:
@@ -218,13 +253,14 @@ def test_what_is_only_learned_by_heart_is_not_believed(monkeypatch: pytest.Monke
 def test_every_step_is_cross_fitted_once_and_what_was_found_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[tuple[Tensor, Tensor]] = []
 
-    def noted(odds: Tensor, fails: Tensor) -> tuple[Tensor, Tensor]:
+    def noted(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, Tensor]:
+        assert risk_steps == 7
         given.append((odds, fails))
         return torch.tensor(0.0), torch.tensor(-1.0)
 
     monkeypatch.setattr("astra_data.grounding.failures.calibration", noted)
-    episodes = hurried(10, 0)
-    model = fit_failures(TASK, HistoryGrounding(grounding_model()), episodes, 3, seed=0)
+    episodes = failing(TASK, hurried(10, 0), 7)
+    model = fit_failures(TASK, HistoryGrounding(grounding_model()), episodes, 3, 0, 7)
     ((odds, fails),) = given
     steps = int(episodes.windows.mask.sum())
     assert odds.shape == (3, steps) and fails.shape == (steps,)

@@ -199,7 +199,7 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
     for members in (0, 2):
         folder = tmp_path / f"{members}"
         folder.mkdir()
-        asked = config.model_copy(update={"failure_members": members})
+        asked = config.model_copy(update={"failure_members": members, "failure_steps": 3})
         given = Fitting(TASKS["antmaze-umaze"], asked, None, training, held_out, 0, "cpu", folder, silent)
         grounding, metrics = HistoryFit(latent=True, reward=True)(given)
         assert (grounding.failures is None) == (members == 0)
@@ -207,6 +207,8 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
         # It replaces the topple head, which is then not fitted.
         assert ("loss_topple" in metrics["epochs"][-1]) == (members == 0)
     assert grounding.failures is not None and len(grounding.failures.members) == 2
+    assert grounding.failures.shape.risk_steps == 3
     # R_pred learned no failures then: there is nothing of it to compare.
     assert metrics["failures"].keys() == {"failure_model"}
     assert "failure_members" not in config.model_dump() and asked.model_dump()["failure_members"] == 2
+    assert "failure_steps" not in config.model_dump() and asked.model_dump()["failure_steps"] == 3

@@ -158,17 +158,17 @@ def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
 def test_judges_without_a_failure_model_get_one_of_the_recipes_size_when_they_are_asked_first(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun, made = list[int](), Judge.of
+    begun, made = list[tuple[int, int]](), Judge.of
 
     def of(*given: Any) -> Judge:  # noqa: ANN401
-        begun.append(given[-1])
+        begun.append(given[-2:])
         return made(*given)
 
     monkeypatch.setattr(Judge, "of", of)
     monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
-    judged(root, failure_members=7)
-    assert begun == [7, 7, 7]  # once for each of three judges of six policies
-    assert SelectConfig().failure_members == 5
+    judged(root, failure_members=7, failure_steps=3)
+    assert begun == [(7, 3)] * 3  # once for each of three judges of six policies
+    assert (SelectConfig().failure_members, SelectConfig().failure_steps) == (5, 2)
 
 
 def test_judges_of_the_same_episodes_are_named(root: Path) -> None:

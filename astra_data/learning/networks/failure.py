@@ -30,6 +30,7 @@ class FailureShape:
         maze_cells: (height, width) of the maze's fine grid; zeros where there is no maze.
         cell_m: side of its cells.
         members: networks, whose probabilities are averaged.
+        risk_steps: within how many steps a failure is foreseen.
         hidden_size: of their two layers. dropout: rate after each.
     """
 
@@ -39,6 +40,7 @@ class FailureShape:
     maze_cells: tuple[int, int] = (0, 0)
     cell_m: float = 1.0
     members: int = 5
+    risk_steps: int = RISK_STEPS
     hidden_size: int = 32
     dropout: float = 0.2
 
@@ -50,7 +52,7 @@ class FailureShape:
 
 
 class FailureModel(nn.Module):
-    """Estimate the probability of a failure within `RISK_STEPS`, from before a step is corrected.
+    """Estimate the probability of a failure within the shape's `risk_steps`, from before a step is corrected.
 
     The memory (B, M) is an argument and a result, never kept: the last state, where the simulator had landed,
     the last action, and the averages.
@@ -108,7 +110,7 @@ class FailureModel(nn.Module):
         return torch.cat([state, state, previous_action, averages], dim=-1)
 
     def step(self, state: Tensor, action: Tensor, landed: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the probability (B,) of a failure within `RISK_STEPS`, and the next memory (B, M).
+        """Return the probability (B,) of a failure within `risk_steps`, and the next memory (B, M).
 
         Args:
             state: s_i, (B, X).
@@ -150,8 +152,8 @@ class FailureModel(nn.Module):
         self.log_odds_shift.copy_(shift)
 
     def hazard(self, probability: Tensor) -> Tensor:
-        """Return the probability (...) of a failure in the very step, given that within `RISK_STEPS`."""
-        return probability / RISK_STEPS
+        """Return the probability (...) of a failure in the very step, given that within `risk_steps`."""
+        return probability / self.shape.risk_steps
 
     @property
     def memory_size(self) -> int:

@@ -1,0 +1,16 @@
+"""How near a robot came to walls."""
+
+import numpy as np
+
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.worlds.task import Task
+
+_CLOSEST_SHARE = 0.01
+
+
+def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:
+    """Return the distance in m from walls that the robot kept in 99 of 100 steps; None without walls."""
+    if task.plane is None:
+        return None
+    positions = episodes.steps(episodes.windows.state)[:, :2].numpy(force=True)
+    return float(np.quantile(task.maze.clearance(positions), _CLOSEST_SHARE))
