@@ -133,7 +133,10 @@ def test_the_failure_model_is_fitted_to_replays_that_keep_clear(
     training = recorded(*[1.0] * 10)
     training = replace(training, windows=replace(training.windows, topples_soon=failed))
     config = GroundConfig(
-        **{"updates": 1, "batch_windows": 1, "window": 2, "latent_size": 8},
+        updates=1,
+        batch_windows=1,
+        window=2,
+        latent_size=8,
         recorded_clearance=True,
         failure_members=1,
         failure_steps=3,
