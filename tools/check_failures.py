@@ -2,10 +2,13 @@
 
     python tools/check_failures.py antmaze-long runs/x --fresh 3 --fresh 4 --episodes 50
     python tools/check_failures.py cart.py:TASK runs/x --row astra --fresh 1
+    python tools/check_failures.py cart.py:TASK runs/x --within 20 --within 2
 
 Failure models are fitted to a seed's paired episodes, as they are replayed in its grounding, and measured on
 those of other seeds, replayed there as well. So are its own failure model, topple head and R_pred; and the
 recorded commands are replayed as a whole, where the model is to expect as many failures as were recorded.
+With `--within`, failure models of so many steps are cross-fitted to the seed's own episodes instead, and it
+is told how well they know the very step of a failure.
 """
 
 from collections.abc import Mapping
@@ -15,9 +18,11 @@ from typing import Annotated, Any
 import torch
 import typer
 
+from astra_data.grounding.calibration import folds
 from astra_data.grounding.failures import (
     AHEAD_STEPS,
     compared_foresight,
+    failing,
     fit_failures,
     foresight,
     replayed_inputs,
@@ -35,22 +40,26 @@ from astra_data.worlds.task import Task
 def main(
     task: str,
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
-    fresh: Annotated[list[int], typer.Option(help="Seeds whose episodes to measure on.")],
+    fresh: Annotated[list[int] | None, typer.Option(help="Seeds whose episodes to measure on.")] = None,
     row: Annotated[str, typer.Option(help="Whose grounding.")] = "nas",
     seed: Annotated[int, typer.Option(help="Of the grounding, and of the episodes to fit to.")] = 0,
     episodes: Annotated[list[int] | None, typer.Option(help="First episodes to fit to, besides all.")] = None,
     members: Annotated[int, typer.Option(help="Networks of each failure model.")] = 5,
     ahead: Annotated[list[str] | None, typer.Option(help='Steps before a failure, such as "1-5".')] = None,
+    within: Annotated[list[int] | None, typer.Option(help="Steps of failure models to compare.")] = None,
 ) -> None:
     """Print a line for each model and dataset."""
     world = task_named(task)
-    measured = {one: PairedEpisodes.load(run / "pair" / f"seed_{one}") for one in fresh}
+    measured = {one: PairedEpisodes.load(run / "pair" / f"seed_{one}") for one in fresh or ()}
     windows = [(int(first), int(last)) for first, _, last in (one.partition("-") for one in ahead or ())]
     windows = windows or list(AHEAD_STEPS)
     grounding = load_grounding(run / "ground" / row / f"seed_{seed}" / "grounding.safetensors")
     if not isinstance(grounding, HistoryGrounding):
         raise typer.BadParameter(f"{row} has no history grounding")
     whole = PairedEpisodes.load(run / "pair" / f"seed_{seed}")
+    if within:
+        _print_likelihoods(world, grounding, whole, members, within)
+        return
     titles = " | ".join(f"{first}-{last}" for first, last in windows)
     print(f"| fitted to | failures | on seed | {titles} | Brier skill |")
     print("|---|---|---|" + "---|" * (len(windows) + 1))
@@ -71,6 +80,32 @@ def main(
             print(f"| {row}: {head} | | {name} {_figures(found)}")
     if grounding.failures is not None:
         _print_rates(world, grounding, measured)
+
+
+def _print_likelihoods(
+    task: Task, grounding: HistoryGrounding, whole: PairedEpisodes, members: int, within: list[int]
+) -> None:
+    """Print the log-likelihood of when failures came, above that of a constant rate."""
+    print("| within | failures | nats a failure above a constant rate | expected |\n|---|---|---|---|")
+    for steps in within:
+        episodes = failing(task, whole, steps)
+        mask, fails = episodes.windows.mask, episodes.windows.topples_soon.any(1)
+        hazard = torch.zeros_like(mask)
+        torch.manual_seed(0)
+        for fold in folds(fails):
+            fitted_to, fresh = (episodes.select(part.nonzero().squeeze(1)) for part in (~fold, fold))
+            model = fit_failures(task, grounding, fitted_to, members, 0, steps)
+            hazard[fold] = model.hazard(model.probability(replayed_inputs(task, grounding, model, fresh)))
+        here = fails[:, None] & (failing(task, whole, 1).windows.topples_soon > 0)
+        count, steps_in_all = float(fails.sum()), float(mask.sum())
+        rate = torch.full_like(mask, count / steps_in_all)
+        known, usual = (
+            float((torch.where(here, one.log(), torch.log1p(-one)) * mask).sum())
+            for one in (hazard.clamp(1e-7, 1 - 1e-7), rate)
+        )
+        print(
+            f"| {steps} | {count:.0f} | {(known - usual) / count:.2f} | {float((hazard * mask).sum()):.1f} |"
+        )
 
 
 def _figures(found: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from statistics import fmean
 
 from astra_data.reports.choice_page import named
 from astra_data.reports.formatting import interval, spread
@@ -54,7 +55,8 @@ class Verdict:
 def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     """Name the row to deploy: that of the chosen policy, or else the one with the best mean over seeds.
 
-    A row with a role, such as the floor, is a reference and never the one.
+    A row with a role, such as the floor, is a reference and never the one. Where nothing was tested in the
+    target, rows are compared by what judges predict, if a policy was chosen: they foresee failures.
 
     Args:
         results: of all rows.
@@ -66,7 +68,11 @@ def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     chosen = chosen_of(results)
     name = chosen.row if chosen else best_of(results)
     row = results.methods[name]
-    as_good = [floor.title for floor in _floors(results) if _mean(results, floor) >= _mean(results, row)]
+    as_good = [
+        results.methods[floor].title
+        for floor in _floors(results)
+        if _worth(results, floor) >= _worth(results, name)
+    ]
     opening = "Deploy"
     if as_good:
         opening = (
@@ -84,7 +90,7 @@ def best_of(results: Results) -> str:
     """Return the row with the best mean over seeds that is no reference."""
     return max(
         (name for name, row in results.methods.items() if not row.role),
-        key=lambda name: _mean(results, results.methods[name]),
+        key=lambda name: _worth(results, name),
     )
 
 
@@ -109,7 +115,9 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         for one in candidates[: candidates.index(chosen)]:
             yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
         if best is not row:
-            yield f"By the mean over seeds {best.title} is ahead: {_score(results, best)}."
+            predicted = _predicted(results, best_of(results))
+            score = _score(results, best) if predicted is None else f"predicted success {predicted:.2f}"
+            yield f"By the mean over seeds {best.title} is ahead: {score}."
         if results.choice.regret and chosen is candidates[0]:
             yield (
                 f"In hindsight another policy is better in the target, by {results.choice.regret:.2f}: "
@@ -128,7 +136,11 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         if ties:
             yield f"As good by the mean: {', '.join(ties)}."
     for floor in _floors(results):
-        yield from _against(results, row, floor)
+        predicted = _predicted(results, floor)
+        if predicted is None:
+            yield from _against(results, row, results.methods[floor])
+        else:
+            yield f"{results.methods[floor].title} is predicted {predicted:.2f}, a mean over its seeds."
     failed = row.summary["failed"].mean
     if failed >= _MOSTLY:
         yield (
@@ -153,8 +165,20 @@ def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iter
         )
 
 
-def _floors(results: Results) -> list[MethodResults]:
-    return [row for row in results.methods.values() if row.role == "floor"]
+def _floors(results: Results) -> list[str]:
+    return [name for name, row in results.methods.items() if row.role == "floor"]
+
+
+def _worth(results: Results, name: str) -> float:
+    """Return by how much rows are compared: the mean of the score, or of the predicted success."""
+    predicted = _predicted(results, name)
+    return _mean(results, results.methods[name]) if predicted is None else predicted
+
+
+def _predicted(results: Results, name: str) -> float | None:
+    """Return the mean success that judges predict of a row's policies; None where the target tells it."""
+    candidates = results.choice.candidates if results.choice and results.tested_in != "target" else []
+    return fmean(found) if (found := [one.predicted for one in candidates if one.row == name]) else None
 
 
 def _mean(results: Results, row: MethodResults) -> float:
@@ -237,10 +261,11 @@ def _of_choice(results: Results, chosen: Ranked) -> Iterator[Fact]:
 def _of_row(results: Results, row: MethodResults) -> Fact:
     score = results.headline
     summary = row.summary[score.measure]
+    place = "" if results.tested_in == "target" else f" {where(results)}"
     if summary.low is None or summary.high is None:
-        note = f"{score.title}, {_seeds(row)}: no interval"
+        note = f"{score.title}{place}, {_seeds(row)}: no interval"
     else:
         ends = interval(summary.iqm, summary.low, summary.high, score.digits)
-        note = f"{score.title}, {_seeds(row)}; IQM {ends}"
+        note = f"{score.title}{place}, {_seeds(row)}; IQM {ends}"
     label = f"{row.title} ({row.role})" if row.role else row.title
     return Fact(label, spread(summary, score.digits), note)

@@ -112,6 +112,38 @@ def test_a_choice_of_the_floor_or_of_what_is_untested_is_passed_over(results: Re
     assert verdict.facts[1].value == "-"
 
 
+def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Results) -> None:
+    """Simulators show no failures: the floor has 1 there, and judges say 0.1."""
+    candidates = [
+        *(candidate("astra", 1, 0.9), candidate("astra_plus", 0, 0.8), candidate("astra_plus", 1, 0.8)),
+        *(
+            candidate("astra", 0, 0.5),
+            candidate("direct_transfer", 0, 0.0),
+            candidate("direct_transfer", 1, 0.2),
+        ),
+    ]
+    choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
+    shown = with_success(results, direct_transfer=[1.0, 1.0, 1.0], astra=[0.5, 0.5, 0.5])
+    untested = shown.model_copy(update={"choice": choice, "tested_in": "grounded"})
+    verdict = verdict_of(untested)
+    assert (verdict.opening, verdict.title) == ("Deploy", "ASTRA, seed 1")
+    assert "Direct transfer is predicted 0.10, a mean over its seeds." in verdict.remarks
+    assert "By the mean over seeds ASTRA+ is ahead: predicted success 0.80." in verdict.remarks
+    assert not any("overlap" in remark for remark in verdict.remarks)
+    assert next(fact for fact in verdict.facts if fact.label == "ASTRA").note.startswith("success in ")
+    as_good = choice.model_copy(
+        update={"candidates": [*candidates[:4], candidate("direct_transfer", 0, 0.8)]}
+    )
+    assert verdict_of(untested.model_copy(update={"choice": as_good})).opening.startswith("No gain over the")
+    # In the target it is measured, and what was predicted is no matter.
+    assert verdict_of(shown.model_copy(update={"choice": choice})).opening.startswith(
+        "No gain over the floor"
+    )
+    assert verdict_of(untested.model_copy(update={"choice": None})).opening.startswith(
+        "No gain over the floor"
+    )
+
+
 def test_a_single_seed_has_no_interval(tmp_path: Path) -> None:
     verdict = verdict_of(made(tmp_path, seeds=(1,)))
     assert sentence(verdict).startswith(
