@@ -78,8 +78,9 @@ def record(folder, drives=60, seconds=15, seed=0):
 
 def play(run, trials=100, seed=0):
     """Print which share of its trials each policy of a run delivers, and tips."""
-    for row in sorted(folder.name for folder in (Path(run) / "train").iterdir()):
-        policy, rng = load_policy(run, row), np.random.default_rng(seed)
+    for trained in sorted((Path(run) / "train").glob("*/seed_*")):
+        row, its_seed = trained.parent.name, int(trained.name.removeprefix("seed_"))
+        policy, rng = load_policy(run, row, seed=its_seed), np.random.default_rng(seed)
         carts = [TrueCart() for _ in range(trials)]
         states = np.array([cart.reset(int(rng.integers(2**32))) for cart in carts])
         delivered, tipped = np.zeros(trials, bool), np.zeros(trials, bool)
@@ -90,7 +91,7 @@ def play(run, trials=100, seed=0):
             for number in np.flatnonzero(~delivered & ~tipped):
                 states[number], tipped[number] = carts[number].step(commands[number])
             delivered |= (np.linalg.norm(states[:, :2] - DOCK_M, axis=1) < 0.3) & ~tipped
-        print(f"{row}: delivered {delivered.mean():.2f}, tipped {tipped.mean():.2f}")
+        print(f"{row}, seed {its_seed}: delivered {delivered.mean():.2f}, tipped {tipped.mean():.2f}")
 
 
 if __name__ == "__main__":
