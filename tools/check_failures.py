@@ -65,7 +65,7 @@ def main(
     print("|---|---|---|" + "---|" * (len(windows) + 1))
     for count in [*(episodes or []), len(whole)]:
         part = whole.select(torch.arange(count))
-        if not tells_failures(part):
+        if not tells_failures(world, part):
             continue
         fitted = fit_failures(world, grounding, part, members, seed=0)
         failures = int(part.windows.topples_soon.any(1).sum())

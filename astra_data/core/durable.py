@@ -49,16 +49,12 @@ def move(source: Path, target: Path) -> None:
     sync(target.parent)
 
 
-def make_folder(folder: Path) -> list[Path]:
-    """Make `folder` and those that it is in; return what was made, the innermost first.
-
-    When this returns, the disk knows.
-    """
+def make_folder(folder: Path) -> None:
+    """Make `folder` and those that it is in; when this returns, the disk knows."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for path in missing:
         sync(path.parent)
-    return missing
 
 
 def write_file(path: Path, content: str | bytes) -> None:
@@ -149,12 +145,13 @@ def _remove_dead(path: Path) -> bool:
 @contextmanager
 def _folder_for(target: Path) -> Iterator[None]:
     """Make the folder that `target` is in; if the block fails, remove what was made and holds nothing."""
-    made = make_folder(target.parent)
+    missing = [path for path in target.parents if not path.exists()]
     try:
+        make_folder(target.parent)
         yield
     except BaseException:
-        with suppress(OSError):
-            for path in made:
+        for path in missing:
+            with suppress(OSError):
                 path.rmdir()
         raise
 

@@ -6,6 +6,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.worlds.task import Task
 
 _CLOSEST_SHARE = 0.01
+"""Of the recorded steps: those that were closer to a wall are not what a robot can rely on."""
 
 
 def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:

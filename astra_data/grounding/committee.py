@@ -78,7 +78,8 @@ class Committee:
             )
         # In float64 the product keeps its tiny eigenvalues, which the factor of the scatter has.
         factors = torch.stack([made.model.residual_factor for made in known]).double()
-        kept = [made.clearance_m for made in known if made.clearance_m is not None]
+        bodies = [made.foreseeing(task.objective) if made.failures is not None else made for made in known]
+        kept = [made.clearance_m for made in bodies if made.clearance_m is not None]
         return cls(
             task,
             models,

@@ -17,7 +17,7 @@ from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.failure import FailureModel, FailureShape
-from astra_data.learning.networks.paired_windows import RISK_STEPS
+from astra_data.learning.networks.paired_windows import RISK_STEPS, before_failures
 from astra_data.worlds.task import Task
 
 AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
@@ -37,19 +37,24 @@ def failing(task: Task, episodes: PairedEpisodes, risk_steps: int) -> PairedEpis
     """Return the episodes with what a failure model learns of them as `topples_soon`.
 
     That is the last `risk_steps` before a failure that no abstract state shows. Where one does, as with a
-    ball beside the goal, simulators end episodes themselves, and a failure model would end them twice.
+    ball beside the goal, simulators end episodes themselves, and a failure model would end them twice. A
+    touch of a wall is learned: where a simulated body touches one, the robot's often does not, and the other
+    way round.
     """
     windows, last = episodes.windows, episodes.lengths - 1
     each = torch.arange(len(episodes), device=last.device)
     is_shown = task.objective.missed(windows.next_state[each, last], windows.goal[each, last])
     fails = windows.topples_soon.any(1) & ~is_shown
-    left = episodes.lengths[:, None] - torch.arange(windows.mask.shape[1], device=last.device)
-    soon = fails[:, None] & (left >= 1) & (left <= risk_steps)
-    return replace(episodes, windows=replace(windows, topples_soon=soon.float()))
+    soon = before_failures(fails, windows.mask, risk_steps)
+    return replace(episodes, windows=replace(windows, topples_soon=soon))
 
 
-def tells_failures(episodes: PairedEpisodes) -> bool:
+def tells_failures(task: Task, episodes: PairedEpisodes, risk_steps: int = RISK_STEPS) -> bool:
     """Whether a failure model can be fitted: some steps are before a failure, and not every one."""
+    return _tells(failing(task, episodes, risk_steps))
+
+
+def _tells(episodes: PairedEpisodes) -> bool:
     return _has_both(episodes.steps(episodes.windows.topples_soon))
 
 
@@ -63,8 +68,9 @@ def fit_failures(
 ) -> FailureModel:
     """Fit a failure model of `members` networks to replays of whole episodes; calibrate it by cross-fitting.
 
-    The episodes are what `failing` returns for `risk_steps`, and such that `tells_failures`.
+    The episodes are such that `tells_failures`.
     """
+    training = failing(task, training, risk_steps)
     fails = training.windows.topples_soon
     torch.manual_seed(derive(seed, "failure model"))
     untrained = _untrained(task, training, members, risk_steps)
@@ -75,7 +81,7 @@ def fit_failures(
     odds, happened = [], []
     for fold in folds(fails.any(1)):
         others = training.select((~fold).nonzero().squeeze(1))
-        if not tells_failures(others):
+        if not _tells(others):
             continue
         fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.topples_soon))
         own = training.select(fold.nonzero().squeeze(1))
@@ -172,16 +178,18 @@ def compared_foresight(
     """
     windows, model, failures = held_out.windows, grounding.model, grounding.failures
     latent, _ = model.encode(windows)
-    compared = {}
+    found = {}
     if predicts_reward and model.failure_weight > 0:
         parts = model.predict_reward_parts(latent, windows.action)
-        compared["predicted_reward"] = (parts[..., 1] / model.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
+        probability = (parts[..., 1] / model.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
+        found["predicted_reward"] = foresight(probability, held_out)
     if failures is not None:
-        compared["failure_model"] = failures.probability(replayed_inputs(task, grounding, failures, held_out))
+        probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
+        found["failure_model"] = foresight(probability, failing(task, held_out, failures.shape.risk_steps))
     else:
-        logit = model.topple_logit(latent, windows.action, windows.next_state)
-        compared["topple_head"] = logit.sigmoid()
-    return {name: foresight(probability, held_out) for name, probability in compared.items()}
+        probability = model.topple_logit(latent, windows.action, windows.next_state).sigmoid()
+        found["topple_head"] = foresight(probability, held_out)
+    return found
 
 
 def foresight(

@@ -16,7 +16,7 @@ from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.clearance import recorded_clearance_m
 from astra_data.grounding.diagnostics import telemetry
-from astra_data.grounding.failures import compared_foresight, failing, fit_failures, tells_failures
+from astra_data.grounding.failures import compared_foresight, fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -28,7 +28,6 @@ from astra_data.learning.networks.paired_windows import RISK_STEPS
 from astra_data.worlds.task import Task
 
 _KEEP_EVERY = 250
-"""Of the recorded steps: those that were closer to a wall are not what a robot can rely on."""
 
 
 class GroundConfig(DescentConfig):
@@ -148,10 +147,8 @@ class HistoryFit:
                 training=residual_rewards(fitting.task, fitting.training),
                 held_out=residual_rewards(fitting.task, fitting.held_out),
             )
-        training, held_out = (
-            failing(fitting.task, one, config.failure_steps) for one in (fitting.training, fitting.held_out)
-        )
-        foresees = bool(config.failure_members) and tells_failures(training)
+        can_tell = tells_failures(fitting.task, fitting.training, config.failure_steps)
+        foresees = bool(config.failure_members) and can_tell
         weights, count = self.weights(config, failures=not foresees), 1 + config.members
         first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
         (model, metrics), members = first, tuple(other for other, _ in others)
@@ -171,10 +168,10 @@ class HistoryFit:
             grounding = replace(grounding, scatters=scatters)
         if foresees:
             sizes = config.failure_members, fitting.seed, config.failure_steps
-            failures = fit_failures(fitting.task, grounding, training, *sizes)
+            failures = fit_failures(fitting.task, grounding, fitting.training, *sizes)
             grounding = replace(grounding, failures=failures)
         if config.failure_members:
-            metrics["failures"] = compared_foresight(fitting.task, grounding, held_out, self.reward)
+            metrics["failures"] = compared_foresight(fitting.task, grounding, fitting.held_out, self.reward)
         return grounding, metrics
 
 

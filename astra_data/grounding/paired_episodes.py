@@ -28,7 +28,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.endings import stands_still
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
-from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
+from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows, before_failures
 from astra_data.learning.recorded import draw_steps
 from astra_data.worlds.commands import Commands
 
@@ -123,7 +123,7 @@ class PairedEpisodes:
                 next_state=padded[ABSTRACT_NEXT_STATE],
                 reward=torch.stack([reward * ~terminated, reward * failed], dim=-1),
                 goes_on=(mask & ~terminated).float(),
-                topples_soon=_topples_soon(failed, mask),
+                topples_soon=before_failures(failed.any(1), mask, RISK_STEPS),
                 mask=mask.float(),
             ),
             reference=dataset.reference,
@@ -237,12 +237,6 @@ def _dropped_place(dataset: Dataset) -> tuple[int, ...]:
         return ()
     groups = [group for role, group in columns[STATE].roles if role == "position"]
     return tuple(index for group in groups for index in range(group.start, group.stop))
-
-
-def _topples_soon(failed: Tensor, mask: Tensor) -> Tensor:
-    """Mark the last `RISK_STEPS` steps of each episode that ends in failure, (E, T), 0 or 1."""
-    steps_left = mask.flip(1).cumsum(1).flip(1)
-    return (failed.any(1, keepdim=True) & mask & (steps_left <= RISK_STEPS)).float()
 
 
 def _gather(windows: PairedWindows, rows: Tensor | tuple[Tensor, Tensor]) -> PairedWindows:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import inf
 from statistics import fmean
 
 from astra_data.reports.choice_page import named
@@ -68,11 +69,8 @@ def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     chosen = chosen_of(results)
     name = chosen.row if chosen else best_of(results)
     row = results.methods[name]
-    as_good = [
-        results.methods[floor].title
-        for floor in _floors(results)
-        if _worth(results, floor) >= _worth(results, name)
-    ]
+    worth = _worth(results)
+    as_good = [floor.title for key, floor in _floors(results) if worth.get(key, -inf) >= worth[name]]
     opening = "Deploy"
     if as_good:
         opening = (
@@ -88,10 +86,8 @@ def verdict_of(results: Results, percent: int | None = None) -> Verdict:
 
 def best_of(results: Results) -> str:
     """Return the row with the best mean over seeds that is no reference."""
-    return max(
-        (name for name, row in results.methods.items() if not row.role),
-        key=lambda name: _worth(results, name),
-    )
+    worth = _worth(results)
+    return max((name for name in worth if not results.methods[name].role), key=lambda name: worth[name])
 
 
 def chosen_of(results: Results) -> Ranked | None:
@@ -110,13 +106,14 @@ def _passed_over(results: Results, one: Ranked) -> str:
 
 def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
     row, best = results.methods[name], results.methods[best_of(results)]
+    worth, is_predicted = _worth(results), _is_predicted(results)
     if chosen and results.choice:
         candidates = results.choice.candidates
         for one in candidates[: candidates.index(chosen)]:
             yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
         if best is not row:
-            predicted = _predicted(results, best_of(results))
-            score = _score(results, best) if predicted is None else f"predicted success {predicted:.2f}"
+            ahead = worth[best_of(results)]
+            score = f"predicted success {ahead:.2f}" if is_predicted else _score(results, best)
             yield f"By the mean over seeds {best.title} is ahead: {score}."
         if results.choice.regret and chosen is candidates[0]:
             yield (
@@ -135,12 +132,15 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         ]
         if ties:
             yield f"As good by the mean: {', '.join(ties)}."
-    for floor in _floors(results):
-        predicted = _predicted(results, floor)
-        if predicted is None:
-            yield from _against(results, row, results.methods[floor])
-        else:
-            yield f"{results.methods[floor].title} is predicted {predicted:.2f}, a mean over its seeds."
+    for key, floor in _floors(results):
+        if not is_predicted:
+            yield from _against(results, row, floor)
+        elif key in worth:
+            yield f"{floor.title} is predicted {worth[key]:.2f}, a mean over its seeds."
+    if unjudged := [
+        of.title for key, of in results.methods.items() if of.role != "ceiling" and key not in worth
+    ]:
+        yield f"Not judged, so not compared: {', '.join(unjudged)}."
     failed = row.summary["failed"].mean
     if failed >= _MOSTLY:
         yield (
@@ -165,20 +165,24 @@ def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iter
         )
 
 
-def _floors(results: Results) -> list[str]:
-    return [name for name, row in results.methods.items() if row.role == "floor"]
+def _floors(results: Results) -> list[tuple[str, MethodResults]]:
+    return [(name, row) for name, row in results.methods.items() if row.role == "floor"]
 
 
-def _worth(results: Results, name: str) -> float:
-    """Return by how much rows are compared: the mean of the score, or of the predicted success."""
-    predicted = _predicted(results, name)
-    return _mean(results, results.methods[name]) if predicted is None else predicted
+def _is_predicted(results: Results) -> bool:
+    """Whether rows are compared by what judges predict: the target told nothing, and a policy was chosen."""
+    return results.tested_in != "target" and chosen_of(results) is not None
 
 
-def _predicted(results: Results, name: str) -> float | None:
-    """Return the mean success that judges predict of a row's policies; None where the target tells it."""
-    candidates = results.choice.candidates if results.choice and results.tested_in != "target" else []
-    return fmean(found) if (found := [one.predicted for one in candidates if one.row == name]) else None
+def _worth(results: Results) -> dict[str, float]:
+    """Return by what rows are compared: the mean of the score, or of the predicted success where that is."""
+    if not _is_predicted(results) or results.choice is None:
+        return {name: _mean(results, row) for name, row in results.methods.items()}
+    predicted: dict[str, list[float]] = {}
+    for one in results.choice.candidates:
+        if one.row in results.methods:
+            predicted.setdefault(one.row, []).append(one.predicted)
+    return {name: fmean(values) for name, values in predicted.items()}
 
 
 def _mean(results: Results, row: MethodResults) -> float:

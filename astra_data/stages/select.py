@@ -48,8 +48,8 @@ class SelectConfig(Config):
     judge: str | None = None
     """Row whose groundings judge; by default the reference, NAS."""
     failure_members: Number = 5
-    """Networks of the failure model that a judge gets whose grounding has none, where some of its episodes
-    fail; 0 for none: its states are then scattered as the target's are around the correction."""
+    """Networks of the failure model that a judge gets whose history model has none, where some of its
+    episodes fail; 0 for none: its states are then scattered as the target's are around the correction."""
     failure_steps: AtOnce = 2
     """Within how many steps that failure model foresees failures."""
 

@@ -1,5 +1,6 @@
 """Recordings of a robot: datasets and logs → pieces of rows; rows that do not count are marked."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from hashlib import sha256
@@ -15,7 +16,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
 from astra_data.dataset.endings import is_terminated, stands_still
 from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.versions import locate
+from astra_data.dataset.versions import Version, locate
 from astra_data.exchange.importing import import_dataset, log_suffixes
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import find_sources, is_archive
@@ -91,7 +92,7 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
     Raises:
         BadInputError: a part of `place` is not usable, or there is none; the message says why.
     """
-    if not place.exists():
+    if not os.path.exists(place):
         try:
             place = locate(place)
         except BadInputError as error:
@@ -147,8 +148,13 @@ def _recording(
 
 
 def place_name(place: Path) -> str:
-    """Return the name of a recording or of a folder of recordings: its file name without endings."""
-    return place.resolve().name.partition(".")[0]
+    """Return the name of a recording or of a folder of recordings: its file name without endings.
+
+    Of a version of a dataset it is the dataset's name and the version.
+    """
+    found = place.resolve() if os.path.exists(place) else locate(place)
+    version = Version.from_tag(found.name)
+    return f"{found.parent.name}-{version}" if version else found.name.partition(".")[0]
 
 
 def _pieces(name: str, dataset: Dataset, fps: int, config: Reading) -> Iterator[Piece]:

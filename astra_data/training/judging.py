@@ -6,7 +6,7 @@ from statistics import fmean
 
 from torch import Tensor
 
-from astra_data.grounding.failures import failing, fit_failures, tells_failures
+from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -39,10 +39,9 @@ class Judge:
         which foresees failures within `failure_steps`.
         """
         scatter = grounding.scatter(episodes)
-        before = failing(task, episodes, failure_steps)
-        can_tell = bool(failure_members) and tells_failures(before)
+        can_tell = bool(failure_members) and tells_failures(task, episodes, failure_steps)
         if can_tell and isinstance(grounding, HistoryGrounding) and grounding.failures is None:
-            failures = fit_failures(task, grounding, before, failure_members, 0, failure_steps)
+            failures = fit_failures(task, grounding, episodes, failure_members, 0, failure_steps)
             grounding = replace(grounding, failures=failures)
         return cls(task, grounding, scatter)
 

@@ -139,8 +139,11 @@ def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path
 
 def test_a_failure_removes_the_folders_that_were_made_for_it_alone(tmp_path: Path) -> None:
     home = tmp_path / "home"
-    with pytest.raises(KeyError), hidden_folder(home / "walks/data-1.0.0"):
+    with pytest.raises(KeyError), hidden_folder(home / "of/walks/data-1.0.0"):
         raise KeyError
+    assert not home.exists()
+    with pytest.raises(DiskError):
+        write_file(home / ("walks" * 100) / "notes.txt", "its name is too long")
     assert not home.exists()
     home.mkdir()
     with pytest.raises(KeyError), hidden_folder(home / "walks/data-1.0.0"):

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +78,19 @@ def test_groundings_of_several_seeds_are_one_committee() -> None:
     of = Committee.of(TASK, made)
     np.testing.assert_allclose(follow(of)[1], follow(committee())[1], rtol=1e-5)
     assert of.covariance.item() == pytest.approx(SCATTER_M**2)
+
+
+def test_where_touches_are_foreseen_episodes_are_followed_up_to_the_wall() -> None:
+    """The recorded clearance is for policies: a failure model tells by itself what comes of touches."""
+    ends_there = replace(TASK, objective=replace(TASK.objective, ends_at_walls=True))
+    failures = FailureModel(FailureShape(state_size=1, action_size=1, timestep_s=0.1, members=1)).eval()
+    for task, model, kept in (
+        (TASK, failures, 0.3),
+        (ends_there, None, 0.3),
+        (ends_there, failures, None),
+    ):
+        made = [HistoryGrounding(shifted(offset), model, clearance_m=0.3) for offset in OFFSETS_M]
+        assert Committee.of(task, made).clearance_m == kept
 
 
 def test_one_correction_alone_cannot_disagree() -> None:

@@ -181,12 +181,7 @@ def test_no_failure_model_is_fitted_to_failures_that_abstract_states_show(
     config = GroundConfig(updates=1, batch_windows=4, window=5, latent_size=8, failure_members=2)
     fitting = Fitting(task, config, None, training, training, 0, "cpu", tmp_path, silent)
     grounding, metrics = HistoryFit(latent=False, reward=False)(fitting)
-    assert grounding.failures is None and metrics["failures"]["topple_head"] == {
-        "failures": 0,
-        "auc": None,
-        "brier_skill": None,
-        "reliability": None,
-    }
+    assert grounding.failures is None and set(metrics["failures"]) == {"topple_head"}
 
 
 def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: Path) -> None:

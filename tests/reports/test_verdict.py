@@ -124,7 +124,7 @@ def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Result
     ]
     choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
     shown = with_success(results, direct_transfer=[1.0, 1.0, 1.0], astra=[0.5, 0.5, 0.5])
-    untested = shown.model_copy(update={"choice": choice, "tested_in": "grounded"})
+    untested = shown.model_copy(update={"choice": choice, "tested_in": "simulators"})
     verdict = verdict_of(untested)
     assert (verdict.opening, verdict.title) == ("Deploy", "ASTRA, seed 1")
     assert "Direct transfer is predicted 0.10, a mean over its seeds." in verdict.remarks
@@ -135,6 +135,13 @@ def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Result
         update={"candidates": [*candidates[:4], candidate("direct_transfer", 0, 0.8)]}
     )
     assert verdict_of(untested.model_copy(update={"choice": as_good})).opening.startswith("No gain over the")
+    # Rows that nobody judged are not compared: their figures are of simulators.
+    alone = verdict_of(
+        untested.model_copy(update={"choice": choice.model_copy(update={"candidates": candidates[:1]})})
+    )
+    assert (alone.opening, alone.title) == ("Deploy", "ASTRA, seed 1")
+    assert "Not judged, so not compared: Direct transfer, ASTRA+." in alone.remarks
+    assert not any("ahead" in remark or "overlap" in remark for remark in alone.remarks)
     # In the target it is measured, and what was predicted is no matter.
     assert verdict_of(shown.model_copy(update={"choice": choice})).opening.startswith(
         "No gain over the floor"

@@ -8,7 +8,7 @@ from toy_walks import actions, log, states, write_archive
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.exchange.importing import import_dataset
-from astra_data.studies.recordings import read_recordings
+from astra_data.studies.recordings import place_name, read_recordings
 from astra_data.studies.walking import WalkingConfig
 
 MAPPING = Path(__file__).parents[2] / "recipes/imports/nao_guda.toml"
@@ -43,9 +43,11 @@ def test_a_dataset_at_home_is_a_recording_by_its_name(
     expected = Dataset.open(root).content_hash
     for called in (name, f"{name}@{root.name}"):
         (one,) = read_recordings(Path(called), MAPPING, tmp_path / "home", CONFIG)
-        assert one.content_hash == expected
+        assert one.content_hash == expected and one.name == f"{name}-1.0.0" == place_name(Path(called))
     with pytest.raises(BadInputError, match=rf"walls does not exist.*no dataset 'walls'.*{name}"):
         read_recordings(Path("walls"), MAPPING, tmp_path / "home", CONFIG)
+    with pytest.raises(BadInputError, match="does not exist: expected a dataset, or logs"):
+        read_recordings(Path("w" * 400), MAPPING, tmp_path / "home", CONFIG)
 
 
 def test_long_episodes_become_pieces_that_share_a_state(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from rail_run import make_rail_run
 from small_cart import TASK
 from torch import Tensor
 
-from astra_data.grounding.failures import failing, fit_failures, tells_failures
+from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.history import HistoryGrounding
@@ -114,10 +114,10 @@ def test_a_judge_without_a_failure_model_gets_one_where_its_episodes_fail(
         assert isinstance(made, HistoryGrounding) and made.model is grounding.model
         return made.failures
 
-    assert tells_failures(episodes) and known.failures is not None
+    assert tells_failures(TASK, episodes) and known.failures is not None
     fitted = failures_of(lacking, episodes, 3)
     assert fitted is not None and len(fitted.members) == 3
-    expected = fit_failures(TASK, lacking, failing(TASK, episodes, 4), 3, 0, 4)
+    expected = fit_failures(TASK, lacking, episodes, 3, 0, 4)
     assert fitted.shape.risk_steps == 4
     assert all(torch.equal(one, expected.state_dict()[key]) for key, one in fitted.state_dict().items())
     assert failures_of(known, episodes, 3) is known.failures

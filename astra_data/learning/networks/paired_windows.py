@@ -17,7 +17,7 @@ class PairedWindows:
         state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
         next_state: φ(s_{i+1}), (B, T, X).
-        topples_soon: (B, T), 1 where the episode fails within `RISK_STEPS`.
+        topples_soon: (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`.
         reward: r_i, or the residual reward, in two parts, (B, T, 2): of steps that go on, and of steps that
             end in failure; 0 in the other. Reaching the goal is detected and rewarded by the simulator.
         goes_on: (B, T), 1 where the step ends nothing: only there the first part of the reward is known.
@@ -34,3 +34,9 @@ class PairedWindows:
     goes_on: Tensor
     topples_soon: Tensor
     mask: Tensor
+
+
+def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:
+    """Return 1 at the last `steps` real steps of each episode that fails (E,), by the mask (E, T), else 0."""
+    left = mask.flip(1).cumsum(1).flip(1)
+    return (fails[:, None] & mask.bool() & (left <= steps)).float()
