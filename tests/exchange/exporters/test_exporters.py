@@ -94,7 +94,7 @@ def test_an_altered_record_is_told(dataset: Dataset, tmp_path: Path) -> None:
         record = json.loads(opened[RECORD][()])
         del opened[RECORD]
         opened[RECORD] = json.dumps(record | {"lengths": [7, -1], "uids": "none"})
-    with pytest.raises(CorruptDatasetError, match=r"record of the export is malformed \(uids .*; lengths"):
+    with pytest.raises(CorruptDatasetError, match=r"record of the export is malformed \(uids: .*; lengths"):
         import_dataset([tmp_path / "set.hdf5"], out=tmp_path / "back")
 
 
@@ -146,7 +146,7 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(dataset: Dataset, tmp_path
     for number, (status, line) in enumerate(results):
         assert (status, line.count("\n")) == (1, 1), (cases[number], line)
         assert "cannot be written: a file would be larger than is allowed" in line
-        assert list((tmp_path / str(number)).iterdir()) == []
+        assert not (tmp_path / str(number)).exists()
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))
