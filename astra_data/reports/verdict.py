@@ -105,15 +105,15 @@ def _passed_over(results: Results, one: Ranked) -> str:
 
 
 def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
-    row, best = results.methods[name], results.methods[best_of(results)]
+    ahead = best_of(results)
+    row, best = results.methods[name], results.methods[ahead]
     worth, is_predicted = _worth(results), _is_predicted(results)
     if chosen and results.choice:
         candidates = results.choice.candidates
         for one in candidates[: candidates.index(chosen)]:
             yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
         if best is not row:
-            ahead = worth[best_of(results)]
-            score = f"predicted success {ahead:.2f}" if is_predicted else _score(results, best)
+            score = f"predicted success {worth[ahead]:.2f}" if is_predicted else _score(results, best)
             yield f"By the mean over seeds {best.title} is ahead: {score}."
         if results.choice.regret and chosen is candidates[0]:
             yield (

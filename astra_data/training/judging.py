@@ -39,8 +39,12 @@ class Judge:
         which foresees failures within `failure_steps`.
         """
         scatter = grounding.scatter(episodes)
-        can_tell = bool(failure_members) and tells_failures(task, episodes, failure_steps)
-        if can_tell and isinstance(grounding, HistoryGrounding) and grounding.failures is None:
+        if (
+            failure_members
+            and isinstance(grounding, HistoryGrounding)
+            and grounding.failures is None
+            and tells_failures(task, episodes, failure_steps)
+        ):
             failures = fit_failures(task, grounding, episodes, failure_members, 0, failure_steps)
             grounding = replace(grounding, failures=failures)
         return cls(task, grounding, scatter)
