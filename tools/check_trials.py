@@ -1,16 +1,18 @@
 """How far from the best policy a choice is, by the trials in the target that it is given; print Markdown.
 
-    uv run python tools/check_trials.py runs/antmaze_long runs/cart_study
+    uv run python tools/check_trials.py recipes/results/antmaze_long_fresh.json runs/cart/report/results.json
 
-The recorded target episodes of a run's policies are the pool that trials are drawn from, and their share of
-success is taken for the truth, so the run has to be made until `evaluate`, and to have a choice.
+The target episodes of a report's policies are the pool that trials are drawn from, and their share of success
+is taken for the truth, so the report needs a choice and a target.
 """
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from timing import complain
 
+from astra_data.core.errors import AstraDataError
 from astra_data.experiments.trial_regret import (
     at_random,
     by_equal_shares,
@@ -18,33 +20,37 @@ from astra_data.experiments.trial_regret import (
     estimate,
     pools_of,
 )
-from astra_data.reports.choice import read_judged
+from astra_data.reports.files import read_published
 from astra_data.reports.formatting import interval, table
+from astra_data.reports.sizes import by_size
 
 WAYS = {"halving from the prediction": by_halving, "equal shares": by_equal_shares, "at random": at_random}
 
 
 def main(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs.")],
+    reports: Annotated[list[Path], typer.Argument(help="JSON files of reports.")],
     trials: Annotated[list[int] | None, typer.Option(help="Numbers of trials.")] = None,
     repeats: Annotated[int, typer.Option(help="Of the draw of outcomes.")] = 1000,
     resamples: Annotated[int, typer.Option(help="Of the seeds, for the intervals.")] = 200,
 ) -> None:
-    """Print a table for each run and size."""
-    for run in runs:
-        judged = read_judged(run)
-        for percent in judged.percents if judged else [None]:
-            pools = pools_of(run, percent)
-            size = f", {percent} %" if percent else ""
-            print(f"{run.name}{size}: {len(pools)} candidates, regret by trials, 95 % over seeds\n")
-            lines = []
-            for count in (0, *(trials or (10, 20, 50, 100, 200))):
-                found = [
-                    estimate(pools, count, choose, repeats=repeats, resamples=resamples)
-                    for choose in WAYS.values()
-                ]
-                lines.append([f"{count}", *(interval(one.mean, one.low, one.high) for one in found)])
-            print(table(["trials", *WAYS], lines) + "\n", flush=True)
+    """Print a table for each report and size."""
+    try:
+        for report in reports:
+            for percent, results in by_size(read_published(report)).items():
+                pools = pools_of(results)
+                size = f", {percent} %" if percent else ""
+                head = f"{results.recipe}{size}: {len(pools)} candidates, regret by trials, 95 % over seeds"
+                print(f"{head}\n")
+                lines = []
+                for count in (0, *(trials or (10, 20, 50, 100, 200))):
+                    found = [
+                        estimate(pools, count, choose, repeats=repeats, resamples=resamples)
+                        for choose in WAYS.values()
+                    ]
+                    lines.append([f"{count}", *(interval(one.mean, one.low, one.high) for one in found)])
+                print(table(["trials", *WAYS], lines) + "\n", flush=True)
+    except AstraDataError as error:
+        raise typer.Exit(complain(str(error))) from None
 
 
 if __name__ == "__main__":

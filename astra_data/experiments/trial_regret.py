@@ -1,27 +1,24 @@
-"""How much trials improve a choice, by replaying the recorded target episodes of a run's policies."""
+"""How much trials improve a choice, by replaying the target episodes of the policies in a report."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import place
-from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
-from astra_data.reports.choice import read_judged
 from astra_data.reports.halving import halve
+from astra_data.reports.schema import Results
 from astra_data.reports.statistics import CONFIDENCE
 
 
 @dataclass(frozen=True)
 class Pool:
-    """A candidate: what ranks it, and how many of its recorded target episodes succeeded.
+    """A candidate: what ranks it, and how many of its target episodes succeeded.
 
     Attributes:
         seed: of its policy. lower: quartile of its judges. predicted: their mean.
-        episodes: that were recorded. successes: of these.
+        episodes: in the target. successes: of these.
     """
 
     seed: int
@@ -32,13 +29,13 @@ class Pool:
 
     @property
     def success(self) -> float:
-        """The share of the recorded episodes, taken for the truth."""
+        """The share of its episodes, taken for the truth."""
         return self.successes / self.episodes
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean regret, and its 95 % interval, which resamples the run's seeds."""
+    """A mean regret, and its 95 % interval, which resamples the seeds."""
 
     mean: float
     low: float
@@ -103,10 +100,10 @@ def mean_regret(
 def estimate(
     pools: Sequence[Pool], trials: int, choose: Choose, *, repeats: int, resamples: int, seed: int = 0
 ) -> Estimate:
-    """Return the mean regret over repeats, with an interval: each resample draws the seeds of the run anew.
+    """Return the mean regret over repeats, with an interval: each resample draws the seeds anew.
 
     Args:
-        pools: the candidates of a run.
+        pools: the candidates.
         trials: to spend.
         choose: how.
         repeats: of the draw of the outcomes; a tenth of them for each resample.
@@ -124,25 +121,25 @@ def estimate(
     return Estimate(mean, float(low), float(high))
 
 
-def pools_of(run: Path, percent: int | None = None) -> list[Pool]:
-    """Return the candidates of a run that were tested in the target.
+def pools_of(results: Results) -> list[Pool]:
+    """Return the candidates of a choice that were tested in the target.
 
     Raises:
-        BadInputError: the run has no choice, or fewer than two of its candidates were tested in the target.
+        BadInputError: there is no choice, or fewer than two of its candidates were tested in the target.
     """
-    judged = read_judged(run)
-    if judged is None:
-        raise BadInputError(f"{run}: expected select/select.json, found none: run astra-data select {run}")
-    pools = []
-    for one in judged.ranked(percent):
-        file = run / "evaluate" / one.row / place(one.seed, percent) / EVALUATION
-        tested = read_json(Evaluation, file).target if file.is_file() else None
-        if tested is not None:
-            count, successes = len(tested.success), round(sum(tested.success))
-            pools.append(Pool(one.seed, one.lower, one.predicted, count, successes))
+    if results.choice is None:
+        raise BadInputError(
+            f"expected results with a choice, got those of {results.recipe} without: "
+            "give the recipe a table [select] and run it"
+        )
+    pools = [
+        Pool(one.seed, one.lower, one.predicted, results.episodes, round(one.target * results.episodes))
+        for one in results.choice.candidates
+        if one.target is not None
+    ]
     if len(pools) < 2:
         raise BadInputError(
-            f"{run}: expected two candidates or more that were tested in the target, found {len(pools)}: "
-            "run its recipe until evaluate"
+            f"{results.recipe}: expected two candidates or more that were tested in the target, found "
+            f"{len(pools)}: run its recipe until evaluate"
         )
     return pools

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import write_choice, write_evaluation
+from fake_runs import bare_results
 from scipy.stats import binom, hypergeom
 
 from astra_data.core.errors import BadInputError
@@ -19,6 +19,7 @@ from astra_data.experiments.trial_regret import (
     mean_regret,
     pools_of,
 )
+from astra_data.reports.schema import Choice, Ranked, Results
 
 
 def pool(seed: int, lower: float, success: float, episodes: int = 100) -> Pool:
@@ -95,26 +96,55 @@ def test_an_interval_resamples_the_seeds_of_the_run() -> None:
 
 
 def test_pools_are_the_candidates_that_were_tested(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="run astra-data select"):
-        pools_of(tmp_path)
-    write_choice(tmp_path)
-    write_evaluation(tmp_path, "astra", 2)
+    """The last is the worst for its judges, but in the target the best."""
+    results = bare_results("antmaze_u", {"astra": [0, 1, 2]}, {})
+    with pytest.raises(
+        BadInputError, match=r"those of antmaze_u without: give the recipe a table \[select\]"
+    ):
+        pools_of(results)
+    candidates = [
+        ranked(1, lower=0.75, predicted=0.8, target=0.29),
+        ranked(2, lower=0.5, predicted=0.7, target=None),
+        ranked(0, lower=0.25, predicted=0.3, target=1.0),
+    ]
+    assert pools_of(chosen_from(results, candidates)) == [
+        Pool(1, 0.75, 0.8, 100, 29),
+        Pool(0, 0.25, 0.3, 100, 100),
+    ]
     with pytest.raises(BadInputError, match="tested in the target, found 1: run its recipe until evaluate"):
-        pools_of(tmp_path)
-    write_evaluation(tmp_path, "astra_plus", 0)
-    found = pools_of(tmp_path)
-    assert found == [Pool(2, 1.0, 1.0, 4, 3), Pool(0, 0.5, 0.5, 4, 4)]
-    assert [one.success for one in found] == [0.75, 1.0]
+        pools_of(chosen_from(results, candidates[:2]))
+
+
+def ranked(seed: int, **figures: float | None) -> Ranked:
+    return Ranked.model_validate(
+        {"row": "astra", "seed": seed, "judges": 2, "low": None, "high": None, **figures}
+    )
+
+
+def chosen_from(results: Results, candidates: list[Ranked]) -> Results:
+    choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
+    return results.model_copy(update={"choice": choice, "episodes": 100})
+
+
+TOOL = Path(__file__).parents[2] / "tools/check_trials.py"
 
 
 def test_the_tool_prints_a_table(tmp_path: Path) -> None:
-    write_choice(tmp_path)
-    for row, seed in product(("astra", "astra_plus"), (0, 1, 2)):
-        write_evaluation(tmp_path, row, seed)
-    tool = Path(__file__).parents[2] / "tools/check_trials.py"
+    file = tmp_path / "results.json"
+    candidates = [
+        ranked(seed, lower=lower, predicted=lower, target=target)
+        for seed, lower, target in ((0, 0.8, 0.75), (1, 0.7, 1.0), (2, 0.1, 0.0))
+    ]
+    found = chosen_from(bare_results("antmaze_u", {"astra": [0, 1, 2]}, {}), candidates)
+    file.write_text(found.model_dump_json())
     given = ["--trials", "10", "--repeats", "20", "--resamples", "10"]
-    command = [sys.executable, str(tool), str(tmp_path), *given]
+    command = [sys.executable, str(TOOL), str(file), *given]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "6 candidates, regret by trials" in shown
-    # Without trials ASTRA, seed 2, with 0.75 is chosen, and ASTRA+ has 1.
+    assert "antmaze_u: 3 candidates, regret by trials" in shown
     assert "| 0 | 0.25 [" in shown and "| 10 | " in shown
+
+
+def test_the_tool_tells_what_is_wrong_in_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, str(TOOL), str(tmp_path / "none.json")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1 and "expected published results" in ended.stderr and "Traceback" not in ended.stderr
