@@ -15,7 +15,7 @@ def validate(
     ] = False,
 ) -> None:
     """Check every file and value of a LeRobot dataset, and list all faults."""
-    from astra_data.core.errors import CorruptDatasetError
+    from astra_data.core.errors import BadInputError, CorruptDatasetError
     from astra_data.dataset.columns import TERMINATED
     from astra_data.dataset.doctor.check import check
     from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
@@ -36,7 +36,11 @@ def validate(
             f"{message}\nTo save its whole episodes: astra-data repair {root} --out DIR"
         )
     typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
-    whole = Dataset.open(root)
+    try:
+        whole = Dataset.open(root)
+    except BadInputError as error:  # whole, but no robot's trajectories
+        typer.echo(f"note: {error}")
+        return
     if TERMINATED in whole.features:
         typer.echo(f"episodes end: {endings_of(whole)}")
 

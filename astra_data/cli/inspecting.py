@@ -75,7 +75,7 @@ def list_(
     from rich.console import Console
     from rich.table import Table
 
-    from astra_data.core.errors import CorruptDatasetError
+    from astra_data.core.errors import AstraDataError, CorruptDatasetError
     from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
 
     faults: list[str] = []
@@ -85,7 +85,7 @@ def list_(
             reference = f"{name}@data-{version}"
             try:
                 found = open_dataset(reference)
-            except CorruptDatasetError as error:
+            except AstraDataError as error:
                 table.add_row(reference, "damaged", "", "", "")
                 faults.append(str(error))
                 continue

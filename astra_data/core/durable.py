@@ -9,7 +9,7 @@ import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -51,10 +51,22 @@ def move(source: Path, target: Path) -> None:
 
 def make_folder(folder: Path) -> None:
     """Make `folder` and those that it is in; when this returns, the disk knows."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    missing = missing_folders(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for path in missing:
         sync(path.parent)
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """Return which of `folder` and those that it is in do not exist, the innermost first."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those of `folders`, the innermost first, that hold nothing."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def write_file(path: Path, content: str | bytes) -> None:
@@ -86,7 +98,7 @@ def hidden_folder(target: Path) -> Iterator[Path]:
         BadInputError: this process is writing `target` already.
         DiskError: it cannot be written.
     """
-    with writing(target), _folder_for(target):
+    with writing(target), folder_for(target):
         sweep(target)
         with _own_folder(target) as folder:
             try:
@@ -143,16 +155,14 @@ def _remove_dead(path: Path) -> bool:
 
 
 @contextmanager
-def _folder_for(target: Path) -> Iterator[None]:
+def folder_for(target: Path) -> Iterator[None]:
     """Make the folder that `target` is in; if the block fails, remove what was made and holds nothing."""
-    missing = [path for path in target.parents if not path.exists()]
+    missing = missing_folders(target.parent)
     try:
         make_folder(target.parent)
         yield
     except BaseException:
-        for path in missing:
-            with suppress(OSError):
-                path.rmdir()
+        remove_empty(missing)
         raise
 
 

@@ -88,4 +88,7 @@ def _outcome_faults(columns: Mapping[str, Array]) -> list[str]:
     done = columns.get(DONE)
     if done is not None and done.dtype == bool and not done[-1]:
         faults.append(f"{DONE}: false in the last frame, expected true: an episode ends there")
+    both = [columns[name] for name in (TERMINATED, TRUNCATED) if name in columns]
+    if done is not None and done[-1] and len(both) == 2 and not any(flags[-1] for flags in both):
+        faults.append(f"{DONE}: true in the last frame, expected {TERMINATED} or {TRUNCATED} there, too")
     return faults

@@ -21,7 +21,7 @@ RECORDED_TASK = "recorded.task_index"
 ENDS = (names.TERMINATED, names.TRUNCATED)
 _FLOATS = (names.STATE, names.NEXT_STATE, names.GOAL, names.ACTION, names.REWARD)
 _FLAGS = (*ENDS, names.DONE, names.SUCCESS)
-_DERIVED = (
+DERIVED_FLAGS = (
     Column(names.TERMINATED, "bool", meaning="the recording does not tell: never set"),
     Column(names.TRUNCATED, "bool", meaning="the recording of the episode ends"),
     Column(names.DONE, "bool", meaning="terminated or truncated"),
@@ -53,6 +53,8 @@ class Rows:
                 sources.add(names.STATE)
             elif name in (names.TRUNCATED, names.DONE):
                 sources.update(ENDS)
+            elif name == names.SUCCESS:
+                sources.update((name, names.TERMINATED))
             elif name == RECORDED_TASK:
                 sources.add(names.TASK_INDEX)
             elif name not in names.RESERVED:
@@ -86,6 +88,8 @@ class Rows:
             return truncated if spec.name == names.TRUNCATED else terminated | truncated
         if spec.name == names.TERMINATED:
             return self._ends(run, steps)[0]
+        if spec.name == names.SUCCESS and self.dropped:
+            return self._successes(run, steps).astype(spec.dtype)
         if spec.name == names.NEXT_STATE and self.dropped:
             values = run.columns[names.STATE][1:]
         else:
@@ -94,13 +98,28 @@ class Rows:
             return values.astype(spec.dtype)
 
     def _ends(self, run: Run, steps: int) -> tuple[Array, Array]:
-        """Return terminated and truncated, (T,); an episode that is cut off is truncated."""
+        """Return terminated and truncated, (T,); an episode that is cut off is truncated.
+
+        If the row that is left out is terminated, the step before it is.
+        """
         terminated, truncated = (
             run.columns[name][:steps] != 0 if name in self.stored else np.zeros(steps, bool) for name in ENDS
         )
+        terminated[-1] |= self._is_terminated(run)
         if self.dropped or names.TRUNCATED not in self.stored:
             truncated[-1] |= not terminated[-1]
         return terminated, truncated
+
+    def _successes(self, run: Run, steps: int) -> Array:
+        """Return which steps succeeded, (T,); the last takes over what a terminated row left out says."""
+        stored = run.columns[names.SUCCESS] != 0
+        success: Array = stored[:steps].copy()
+        if self._is_terminated(run):
+            success[-1] = stored[-1]
+        return success
+
+    def _is_terminated(self, run: Run) -> bool:
+        return names.TERMINATED in self.stored and bool(run.columns[names.TERMINATED][-1])
 
 
 @dataclass(frozen=True)
@@ -154,11 +173,14 @@ class RecordedFiles:
 def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:
     """Return the columns of the dataset, from those of the recording that are not LeRobot's own."""
     columns = {column.name: _typed(column) for column in recorded}
-    state = columns[names.STATE]
-    meaning = f"{state.meaning or 'the state'}, one step later"
-    derived = [replace(state, name=names.NEXT_STATE, meaning=meaning), *_DERIVED]
+    derived = [next_state_of(columns[names.STATE]), *DERIVED_FLAGS]
     derived += [Column(RECORDED_TASK, "int64", meaning="the recording's task_index")] if has_tasks else []
     return [*columns.values(), *(column for column in derived if column.name not in columns)]
+
+
+def next_state_of(state: Column) -> Column:
+    """Return the column of next states, which are those of the following rows."""
+    return replace(state, name=names.NEXT_STATE, meaning=f"{state.meaning or 'the state'}, one step later")
 
 
 def _typed(column: Column) -> Column:

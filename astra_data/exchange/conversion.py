@@ -1,12 +1,14 @@
 """Convert the fields of a recording to columns of a dataset."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Column
+from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, TERMINATED, Array, Column
+from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
 from astra_data.exchange.mapping import FLAGS, ColumnMapping, ImportMapping
 from astra_data.exchange.recording import Block
 
@@ -95,17 +97,12 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
 def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]:
     columns = dict(converted)
     if STATE in columns and NEXT_STATE not in columns:
-        state = columns[STATE]
-        meaning = f"{state.meaning or 'the state'}, one step later"
+        following = next_state_of(columns[STATE])
         if TERMINATED in columns and terminal == "stand_still":
-            meaning += "; where an episode terminates, not recorded: the state itself"
-        columns[NEXT_STATE] = Column(NEXT_STATE, state.dtype, state.size, state.names, meaning, state.astra)
-    derived = (
-        Column(TERMINATED, "bool", meaning="the recording does not tell: never set"),
-        Column(TRUNCATED, "bool", meaning="the recording of the episode ends"),
-        Column(DONE, "bool", meaning="terminated or truncated"),
-    )
-    return (*columns.values(), *(column for column in derived if column.name not in columns))
+            made_up = "; where an episode terminates, not recorded: the state itself"
+            following = replace(following, meaning=f"{following.meaning}{made_up}")
+        columns[NEXT_STATE] = following
+    return (*columns.values(), *(column for column in DERIVED_FLAGS if column.name not in columns))
 
 
 def _as_rows(name: str, values: Array, faults: list[str]) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.checkup.jumps import full_turns, shortest
 from astra_data.dataset.columns import (
     DONE,
     NEXT_STATE,
@@ -47,6 +48,7 @@ class Tally:
         split_points: number of boundaries between episodes, by reason.
         last_rows: last rows of episodes, dropped because their next state was not recorded.
         last_terminated: those of them that were terminated.
+        last_successes: those of them that succeeded without being terminated.
         last_reward: the sum of their rewards.
         short_rows: rows of episodes that were too short.
         rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
@@ -59,6 +61,7 @@ class Tally:
     split_points: dict[str, int] = field(default_factory=dict)
     last_rows: int = 0
     last_terminated: int = 0
+    last_successes: int = 0
     last_reward: float = 0.0
     short_rows: int = 0
     rows_after_end: int = 0
@@ -153,6 +156,7 @@ class Cutter:
             return episode | {NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
         self.tally.last_rows += 1
         self.tally.last_terminated += terminated
+        self.tally.last_successes += not terminated and SUCCESS in episode and bool(episode[SUCCESS][-1])
         self.tally.last_reward += float(episode[REWARD][-1]) if REWARD in episode else 0.0
         kept = {name: values[:-1] for name, values in episode.items()}
         if terminated:
@@ -226,7 +230,9 @@ class Cutter:
         changed = np.diff(np.concatenate([old_counters, counters], axis=1), axis=1) > 0
         jumped = np.zeros(counters.shape[1], bool)
         if jump and where is not None and old_where is not None:
+            [column] = (column for column in self.columns if column.name == jump.column)
             steps = np.diff(np.concatenate([old_where, where]).astype(np.float64), axis=0)
+            steps = shortest(steps, full_turns(column)[list(jump.values)])
             jumped = np.linalg.norm(steps, axis=1) > jump.above
         reasons = np.insert(changed, REASONS.index("jump"), jumped, axis=0)
         begins: Mask = np.asarray(reasons.any(axis=0))

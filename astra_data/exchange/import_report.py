@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from astra_data.dataset.columns import TERMINATED
 from astra_data.dataset.endings import Endings
 from astra_data.exchange.cutting import Tally
 
@@ -57,6 +58,9 @@ def _after_ends(tally: Tally) -> str:
 def _last_rows(tally: Tally) -> str:
     parts = [
         f"{tally.last_terminated} of them terminated" if tally.last_terminated else "",
+        f"{tally.last_successes} succeeded, which is lost unless {TERMINATED} is set there"
+        if tally.last_successes
+        else "",
         f"with them a reward of {tally.last_reward:g} in sum" if tally.last_reward else "",
     ]
     lost = ", ".join(filter(None, parts))

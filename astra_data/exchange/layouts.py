@@ -1,8 +1,17 @@
 """Names of our columns in the files of other libraries, for importers and exporters."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
-from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
+from astra_data.dataset.columns import (
+    ACTION,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+)
 
 D4RL = {
     STATE: "observations",
@@ -25,6 +34,15 @@ RECORD = "metadata/astra_data"
 """Where HDF5 files hold the record of an export."""
 
 
-def extra_fields(columns: Iterable[str], known: Iterable[str]) -> dict[str, str]:
-    """Return the fields of the columns for which a format has no name of its own."""
-    return {name: f"infos/{name}" for name in columns if name not in known}
+VECTORS = (STATE, NEXT_STATE, GOAL, ACTION)
+"""Columns that are vectors in every format, (T, size), also those of one value a step."""
+
+
+def fields_of(columns: Iterable[str], own: Mapping[str, str]) -> dict[str, str]:
+    """Return the field of each of the columns: a format's own name, or one among its infos."""
+    return {name: own.get(name, f"infos/{name}") for name in columns}
+
+
+def as_stored(name: str, values: Array) -> Array:
+    """Return a column's values (T,) or (T, size) in the shape that the formats have it."""
+    return values.reshape(len(values), -1) if name in VECTORS else values

@@ -76,7 +76,8 @@ class Jump(Config):
     values: Annotated[tuple[Index, ...], Field(min_length=1)]
     """Which of its values, such as x and y."""
     above: Positive
-    """The Euclidean distance between rows, in the column's unit, above which it is a jump."""
+    """The Euclidean distance between rows, in the column's unit, above which it is a jump; whole turns of an
+    angle do not count."""
 
 
 class Split(Config):

@@ -121,9 +121,13 @@ class JointsConfig(Config):
         """Return the joints of observation.state; those of action are their targets, in the same order.
 
         Raises:
-            BadInputError: there are targets, but not one for each joint.
+            BadInputError: there is no observation.state; or there are targets, but not one for each joint.
         """
         found = {column.name: column for column in dataset.schema}
+        if STATE not in found:
+            raise BadInputError(
+                f"{dataset.reference}: expected joints in observation.state, found no such column"
+            )
         state, action = found[STATE], found.get(ACTION)
         if action is not None and action.size != state.size:
             raise BadInputError(

@@ -51,7 +51,8 @@ class Gains(Predictor):
         """Fit the gains by least squares to the end of each stretch, in closed form: first the turn."""
         end = chained(stretch.motion)[:, -1]
         turn = stretch.simulated[..., 2].sum(1)
-        self.gains[2] = (turn @ end[:, 2]) / (turn @ turn)
+        if turn.any():
+            self.gains[2] = (turn @ end[:, 2]) / (turn @ turn)
         # Given the turn, the position is linear in the other two gains.
         parts = [
             chained(stretch.simulated * stretch.simulated.new_tensor([*axis, self.gains[2]]))[:, -1, :2]

@@ -1,8 +1,9 @@
 """Recordings of a robot: datasets and logs → pieces of rows; rows that do not count are marked."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from astra_data.core.config import load_recipe
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_rows
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
 from astra_data.dataset.endings import is_terminated, stands_still
@@ -113,7 +115,16 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
         raise BadInputError(f"{place}: expected recordings of a robot, found none: {reasons}")
     if faults:
         raise BadInputError(f"{place}: {'; '.join(faults)}; move aside what is not a recording")
-    return found
+    names = Counter(recording.name for recording in found)
+    return [_apart(recording) if names[recording.name] > 1 else recording for recording in found]
+
+
+def _apart(recording: Recording) -> Recording:
+    """Return it under a name that no other recording has: that with the beginning of its hash."""
+    name = f"{recording.name}-{recording.content_hash[:8]}"
+    return replace(
+        recording, name=name, pieces=tuple(replace(piece, recording=name) for piece in recording.pieces)
+    )
 
 
 def _parts(place: Path, suffixes: tuple[str, ...], *, each: bool) -> Iterator[Path]:
@@ -158,19 +169,18 @@ def place_name(place: Path) -> str:
 
 
 def _pieces(name: str, dataset: Dataset, fps: int, config: Reading) -> Iterator[Piece]:
-    longest = round(config.piece_s * fps)
+    longest = max(1, round(config.piece_s * fps))
     body = config.body(dataset)
     columns = [STATE, NEXT_STATE, TERMINATED, *([ACTION] if body.given_size else [])]
     for episode in dataset.episodes(columns):
-        ends = (episode.columns[name][-1] for name in (STATE, NEXT_STATE))
+        before, after = (as_rows(episode.columns[name]) for name in (STATE, NEXT_STATE))
         # At its end the state may stand for a next state that the log does not have: that is no step.
-        rows = len(episode) - (is_terminated(episode.columns) and stands_still(*ends))
+        rows = len(episode) - (is_terminated(episode.columns) and stands_still(before[-1], after[-1]))
         if rows == 0:
             continue
-        following = episode.columns[NEXT_STATE][rows - 1 : rows]
-        state = np.concatenate([episode.columns[STATE][:rows], following]).astype(np.float64)
+        state = np.concatenate([before[:rows], after[rows - 1 : rows]]).astype(np.float64)
         recorded = episode.columns.get(ACTION, np.empty((len(episode), 0)))
-        action = recorded[:rows].astype(np.float64)
+        action = as_rows(recorded)[:rows].astype(np.float64)
         broken = config.broken(state, fps)
         for first in range(0, rows, longest):
             last = min(first + longest, rows)

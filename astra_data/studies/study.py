@@ -144,7 +144,8 @@ def run_study(
 
 
 def _check_same(path: Path, settings: dict[str, Any]) -> None:
-    if path.exists() and json.loads(path.read_text()) != settings:
+    begun = any(path.parent.rglob("*.safetensors"))
+    if begun and path.exists() and json.loads(path.read_text()) != settings:
         raise BadInputError(
             f"{path.parent} holds results of other settings or other recordings: remove it, or name another "
             "folder with --root"

@@ -143,7 +143,7 @@ class WalkingConfig(Config):
         place, heading = state[:, :2], state[:, 2]
         moved = np.linalg.norm(np.diff(place, axis=0), axis=1)
         broken = (moved > self.jump_m) | (abs(wrapped(np.diff(heading))) > self.jump_rad)
-        half = min(fps // 2, len(moved))
+        half = min(max(1, fps // 2), len(moved))
         far = np.linalg.norm(place[half:] - place[:-half], axis=1) > self.fastest_m_s * half / fps
         for first in np.flatnonzero(far):
             broken[first : first + half] = True

@@ -89,6 +89,11 @@ def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.Mo
     assert isinstance(result.exception, AstraDataError)
     assert "broken/data-1.0.0 is incomplete or was altered" in str(result.exception)
     assert result.output.count("@data-1.0.0") == 2 and "damaged" in result.output
+    (tmp_path / "empty/data-1.0.0").mkdir(parents=True)
+    result = call("list")
+    assert isinstance(result.exception, AstraDataError)
+    assert "empty/data-1.0.0" in str(result.exception) and "broken/data-1.0.0" in str(result.exception)
+    assert result.output.count("@data-1.0.0") == 3
 
 
 def test_a_folder_to_clean_that_is_not_there_is_told(tmp_path: Path) -> None:

@@ -54,6 +54,16 @@ def test_only_the_last_step_ends_an_episode(
             open_writer.add(Episode(2, columns))
 
 
+def test_an_episode_is_not_done_without_an_end() -> None:
+    columns = fake_columns(4, seed=1)
+    for name in (TERMINATED, TRUNCATED):
+        columns[name][:] = False
+    with pytest.raises(BadInputError, match=r"next\.done: true in the last frame, expected next\.term"):
+        Admission(COLUMNS).check(Episode(2, columns))
+    columns[TRUNCATED][-1] = True
+    Admission(COLUMNS).check(Episode(2, columns))
+
+
 def test_metadata_keys_keep_the_type_of_their_first_value() -> None:
     admission = Admission(COLUMNS)
     admission.admit(Episode(1, fake_columns(3, seed=1), {"success": True}))

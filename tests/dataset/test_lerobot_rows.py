@@ -54,7 +54,7 @@ def test_recorded_next_states_keep_every_row() -> None:
 @pytest.mark.parametrize("has_next", [True, False])
 def test_an_episode_that_is_cut_off_is_truncated_unless_it_terminated(has_next: bool) -> None:
     steps = STEPS if has_next else STEPS - 1
-    more: dict[str, Array] = {names.TERMINATED: np.arange(STEPS) == steps - 1}
+    more: dict[str, Array] = {names.TERMINATED: np.arange(STEPS) == STEPS - 1}
     more |= {names.NEXT_STATE: np.ones((STEPS, 2), np.float32)} if has_next else {}
     last = np.arange(steps) == steps - 1
     np.testing.assert_array_equal(values(names.TERMINATED, "bool", more=more), last)
@@ -62,6 +62,20 @@ def test_an_episode_that_is_cut_off_is_truncated_unless_it_terminated(has_next: 
     np.testing.assert_array_equal(values(names.DONE, "bool", more=more), last)
     del more[names.TERMINATED]
     np.testing.assert_array_equal(values(names.TRUNCATED, "bool", more=more), last)
+
+
+def test_a_terminated_row_that_is_left_out_hands_its_flags_to_the_step_before() -> None:
+    last = np.arange(STEPS) == STEPS - 1
+    over: dict[str, Array] = {names.TERMINATED: last, names.SUCCESS: last}
+    assert values(names.SUCCESS, "bool", more=over).tolist() == [False, False, True]
+    assert values(names.TRUNCATED, "bool", more=over).tolist() == [False, False, False]
+    failed = {names.TERMINATED: last, names.SUCCESS: np.array([False, False, True, False])}
+    assert values(names.SUCCESS, "bool", more=failed).tolist() == [False, False, False]
+    cut_off: dict[str, Array] = {names.TERMINATED: np.zeros(STEPS, bool), names.SUCCESS: last}
+    assert values(names.SUCCESS, "bool", more=cut_off).tolist() == [False, False, False]
+    assert values(names.SUCCESS, "bool", more={names.SUCCESS: last}).tolist() == [False, False, False]
+    with_next = over | {names.NEXT_STATE: np.ones((STEPS, 2), np.float32)}
+    assert values(names.SUCCESS, "bool", more=with_next).tolist() == [False, False, False, True]
 
 
 def test_only_the_columns_that_are_needed_are_read() -> None:
@@ -74,6 +88,8 @@ def test_only_the_columns_that_are_needed_are_read() -> None:
     assert read(RECORDED_TASK) == {names.TASK_INDEX}
     assert read(names.TIMESTAMP) == set()
     assert read("force") == {"force"}
+    rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.SUCCESS: np.zeros(STEPS)})
+    assert read(names.SUCCESS) == {names.SUCCESS, names.TERMINATED}
 
 
 def test_columns_of_ours_have_our_types() -> None:

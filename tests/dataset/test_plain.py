@@ -11,6 +11,7 @@ from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, TIMESTAMP, Array
 from astra_data.dataset.plain import (
+    TIMESTAMP_TOLERANCE_S,
     PlainColumn,
     Run,
     episode_rows,
@@ -188,6 +189,28 @@ def test_wrong_values_of_a_run_are_found(
 def test_a_timestamp_may_be_rounded() -> None:
     rounded = np.array([0, 0.1, 0.20009, 0.3])
     assert list(run_faults(a_run(**{TIMESTAMP: rounded}), number=3, row=20, fps=10)) == []
+
+
+def test_long_episodes_are_as_exact_as_float32() -> None:
+    """Two hours: float32 rounds by up to 0.24 ms there, 30 times a second."""
+    frame = np.arange(2 * 3600 * 30)
+    stored = (frame / 30).astype(np.float32)
+    assert np.abs(stored - frame / 30).max() > TIMESTAMP_TOLERANCE_S
+
+    def faults(times: Array) -> list[tuple[str, str]]:
+        return list(
+            run_faults(
+                Run(Path("file"), 0, {EPISODE_INDEX: np.zeros_like(frame), TIMESTAMP: times}),
+                number=0,
+                row=0,
+                fps=30,
+            )
+        )
+
+    assert faults(stored) == []
+    late = stored.copy()
+    late[-1] += 0.001
+    assert len(faults(late)) == 1
 
 
 def test_further_wrong_values_are_counted() -> None:

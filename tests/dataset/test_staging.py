@@ -116,6 +116,16 @@ def test_without_episodes_nothing_is_left(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_recording_that_fails_before_its_first_episode_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), staged_writer(tmp_path / "new/place/set"):
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(RuntimeError), staged_writer(tmp_path / "new/place/set") as writer:
+        writer.add(fake_episodes()[0])
+        raise RuntimeError
+    assert (tmp_path / "new/place/.set.staged").is_dir()
+
+
 def test_a_damaged_episode_is_told(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), staged_writer(tmp_path / "set") as writer:
         writer.add(fake_episode(1, 4))

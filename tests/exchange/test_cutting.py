@@ -114,6 +114,7 @@ def test_a_terminated_row_without_a_next_state_hands_its_flags_to_the_step_befor
     assert cutting.tally.endings == Endings(terminated=2, cut_off=1)
     tally = cutting.tally
     assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 2 + 4 + 7)
+    assert tally.last_successes == 1
     assert tally.rows_after_end == 1
 
 
@@ -172,6 +173,18 @@ def test_jumps_are_longer_than_their_bound(block_rows: int) -> None:
     x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [660, 760, 9], [660, 760, 1e4]])
     assert rows(cut(cutting, block_rows, x=x)) == [[0, 1], [3]]
     assert cutting.tally.split_points == {"jump": 1}
+
+
+@BLOCKS
+def test_a_whole_turn_of_a_heading_is_no_jump(block_rows: int) -> None:
+    """By its role or its unit: 3.1 to -3.1 rad is a step of 0.08, and 359 to 1 degrees one of 2."""
+    heading = {"fields": ("x",), "take": (0,), "role": ("heading",)}
+    pan = {"fields": ("x",), "take": (1,), "unit": ("deg",)}
+    x = np.array([[3.1, 0], [-3.1, 359], [-3.0, 1], [-2.0, 1], [-2.0, 181]])
+    for column, above, expected in (("yaw", 0.5, [[0, 1], [3]]), ("pan", 3.0, [[0, 1, 2]])):
+        columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, "yaw": heading, "pan": pan}
+        cutting = cutter(columns=columns, split={"jump": {"column": column, "values": (0,), "above": above}})
+        assert rows(cut(cutting, block_rows, x=x)) == expected
 
 
 @BLOCKS

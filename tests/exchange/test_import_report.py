@@ -15,6 +15,11 @@ def test_what_was_dropped_is_counted_aloud() -> None:
     assert report.startswith("out: 2 episodes, 7 frames from 9 rows in 0.2 s\nsplit points: file 1\n")
 
 
+def test_a_lost_success_is_told_with_what_to_do() -> None:
+    told = "3 dropped (2 succeeded, which is lost unless next.terminated is set there), in"
+    assert told in losses(Tally(rows=9, last_rows=3, last_successes=2))
+
+
 def test_rows_after_the_end_are_told_where_there_are_any() -> None:
     told = "; terminated rows after the end, dropped: 4"
     tally = Tally(rows=9, rows_after_end=4)

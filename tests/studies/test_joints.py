@@ -14,6 +14,7 @@ from astra_data.exchange.importing import import_dataset
 from astra_data.studies.errors import Trial
 from astra_data.studies.joints import ALL, Joints, JointsConfig
 from astra_data.studies.predictors import Response
+from astra_data.studies.recordings import read_recordings
 from astra_data.studies.rollouts import FitConfig, fit, predict
 from astra_data.studies.walks import StepsConfig, Stretch, Walks
 
@@ -163,3 +164,17 @@ def test_the_joints_are_those_of_the_state_and_each_has_a_target(tmp_path: Path)
     fewer = dataset('[columns.action]\nfields = ["des_dof_pos"]\ntake = [0]\n', "fewer")
     with pytest.raises(BadInputError, match="action holds 1 values, expected a target for each of the 3"):
         config.body(fewer)
+
+
+def test_a_single_joint_and_a_log_without_joints(tmp_path: Path) -> None:
+    write_log(tmp_path / "log.pt", 1200, seed=0)
+    mapping = tmp_path / "mapping.toml"
+    head = 'name = "toy"\ntask = "t"\nfps = 400\n'
+    mapping.write_text(f'{head}[columns."observation.state"]\nfields = ["dof_pos"]\ntake = [1]\n')
+    [one] = read_recordings(tmp_path / "log.pt", mapping, tmp_path / "home", JointsConfig())
+    assert one.pieces[0].state.shape == (len(one.pieces[0]) + 1, 1)
+    found = Walks.of_pieces(one.pieces, one.fps, CONFIG)
+    assert found.motion.shape[-1] == 1
+    mapping.write_text(f'{head}[columns.action]\nfields = ["des_dof_pos"]\n')
+    with pytest.raises(BadInputError, match=r"expected joints in observation\.state, found no such column"):
+        read_recordings(tmp_path / "log.pt", mapping, tmp_path / "home", JointsConfig())

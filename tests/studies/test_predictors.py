@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -55,6 +56,13 @@ def test_fitted_gains_have_the_least_error_at_the_end(stretch: Stretch) -> None:
             other = model.gains.clone()
             other[axis] += change
             assert missed(other) > best
+
+
+def test_a_walk_without_turns_leaves_the_gain_of_turning_as_it_is(stretch: Stretch) -> None:
+    model = Gains()
+    straight = stretch.simulated * torch.tensor([1.0, 1.0, 0.0])
+    model.fit(replace(stretch, simulated=straight))
+    assert model.gains[2] == 1.0 and bool(model.gains.isfinite().all())
 
 
 def test_gains_that_the_walk_was_made_with_are_found() -> None:

@@ -70,6 +70,32 @@ def test_only_a_next_state_that_was_made_up_is_no_step(tmp_path: Path, terminal:
     np.testing.assert_allclose(one.pieces[0].state[-1, :2] * 1000, walk["observations"][-1][:2], rtol=1e-5)
 
 
+def test_recordings_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    for seed, day in enumerate(("day1", "day2")):
+        (tmp_path / "logs" / day).mkdir(parents=True)
+        write_archive(tmp_path / "logs" / day / "walk.tar.gz", 300, seed=seed)
+    write_archive(tmp_path / "logs/alone.tar.gz", 300, seed=5)
+    found = read_recordings(tmp_path / "logs", MAPPING, tmp_path / "home", CONFIG)
+    alone, *walks = found
+    assert alone.name == "alone"
+    assert [one.name for one in walks] == [f"walk-{one.content_hash[:8]}" for one in walks]
+    assert len({one.name for one in found}) == 3
+    assert all(piece.recording == one.name for one in found for piece in one.pieces)
+
+
+def test_a_piece_has_a_row_at_least(tmp_path: Path) -> None:
+    write_archive(tmp_path / "walk.tar.gz", 80, seed=0)
+    short = CONFIG.model_copy(update={"piece_s": 0.001})
+    [found] = read_recordings(tmp_path / "walk.tar.gz", MAPPING, tmp_path / "home", short)
+    assert [len(piece) for piece in found.pieces] == [1] * 79
+
+
+def test_at_one_row_a_second_carrying_is_told_too() -> None:
+    state = np.zeros((6, 5))
+    state[:, 0] = np.arange(6) * 0.05
+    assert not CONFIG.broken(state, 1).any()
+
+
 def test_jumps_and_carried_stretches_are_no_walking() -> None:
     state = np.zeros((301, 5))
     state[:, 0] = np.arange(301) * 0.004  # 0.24 m/s

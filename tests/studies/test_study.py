@@ -13,6 +13,7 @@ from astra_data.studies.errors import Trial
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.predictors import Gains
 from astra_data.studies.recordings import Piece, Recording
+from astra_data.studies.rollouts import FitConfig
 from astra_data.studies.study import cases, run_study, shortened
 from astra_data.studies.walks import StepsConfig, Walks
 
@@ -88,7 +89,9 @@ def test_the_raw_simulator_is_always_a_model_and_unknown_ones_are_refused() -> N
 
 
 def test_errors_are_those_of_the_fitted_models_and_fits_are_kept(tmp_path: Path) -> None:
-    found = run_study(recipe(minutes=(0.1,)), [A], [B], tmp_path / "study", silent)
+    quick = FitConfig(updates=1, batch=4, steps=2, latent_size=4, head_sizes=(4,), hidden_sizes=(4,))
+    settings = recipe(minutes=(0.1,), models=("gains", "nas"), fit=quick)
+    found = run_study(settings, [A], [B], tmp_path / "study", silent)
     (case,) = found["cases"]
     small, whole = case["sizes"]
     assert (small["minutes"], whole["minutes"]) == pytest.approx((0.1, 1200 / FPS / 60))
@@ -98,16 +101,20 @@ def test_errors_are_those_of_the_fitted_models_and_fits_are_kept(tmp_path: Path)
     assert cell["rmse"] == pytest.approx(np.sqrt(np.nanmean(raw[:, 1, 0])), abs=1e-5)
     assert case["starts"] == [int(np.isfinite(raw[:, k, 0]).sum()) for k in range(2)]
     assert (case["pieces"], case["test_minutes"]) == (4, pytest.approx(600 / FPS / 60))
-    # Only what a seed changes is repeated: with all data, gains do not depend on it.
+    # Only what a seed changes is repeated: with all data, gains do not depend on it, and networks do.
     fits = sorted(str(path.relative_to(tmp_path / "study")) for path in tmp_path.rglob("*.safetensors"))
     assert fits == [
         "new_recordings/gains/0.1_min/seed_3.safetensors",
         "new_recordings/gains/0.1_min/seed_4.safetensors",
         "new_recordings/gains/all/seed_3.safetensors",
+        "new_recordings/nas/0.1_min/seed_3.safetensors",
+        "new_recordings/nas/0.1_min/seed_4.safetensors",
+        "new_recordings/nas/all/seed_3.safetensors",
+        "new_recordings/nas/all/seed_4.safetensors",
         "new_recordings/raw/0.1_min/seed_3.safetensors",
         "new_recordings/raw/all/seed_3.safetensors",
     ]
-    again = run_study(recipe(minutes=(0.1,)), [A], [B], tmp_path / "study", silent)
+    again = run_study(settings, [A], [B], tmp_path / "study", silent)
     assert again["cases"] == found["cases"]
 
 
@@ -115,6 +122,11 @@ def test_a_folder_holds_one_study_at_a_time(tmp_path: Path) -> None:
     run_study(recipe(models=("raw",)), [A], [B], tmp_path, silent)
     with pytest.raises(BadInputError, match="other settings or other recordings: remove it"):
         run_study(recipe(models=("raw",)), [A], [A], tmp_path, silent)
+    # What failed before its first fit left nothing that could be mixed up.
+    with pytest.raises(BadInputError, match="expected pieces of more than"):
+        long = recipe(models=("raw",), steps=StepsConfig(rows=10, history=1000))
+        run_study(long, [A], [B], tmp_path / "failed", silent)
+    run_study(recipe(models=("raw",)), [A], [B], tmp_path / "failed", silent)
     # Models, seeds, sizes and notes may be others.
     run_study(recipe(models=("raw",), seeds=(9,), notes=("new",)), [A], [B], tmp_path, silent)
     with held(tmp_path) as ours, pytest.raises(BadInputError, match="is in use by another run"):

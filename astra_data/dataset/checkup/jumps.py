@@ -43,12 +43,7 @@ class Jumps:
         self._placed = np.array(
             [unit in PLACES and role != "vector" for unit, role in zip(units, roles, strict=True)]
         )
-        self._turns = np.array(
-            [
-                2 * np.pi if role == "heading" else _TURN.get(unit, 0.0)
-                for unit, role in zip(units, roles, strict=True)
-            ]
-        )
+        self._turns = full_turns(column)
         self._quaternions = [group for role, group in column.roles if role == "quaternion"]
         self._every = -(-steps // SAMPLES)
         self._seen = 0
@@ -72,11 +67,7 @@ class Jumps:
         for group in self._quaternions:  # q and -q are the same rotation
             flipped = (state[:, group] * following[:, group]).sum(axis=1) < 0
             following[flipped, group] *= -1
-        steps = following - state
-        turning = self._turns > 0
-        turns = self._turns[turning]
-        steps[:, turning] -= turns * np.rint(steps[:, turning] / turns)
-        return np.abs(steps)
+        return np.abs(shortest(following - state, self._turns))
 
     def limits(self) -> Floats:
         """Return for each value (S,) the step above which it may jump; infinite where no jump can be told."""
@@ -126,6 +117,26 @@ class Jumps:
             f"above = {above:.2g}) and import again, or {deletion(called, uids)}"
         )
         return [Finding("warning", what, advice, tuple(uids))]
+
+
+def full_turns(column: Column) -> Floats:
+    """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
+    astra = column.astra or {}
+    units = astra.get("unit", [""] * column.size)
+    roles = astra.get("role", [""] * column.size)
+    turns = [
+        _TURN.get(unit, 2 * np.pi if role == "heading" else 0.0)
+        for unit, role in zip(units, roles, strict=True)
+    ]
+    return np.array(turns)
+
+
+def shortest(steps: Floats, turns: Floats) -> Floats:
+    """Return `steps` (T, S) less whole `turns` (S,), where these are not 0."""
+    angles = turns > 0
+    whole = np.rint(np.divide(steps, turns, out=np.zeros_like(steps), where=angles))
+    left: Floats = steps - turns * whole
+    return left
 
 
 def jumps(steps: Floats, limit: float) -> Iterator[int]:

@@ -145,16 +145,16 @@ def repair(
                 "a value was altered after it was written, because the content hash differs; which one is "
                 "unknown"
             )
+        if (metadata or sources) and unknown:
+            result.notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
+        if len(tasks) > 1:
+            result.notes.append(
+                f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'"
+            )
         writer.made = {"repaired": result.notes}
         writer.policy = policy if (policy := folder / POLICY_PATH).is_file() else None
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
-    if (metadata or sources) and unknown:
-        result.notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
-    if len(tasks) > 1:
-        result.notes.append(
-            f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'"
-        )
     return result
 
 

@@ -8,7 +8,7 @@ from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, TERMINATED
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
 from astra_data.exchange.hdf5_file import hdf5_file
-from astra_data.exchange.layouts import D3RLPY, NUMBERED, RECORD, extra_fields
+from astra_data.exchange.layouts import D3RLPY, NUMBERED, RECORD, as_stored, fields_of
 
 VERSION = "2.1"
 
@@ -21,7 +21,7 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
     """
     names = [column.name for column in dataset.schema]
     own = {name: field for name, field in D3RLPY.items() if name != TERMINATED} | {GOAL: D3RLPY[STATE]}
-    fields = extra_fields(names, own) | {name: field for name, field in own.items() if name in names}
+    fields = fields_of(names, own)
     [state] = dataset.specs([STATE])
     exported = Export(dataset, fields, groups=NUMBERED, first={GOAL: state.size})
     observed = [STATE, GOAL] if GOAL in names else [STATE]
@@ -32,11 +32,11 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         file["version"] = VERSION
         for number, episode in enumerate(disk.until_it_fails(exported.episodes())):
             values, length = episode.columns, len(episode)
-            parts = [values[name].reshape(length, -1) for name in observed]
+            parts = [as_stored(name, values[name]) for name in observed]
             file[f"observations_{number}"] = np.concatenate(parts, axis=1)
-            file[f"actions_{number}"] = values[ACTION].reshape(length, -1)
+            file[f"actions_{number}"] = as_stored(ACTION, values[ACTION])
             file[f"rewards_{number}"] = values.get(REWARD, np.zeros(length, np.float32))[:, None]
             file[f"terminated_{number}"] = bool(values[TERMINATED][-1])
             for name in apart:
-                file[f"{fields[name]}_{number}"] = values[name]
+                file[f"{fields[name]}_{number}"] = as_stored(name, values[name])
         file[RECORD] = exported.text()

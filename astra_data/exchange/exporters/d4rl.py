@@ -9,7 +9,7 @@ from astra_data.dataset.columns import REWARD, TERMINATED, TRUNCATED, Array, Epi
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
 from astra_data.exchange.hdf5_file import hdf5_file
-from astra_data.exchange.layouts import D4RL, RECORD, extra_fields
+from astra_data.exchange.layouts import D4RL, RECORD, VECTORS, as_stored, fields_of
 from astra_data.exchange.recording import BLOCK_ROWS
 
 
@@ -21,12 +21,12 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
     """
     own = {name: field for name, field in D4RL.items() if name != TRUNCATED}
     names = [column.name for column in dataset.schema]
-    fields = extra_fields(names, own) | {name: field for name, field in own.items() if name in names}
+    fields = fields_of(names, own)
     exported = Export(dataset, fields)
     rows = int(dataset.lengths.sum())
     with hdf5_file(path) as (file, disk):
         for column in dataset.schema:
-            shape = (rows,) if column.size == 1 else (rows, column.size)
+            shape = (rows,) if column.size == 1 and column.name not in VECTORS else (rows, column.size)
             file.create_dataset(fields[column.name], shape, column.dtype)
         file.create_dataset(D4RL[TRUNCATED], (rows,), bool)
         if REWARD not in fields:
@@ -35,7 +35,8 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         for block in disk.until_it_fails(_blocks(exported.episodes())):
             part = slice(first, first + sum(map(len, block)))
             for name in block[0].columns:
-                file[fields[name]][part] = np.concatenate([episode.columns[name] for episode in block])
+                values = np.concatenate([episode.columns[name] for episode in block])
+                file[fields[name]][part] = as_stored(name, values)
             file[D4RL[TRUNCATED]][part] = np.concatenate([_timeouts(episode) for episode in block])
             first = part.stop
         file[RECORD] = exported.text()

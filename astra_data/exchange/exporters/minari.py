@@ -21,7 +21,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
 from astra_data.exchange.hdf5_file import hdf5_file
-from astra_data.exchange.layouts import MINARI, extra_fields
+from astra_data.exchange.layouts import MINARI, as_stored, fields_of
 
 
 def write(dataset: Dataset, path: Path, out: Path) -> None:
@@ -59,7 +59,7 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         NEXT_STATE: f"next_{observations}",
         GOAL: "observations/desired_goal",
     }
-    fields = extra_fields(names, own) | {name: field for name, field in own.items() if name in names}
+    fields = fields_of(names, own)
     exported = Export(dataset, fields)
     data = path / "data"
     data.mkdir()
@@ -67,10 +67,9 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         for number, episode in enumerate(disk.until_it_fails(exported.episodes())):
             group = file.create_group(f"episode_{number}")
             group.attrs.update(_attributes(number, episode))
-            values = episode.columns
+            values = {name: as_stored(name, column) for name, column in episode.columns.items()}
             arrays = {fields[name]: values[name] for name in names if name != NEXT_STATE}
-            arrays[fields[STATE]] = _with_last(episode, values[NEXT_STATE][-1:])
-            arrays[fields[ACTION]] = values[ACTION].reshape(len(episode), -1)
+            arrays[fields[STATE]] = _with_last(episode.uid, values[STATE], values[NEXT_STATE])
             if REWARD not in fields:
                 arrays[MINARI[REWARD]] = np.zeros(len(episode), np.float32)
             if has_goal:
@@ -120,11 +119,10 @@ def _attributes(number: int, episode: Episode) -> dict[str, Any]:
     return known | ({"seed": seed} if isinstance(seed, int) else {})
 
 
-def _with_last(episode: Episode, last: Array) -> Array:
-    states = episode.columns[STATE]
-    if not np.array_equal(episode.columns[NEXT_STATE][:-1], states[1:]):
+def _with_last(uid: int, states: Array, next_states: Array) -> Array:
+    if not np.array_equal(next_states[:-1], states[1:]):
         raise BadInputError(
-            f"episode {episode.uid}: a next state is not the state of the next step, which Minari cannot "
+            f"episode {uid}: a next state is not the state of the next step, which Minari cannot "
             "store; d4rl and robomimic can"
         )
-    return np.concatenate([states, last])
+    return np.concatenate([states, next_states[-1:]])

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
+from astra_data.dataset.columns import GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
 from astra_data.exchange.hdf5_file import hdf5_file
-from astra_data.exchange.layouts import RECORD, ROBOMIMIC, extra_fields
+from astra_data.exchange.layouts import RECORD, ROBOMIMIC, as_stored, fields_of
 
 VALID_SHARE = 0.1
 """Share of the episodes in mask/valid, as in robomimic's own split; the others are in mask/train."""
@@ -27,7 +27,7 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
     """
     names = [column.name for column in dataset.schema]
     own = {**ROBOMIMIC, STATE: "obs/state", NEXT_STATE: "next_obs/state", GOAL: "obs/goal"}
-    fields = extra_fields(names, own) | {name: field for name, field in own.items() if name in names}
+    fields = fields_of(names, own)
     exported = Export(dataset, fields, groups="data/demo_*")
     environment = dataset.description["environment"]
     arguments = {
@@ -43,8 +43,7 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
             demo = data.create_group(f"demo_{number}")
             demo.attrs["num_samples"] = len(episode)
             demo.attrs["episode_uid"] = episode.uid
-            values = dict(episode.columns)
-            values[ACTION] = values[ACTION].reshape(len(episode), -1)
+            values = {name: as_stored(name, column) for name, column in episode.columns.items()}
             for name in (TERMINATED, TRUNCATED):
                 values[name] = values[name].astype("int64")
             for name, field in fields.items():

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from astra_data.core.durable import folder_for
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, SharingError
 from astra_data.core.lock import held
 from astra_data.core.progress import Progress, silent
@@ -83,7 +84,8 @@ def pull(
         progress(1.0, f"it is there already, and whole: {len(sums)} files were compared")
         return dataset
     try:
-        _fetch_all(remote, sums, target, description, max_bytes, progress)
+        with folder_for(target):
+            _fetch_all(remote, sums, target, description, max_bytes, progress)
     except OSError as error:
         raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
     return Dataset.open(target)

@@ -155,8 +155,10 @@ def test_tasks_are_known_by_their_index(killed: Path, tmp_path: Path) -> None:
     table = pa.table({"task_index": [1, 2], "task": ["walk", "run"]})
     pq.write_table(table, root / "meta/tasks.parquet")
     (root / EPISODES).unlink()
-    repair(root, out=tmp_path / "saved")
+    notes = repair(root, out=tmp_path / "saved").notes
     saved = Dataset.open(tmp_path / "saved")
+    assert saved.description["repaired"] == notes
+    assert "the 2 tasks were merged into one; each episode's own is in its metadata 'task'" in notes
     assert saved.metadata["task"] == [killed_lerobot.task(number) for number in range(8)]
     assert saved.task == "walk / run"
 

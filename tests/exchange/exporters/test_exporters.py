@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, Array, Episode
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, Array, Column, Episode
 from astra_data.exchange.export_record import Sums
 from astra_data.exchange.exporters import EXPORTERS, export
 from astra_data.exchange.importing import import_dataset
@@ -53,6 +53,43 @@ def test_all_that_went_in_comes_back(tmp_path: Path, format: str, has_goal: bool
     assert back.reference == "fake@data-1.0.1"
     assert back.description["parents"] == [dataset.identity]
     assert back.description["environment"] == dataset.description["environment"]
+
+
+VECTORS_OF = {
+    "d3rlpy": ("observations_1", "actions_1"),
+    "d4rl": ("observations", "actions", "next_observations", "infos/goal"),
+    "minari": (
+        *("episode_1/observations/observation", "episode_1/observations/desired_goal"),
+        "episode_1/actions",
+    ),
+    "robomimic": tuple(
+        f"data/demo_1/{field}"
+        for field in ("obs/state", "next_obs/state", "obs/goal", "next_obs/goal", "actions")
+    ),
+}
+
+
+@pytest.mark.parametrize("format", sorted(EXPORTERS))
+def test_one_value_a_step_is_a_vector_of_one(tmp_path: Path, format: str) -> None:
+    """As the other libraries expect states, goals and actions; also where the robot has a single command."""
+    single = [Column(name) for name in (STATE, NEXT_STATE, GOAL, ACTION)]
+    rest = [column for column in COLUMNS if column.name not in (STATE, ACTION)]
+    with writer(tmp_path / "set", columns=[*single, *rest]) as open_writer:
+        for number in range(2):
+            values = np.arange(6, dtype=np.float32)
+            mine = {STATE: values[:-1], NEXT_STATE: values[1:], GOAL: values[:-1], ACTION: values[:-1]}
+            open_writer.add(Episode(number, fake_columns(5, seed=1) | mine))
+    dataset, out = Dataset.open(tmp_path / "set"), tmp_path / FILES[format]
+    export(dataset, out, format=format)
+    with h5py.File(out / "data/main_data.hdf5" if format == "minari" else out) as file:
+        shapes = {field: file[field].shape for field in VECTORS_OF[format]}
+        rewards = {"d4rl": "rewards", "minari": "episode_1/rewards", "robomimic": "data/demo_1/rewards"}
+        assert format not in rewards or len(file[rewards[format]].shape) == 1
+    width = 2 if format == "d3rlpy" else 1
+    assert {shape[1:] for field, shape in shapes.items() if "actions" not in field} == {(width,)}
+    assert {shape[1:] for field, shape in shapes.items() if "actions" in field} == {(1,)}
+    import_dataset([out], out=tmp_path / "back")
+    assert Dataset.open(tmp_path / "back").content_hash == dataset.content_hash
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))

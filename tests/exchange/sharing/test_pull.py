@@ -255,6 +255,5 @@ def test_what_is_no_whole_dataset_is_refused(
     (shared / path).write_text(json.dumps(content))
     resign(shared)
     with pytest.raises(SharingError, match="is not a complete dataset"):
-        pull(source(shared), out=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    assert not hidden(tmp_path / "out")
+        pull(source(shared), out=tmp_path / "new/place/out")
+    assert not (tmp_path / "new").exists()
