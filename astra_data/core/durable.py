@@ -49,17 +49,16 @@ def move(source: Path, target: Path) -> None:
     sync(target.parent)
 
 
-def make_folder(folder: Path) -> None:
-    """Make `folder` and those that it is in; when this returns, the disk knows."""
-    missing = missing_folders(folder)
+def make_folder(folder: Path) -> list[Path]:
+    """Make `folder` and those that it is in; return those that were not there, the innermost first.
+
+    When this returns, the disk knows.
+    """
+    missing = _missing(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for path in missing:
         sync(path.parent)
-
-
-def missing_folders(folder: Path) -> list[Path]:
-    """Return which of `folder` and those that it is in do not exist, the innermost first."""
-    return [path for path in (folder, *folder.parents) if not path.exists()]
+    return missing
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
@@ -157,13 +156,17 @@ def _remove_dead(path: Path) -> bool:
 @contextmanager
 def folder_for(target: Path) -> Iterator[None]:
     """Make the folder that `target` is in; if the block fails, remove what was made and holds nothing."""
-    missing = missing_folders(target.parent)
+    missing = _missing(target.parent)
     try:
         make_folder(target.parent)
         yield
     except BaseException:
         remove_empty(missing)
         raise
+
+
+def _missing(folder: Path) -> list[Path]:
+    return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def _hidden_names(target: Path) -> Iterator[Path]:

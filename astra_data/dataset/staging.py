@@ -16,16 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from astra_data.core.disk import writing
-from astra_data.core.durable import (
-    discard,
-    make_folder,
-    missing_folders,
-    move,
-    remove_empty,
-    sweep,
-    sync,
-    write_file,
-)
+from astra_data.core.durable import discard, make_folder, move, remove_empty, sweep, sync, write_file
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, first_line
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
@@ -112,7 +103,6 @@ class StagedWriter:
         self._resume = resume
         self._admission = Admission(columns)
         self._exit = ExitStack()
-        self._made_folders: list[Path] = []
         self._is_open = False
 
     def __enter__(self) -> "StagedWriter":
@@ -128,9 +118,8 @@ class StagedWriter:
                 f"{self.root}: an interrupted recording left {self._left()}; "
                 f"resume it (--resume), or delete {self.folder} to start again."
             )
-        self._made_folders = missing_folders(self.root.parent)
         with writing(self.folder), ExitStack() as stack:
-            make_folder(self.folder)
+            stack.callback(remove_empty, make_folder(self.folder))
             sweep(self.root)
             if not stack.enter_context(held(self.folder)):
                 raise BadInputError(
@@ -161,7 +150,6 @@ class StagedWriter:
                 with suppress(OSError):  # what stays is recognised by the next call
                     if is_written or not self._holds_work():
                         discard(self.folder, self.root)
-                        remove_empty(self._made_folders)
 
     def _write(self) -> None:
         self._writer.made, self._writer.policy = self.made, self.policy

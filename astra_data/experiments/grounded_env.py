@@ -106,7 +106,8 @@ def evaluate_policy(
     env, simulation, training = _world(run, row, seed, percent, num_envs=1)
     own = OwnPolicy(policy, env.observation_size, env.action_size)
     episodes = training.episodes
-    tested = {"methods": [row], "seeds": [seed]} | settings_of(run)
+    settings = settings_of(run)
+    tested = settings | {"methods": list(dict.fromkeys([*settings["methods"], row]))}
     evaluate = _planned(run, tested, "evaluate", row, seed, percent)
     _check_made(evaluate.keywords, ("target_encoder", "reference"))
     evaluate(
@@ -159,7 +160,7 @@ def _planned(
     run: str | Path, settings: dict[str, Any], stage: str, row: str, seed: int, percent: int | None
 ) -> partial[object]:
     """Return the call by which a run with these `settings` makes the artefact of a row."""
-    recipe = validated(settings, Recipe, f"{run}")
+    recipe = validated(settings | {"select": None}, Recipe, f"{run}")
     only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
     items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
     call = items.get(f"{stage}/{row}/{place(seed, percent)}")

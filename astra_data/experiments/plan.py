@@ -66,9 +66,9 @@ def plan(
         recipe.settings,
         selection.percents,
     )
-    # One seed alone has no judges.
-    if recipe.select is not None and len(selection.seeds) > 1:
-        items.append(_choice(recipe, reported, folder))
+    choice = _choice(recipe, reported, folder)
+    if choice is not None:
+        items.append(choice)
         keys += ("select",)
     call = partial(
         report.run,
@@ -82,9 +82,13 @@ def plan(
     return (*items, Item("report", keys, call))
 
 
-def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item:
-    """Return the choice among the policies of the selection."""
+def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item | None:
+    """Return the choice among the policies of the selection, if there are judges and policies to judge."""
+    if recipe.select is None or len(reported.seeds) < 2:
+        return None
     of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
+    if not any(bench.entries for bench in of):
+        return None
     inputs = dict.fromkeys(key for bench in of for key in bench.keys)
     return Item(
         "select",

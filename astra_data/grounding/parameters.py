@@ -14,7 +14,10 @@ from astra_data.worlds.variation import Variation
 
 @dataclass(frozen=True)
 class IdentifiedParameters(NoGrounding):
-    """Draw the simulator's parameters from the ranges of `variation` for each episode."""
+    """Draw the simulator's parameters from the ranges of `variation` for each episode.
+
+    Its scatter is that around the raw simulator, whose next states the pairs hold.
+    """
 
     kind: ClassVar[str] = "variation"
 

@@ -23,6 +23,12 @@ NO_GROUNDING = NoGrounding()
 
 
 def scatter_factor(residual: Tensor) -> Tensor:
-    """Return the lower triangular factor (X, X) of the covariance of `residual` (N, X)."""
-    covariance = torch.cov(residual.T) + 1e-9 * torch.eye(residual.shape[1], device=residual.device)
-    return torch.as_tensor(torch.linalg.cholesky(covariance))
+    """Return the lower triangular factor (X, X) of the covariance of `residual` (N, X).
+
+    Entries may depend on each other, as a velocity that is computed from positions does on these.
+    """
+    exact = residual.double()
+    covariance = torch.cov(exact.T).view(exact.shape[1], -1) if len(exact) > 1 else exact.new_zeros(())
+    least = 1e-9 * max(1.0, float(covariance.max()))
+    eye = torch.eye(exact.shape[1], dtype=exact.dtype, device=exact.device)
+    return torch.as_tensor(torch.linalg.cholesky(covariance + least * eye)).to(residual.dtype)

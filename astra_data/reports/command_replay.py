@@ -28,6 +28,15 @@ class CommandReplay:
     target: NDArray[np.float64]
 
 
+def can_replay(task: Task) -> bool:
+    """Return whether a task's target can be driven from the start cell by velocities in its plane.
+
+    A robot with a ball turns to it, so its commands are not comparable; a user's robots start where they do.
+    """
+    planar = task.plane is not None and task.objective.action_size == 2
+    return planar and task.ball_index is None and task.make_target is not None
+
+
 def replay_commands(task: Task) -> CommandReplay:
     """Drive one simulated and 60 target robots from the centre of the start cell by the same commands."""
     command = np.concatenate(

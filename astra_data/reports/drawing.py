@@ -82,7 +82,7 @@ def figures_of(
         figures |= _pictures(folders, camera)
     if maze is not None and folders:
         panels = [_panel(results, row, folder, trajectory_episodes) for row, folder in folders.items()]
-        figures["trajectories"] = trajectories(maze, panels)
+        figures["trajectories"] = trajectories(maze, panels, where(results))
     curves = training_curves(results)
     if curves:
         name = "learning" if results.headline == SUCCESS else f"learning_{results.headline.measure}"
@@ -219,6 +219,7 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
             for method, sizes in summaries.items()
         },
         covered,
+        where(first),
     )
 
 

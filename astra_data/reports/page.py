@@ -26,7 +26,7 @@ BESIDE = {
     ),
     "steps": ("failed", "simulated_steps", "tries", "beyond_recorded"),
 }
-"""Headline → the other measures in the table of scores."""
+"""Headline → the other measures in the table of scores; beside another one, those of success."""
 OF_PLANES = {"wall_contact", "distance"}
 """Of these, what tasks without walls and places do not have."""
 NEGLIGIBLE = {"beyond_recorded": 0.01, "tries": 1.0}
@@ -88,7 +88,8 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
 
 def score_table(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return head and lines of the table of scores."""
-    rows, scores, beside = results.methods, results.scores, BESIDE[results.headline.measure]
+    rows, scores = results.methods, results.scores
+    beside = BESIDE.get(results.headline.measure, BESIDE["success"])
     bare = OF_PLANES | NEGLIGIBLE.keys() if results.tested_in == "target" else set(beside)
     beside = tuple(
         measure for measure in beside if measure not in bare or any(map(_some(measure), rows.values()))

@@ -185,7 +185,9 @@ def collect(
                 **({} if plan is None else {"starts": plan.starts[rows.start : rows.stop]}),
             )
             env.reset()
-            acting = behavior.of(rows) if isinstance(behavior, PlannedCommands) else behavior
+            acting: Behavior = behavior
+            if isinstance(behavior, PlannedCommands | MixedBehavior):
+                acting = behavior.of(rows)
             acting.start(len(rows), batch_seed)
             batch = part(recording, rows.start / episodes, rows.stop / episodes)
             steps += record(

@@ -157,7 +157,7 @@ def evaluate(
         outcomes, filmed = {}, {}
         for kind, robot in robots.items():
             counted = asked if kind == headline else None
-            outcomes[kind], filmed[kind], rate = in_target(
+            outcomes[kind], filmed[kind], rate, start_goal = in_target(
                 world,
                 robot,
                 config.episodes,
@@ -180,14 +180,14 @@ def evaluate(
         results |= {"tested_in": tested_in, "encoder": "source"}
     for name, simulated in simulators.items():
         counted = asked if name == tested_in else None
-        outcome, start_goal = in_simulator(
+        outcome, simulated_starts = in_simulator(
             simulated, begin, world.objective.horizon, derive(seed, "simulated evaluation"), counted
         )
+        if name == tested_in:
+            start_goal = simulated_starts
         results[name] = outcome.to_json()
         if name in ("simulated", tested_in):
             tensors[f"{name}.position"] = outcome.position
-    if world.has_target:
-        start_goal = _starts_and_goals(world, config, seed)
     if asked is not None:
         results["beyond_recorded"] = asked.share
     with finished_folder(out) as folder:
@@ -204,12 +204,6 @@ def evaluate(
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
     act = careful(task, goal)
     return lambda state, goal: act(task.abstraction(state), goal)
-
-
-def _starts_and_goals(task: Task, config: EvaluateConfig, seed: int) -> dict[str, Tensor]:
-    env = task.target(config.episodes, seed=derive(seed, "evaluation"), num_threads=1)
-    env.reset()
-    return {"start": env.position, "goal": env.goal}
 
 
 def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:

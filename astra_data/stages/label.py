@@ -67,6 +67,8 @@ def label(
         if column.name not in source.features
     ]
     if not more and out is not None:
+        if out.exists() or out.is_symlink():
+            raise BadInputError(f"{out} exists already; delete it or choose another folder.")
         make_folder(out.parent)
         out.symlink_to(source.root.resolve())
         return out

@@ -19,7 +19,7 @@ from astra_data.methods import method_named
 from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.assembly import assemble
 from astra_data.reports.choice import SELECTED
-from astra_data.reports.command_replay import replay_commands
+from astra_data.reports.command_replay import can_replay, replay_commands
 from astra_data.reports.eval_info import eval_info
 from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
 from astra_data.reports.held_out import failure_rates, foresight_lines
@@ -124,8 +124,7 @@ def report(
             trajectory_methods=config.trajectory_methods,
             trajectory_episodes=config.trajectory_episodes,
         )
-        # A robot with a ball turns to it, so its commands are not comparable.
-        if task.plane is not None and task.ball_index is None:
+        if can_replay(task):
             replay = replay_commands(task)
             figures["mismatch"] = dynamics_mismatch(
                 replay.time_s, replay.command, replay.simulated, replay.target

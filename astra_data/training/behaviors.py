@@ -144,15 +144,23 @@ class PolicyBehavior:
 class MixedBehavior:
     """A policy on a part of the robots, random commands on the others."""
 
-    def __init__(self, policy: Behavior, random: Behavior, share: float) -> None:
-        """Let `random` act on a `share` of the robots, spread evenly, so that the first n have it as well."""
-        self._policy, self._random, self._share = policy, random, share
+    def __init__(self, policy: Behavior, random: Behavior, share: float, first: int = 0) -> None:
+        """Let `random` act on a `share` of all episodes, spread evenly, so that the first n have it as well.
+
+        The robots' episodes are those from number `first` on.
+        """
+        self._policy, self._random, self._share, self._first = policy, random, share, first
+
+    def of(self, rows: range) -> "MixedBehavior":
+        """Return the same for the episodes `rows`."""
+        return MixedBehavior(self._policy, self._random, self._share, rows.start)
 
     def start(self, count: int, seed: int) -> None:
         """Begin new episodes of B = `count` robots."""
         self._policy.start(count, seed)
         self._random.start(count, seed)
-        before = torch.floor(torch.arange(count + 1, dtype=torch.float64) * self._share + 1e-9)
+        episodes = self._first + torch.arange(count + 1, dtype=torch.float64)
+        before = torch.floor(episodes * self._share + 1e-9)
         self.is_random = (before.diff() > 0).unsqueeze(1)
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:

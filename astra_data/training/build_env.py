@@ -40,7 +40,7 @@ class EnvConfig(Config):
     reward: RewardSource | None = None
     """Where the reward comes from: "abstract", "predicted" or "blend"; by default that of the method."""
     topple: bool = False
-    """Draw topples from the topple head: they end the episode, and with the task's own reward they cost."""
+    """Draw topples from the topple head: they end the episode, and cost what a failure costs."""
     risk_weight: NotNegative = 1.0
     """How many topples a predicted one counts for in "blend": it costs the rest of the episode as well."""
     residual_noise: NotNegative = 0.0
@@ -109,7 +109,7 @@ class EnvParts:
     Attributes:
         thinness: 1 where there is no data, 0 where there is enough, on the maze's fine grid (height, width);
             None where there is no maze.
-        scatter: factor of the state noise, (X, X).
+        scatter: factor of the state noise, (X, X); zeros without.
         starts: recorded moments, if episodes may start there.
         variation: ranges of the simulator's parameters, drawn for each episode.
     """
@@ -144,7 +144,11 @@ def env_parts(
             previous_action=windows.previous_action[:, ::every][moments],
             hidden=None if hidden is None else hidden[moments],
         )
-    return EnvParts(thinness, config.residual_noise * grounding.scatter(episodes), starts, variation)
+    size = windows.state.shape[-1]
+    scatter = windows.state.new_zeros(size, size)
+    if config.residual_noise:
+        scatter = config.residual_noise * grounding.scatter(episodes)
+    return EnvParts(thinness, scatter, starts, variation)
 
 
 @torch.no_grad()

@@ -34,8 +34,13 @@ class OwnLearner(InSimulator):
         """Return the policy and its learning curve.
 
         Raises:
-            BadInputError: what it returns is no such policy.
+            BadInputError: what it returns is no such policy, or the device is no CPU.
         """
+        if training.device != "cpu":
+            raise BadInputError(
+                f"--device {training.device}: a learner of your own gets an environment of numpy arrays, "
+                "expected --device cpu; run the recipe again with it, finished artefacts are kept"
+            )
         from astra_data.training.watched_env import WatchedEnv
 
         env, simulation = self.world(training)
@@ -46,7 +51,7 @@ class OwnLearner(InSimulator):
             raise BadInputError(
                 f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}"
             )
-        watched.note()
+        watched.finish()
         own = OwnPolicy(learned, env.observation_size, env.action_size)
         episodes = training.episodes
         curve = {"points": watched.points}

@@ -158,7 +158,6 @@ class SimulatorEnv:
         self.failed = self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
-        decided = success | self.failed
         penalty = torch.zeros(self.num_envs, device=self.device)
         if self.thinness is not None and self.free is not None:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
@@ -171,6 +170,7 @@ class SimulatorEnv:
             penalty = penalty + self.risk_weight * self.objective.failure_reward * risk
         reward = self.objective.reward(before, after, self.goal, self.failed)
         if self.reward == "predicted":
+            decided = success | self.failed
             none_failed = torch.zeros_like(decided)
             own = self.objective.reward(before, after, self.goal, none_failed)
             # Failures that are drawn are paid when they come.

@@ -14,11 +14,17 @@ from astra_data.worlds.task import Task
 
 
 class TargetEpisodes(NamedTuple):
-    """Episodes in the target: their outcome, the states (T + 1, S) of the first, and target steps/s."""
+    """Episodes in the target.
+
+    Attributes:
+        outcome: theirs. filmed: the states (T + 1, S) of the first. rate: target steps/s.
+        start_goal: where they began, "start" (B, 2), and "goal" (B, G).
+    """
 
     outcome: Outcome
     filmed: Tensor
     rate: float
+    start_goal: dict[str, Tensor]
 
 
 def in_target(
@@ -47,6 +53,7 @@ def in_target(
     legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
     env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
     env.reset()
+    start_goal = {"start": env.position.clone(), "goal": env.goal.clone()}
     act = begin(env.goal)
     record = EpisodeRecord(env.position)
     filmed = [env.state[0]]
@@ -65,4 +72,4 @@ def in_target(
         progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
         if not record.active.any():
             break
-    return TargetEpisodes(record.outcome(), torch.stack(filmed), rate)
+    return TargetEpisodes(record.outcome(), torch.stack(filmed), rate, start_goal)

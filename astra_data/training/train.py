@@ -282,9 +282,10 @@ def optimise(
         training.progress(learner.steps / learner.total_steps, note)
         if logbook.is_due or learner.done:
             logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
+    taken, seconds = learner.steps - first, learner.acting.world_seconds
     return {
         "steps_per_second": learner.steps / stopwatch.seconds,
-        "simulator_steps_per_second": (learner.steps - first) / max(learner.acting.world_seconds, 1e-9),
+        "simulator_steps_per_second": taken / seconds if taken else None,
         **stopwatch.spent(),
         "points": points,
     }

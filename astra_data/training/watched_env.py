@@ -36,10 +36,15 @@ class WatchedEnv(BatchedVectorEnv):
             self._ended += int(infos["_final_info"].sum())
             self._succeeded += int(infos["final_info"]["success"].sum())
         if self._steps * _POINTS >= (len(self.points) + 1) * self._total:
-            self.note()
+            self._note()
         return stepped
 
-    def note(self) -> None:
+    def finish(self) -> None:
+        """End the curve with the last step, if it does not yet."""
+        if not self.points or self.points[-1]["steps"] != self._steps:
+            self._note()
+
+    def _note(self) -> None:
         """Add a point to the curve, of the episodes that ended since the last one."""
         lasts = self._training.task.objective.is_lasting
         success = None if lasts or not self._ended else self._succeeded / self._ended

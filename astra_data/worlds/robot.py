@@ -40,7 +40,7 @@ class RobotEnv:
 
     Attributes:
         goal: (B, G) float32.
-        failed: which robots failed in their last step, (B,) bool.
+        failed: which robots failed in their last step, by their own account or the objective's, (B,) bool.
         wall_contact: none of them, (B,) bool: robots do not tell.
     """
 
@@ -80,6 +80,7 @@ class RobotEnv:
         self._takes_seed, self._starts = "seed" in takes, starts if "start" in takes else None
         self.goal = torch.zeros(num_envs, objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self._fell = self.failed.clone()
         self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
         self._state = torch.zeros(num_envs, state.size)
         self.reseed(seed)
@@ -110,7 +111,7 @@ class RobotEnv:
             self._state[row] = self._checked(self._robots[row].reset(**options), "reset")
             goal = self._objective.draw_goals(generator(self._seed, f"goal of {episode}"), 1)
             self.goal[row] = torch.from_numpy(goal[0]).float()
-            self.failed[row] = False
+            self._fell[row] = self.failed[row] = False
         return self._observe()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
@@ -120,14 +121,14 @@ class RobotEnv:
         rows = range(self.num_envs) if active is None else active.nonzero().squeeze(1).tolist()
         for row in rows:
             state, has_failed = self._robots[row].step(commands[row])
-            self._state[row], self.failed[row] = self._checked(state, "step"), bool(has_failed)
+            self._state[row], self._fell[row] = self._checked(state, "step"), bool(has_failed)
         after = self._abstract()
-        success = self._objective.reached(after, self.goal) & ~self.failed
-        failed = (self.failed | self._objective.missed(after, self.goal)) & ~success
+        success = self._objective.reached(after, self.goal) & ~self._fell
+        self.failed = (self._fell | self._objective.missed(after, self.goal)) & ~success
         return Step(
             observation=self._observe(),
-            reward=self._objective.reward(before, after, self.goal, failed),
-            terminated=success | failed,
+            reward=self._objective.reward(before, after, self.goal, self.failed),
+            terminated=success | self.failed,
             success=success,
         )
 

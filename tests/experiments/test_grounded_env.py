@@ -17,10 +17,11 @@ from astra_data.cli.app import app
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.progress import silent
 from astra_data.exchange.importing import import_dataset
+from astra_data.experiments import grounded_env
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.grounded_env import OPTIONS, evaluate_policy
 from astra_data.experiments.plan import plan, stage_of
-from astra_data.experiments.trained_policy import load_policy
+from astra_data.experiments.trained_policy import load_policy, settings_of
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SingleEnv
 from astra_data.training.own_policy import OwnPolicy
@@ -148,6 +149,14 @@ def test_it_is_the_environment_that_the_row_was_trained_in(
     assert torch.equal(trained.starts.state, ours.starts.state)
     assert trained.simulator.scatter is not None and ours.simulator.scatter is not None
     assert torch.equal(trained.simulator.scatter, ours.simulator.scatter)
+
+
+def test_a_recipe_that_chooses_has_the_same_environments(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A choice needs a second seed and a judge, which a single row and seed do not have."""
+    settings = settings_of(run) | {"seeds": [0, 1], "select": {}}
+    monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)
+    for row in ("direct_transfer", "nas", "astra_plus"):
+        assert world_of(run, row, seed=0).num_envs == 1
 
 
 def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:

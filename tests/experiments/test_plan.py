@@ -248,6 +248,16 @@ def test_one_seed_alone_is_not_judged(tmp_path: Path, fake_recipe: type[Recipe])
     assert "select" not in items and "select" not in items["report"].inputs
 
 
+def test_rows_without_policies_to_judge_are_reported_without_a_choice(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    recipe = load(tmp_path, fake_recipe, SELECT)
+    for row in ("follower", "target"):
+        part = Selection.of(recipe, methods=[row])
+        items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
+        assert "select" not in items and "select" not in items["report"].inputs
+
+
 def test_the_judge_is_grounded_even_if_its_row_is_left_out(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
     recipe = load(tmp_path, fake_recipe, SELECT.replace("steps = 3", 'judge = "astra_again"'))
     part = Selection.of(recipe, methods=["direct_transfer"])

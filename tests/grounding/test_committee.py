@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from small_cart import TASK
+from small_cart import TASK, Rail, Reach
 from toy_corrections import OFFSETS_M, SCATTER_M, shifted
 
 from astra_data.core.errors import BadInputError
@@ -91,6 +91,50 @@ def test_where_touches_are_foreseen_episodes_are_followed_up_to_the_wall() -> No
     ):
         made = [HistoryGrounding(shifted(offset), model, clearance_m=0.3) for offset in OFFSETS_M]
         assert Committee.of(task, made).clearance_m == kept
+
+
+class Fenced(Rail):
+    """A rail with a wall at 1 m."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self.clear_m = 0.0
+        self.blocked = torch.zeros(num_envs, dtype=torch.bool)
+
+    def keep_clear(self, distance_m: float) -> None:
+        self.clear_m = distance_m
+
+    def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
+        end_m = 1.0 - self.clear_m
+        self.blocked = landed[:, 0] > end_m
+        self.reset_to(landed.clamp_max(end_m))
+        return self.state
+
+
+class Past(Reach):
+    """What is beyond 0.5 m is lost."""
+
+    def missed(self, state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        return state[:, 0] > 0.5
+
+
+@pytest.mark.parametrize(("clearance_m", "end_m"), [(None, 1.0), (0.25, 0.75)])
+def test_walls_stop_rollouts_where_corrections_keep_clear(clearance_m: float | None, end_m: float) -> None:
+    made = [HistoryGrounding(shifted(offset), clearance_m=clearance_m) for offset in OFFSETS_M]
+    for ends in (False, True):
+        objective = replace(TASK.objective, ends_at_walls=ends)
+        of = Committee.of(replace(TASK, make_simulator=Fenced, objective=objective), made)
+        state, _, reached = follow(of, steps=20)
+        assert state[-1, 0, 0] == pytest.approx(end_m)
+        touched = np.flatnonzero(state[:, 0, 0] >= end_m - 1e-6)[0]
+        assert (reached[:touched, 0] == 1.0).all()
+        assert (reached[touched:, 0] == (0.0 if ends else 1.0)).all()
+
+
+def test_what_the_objective_misses_ends_rollouts() -> None:
+    made = [HistoryGrounding(shifted(offset)) for offset in OFFSETS_M]
+    state, _, reached = follow(Committee.of(replace(TASK, objective=Past(horizon=40)), made))
+    np.testing.assert_array_equal(reached[:, 0], state[:, 0, 0] <= 0.5)
 
 
 def test_one_correction_alone_cannot_disagree() -> None:

@@ -21,6 +21,23 @@ def test_the_scatter_factor_is_triangular_and_its_square_the_covariance() -> Non
     assert (factor.diagonal() > 0).all()
 
 
+def test_entries_that_depend_on_each_other_have_a_factor_too() -> None:
+    """As a velocity that is a difference of positions; so do fewer steps than entries, and a single one."""
+    torch.manual_seed(0)
+    for seed in range(20):
+        torch.manual_seed(seed)
+        moved = 10 ** (seed / 4 - 3) * torch.randn(200, 2)
+        residual = torch.cat([moved, moved / 0.1], dim=1)
+        factor = scatter_factor(residual)
+        expected = torch.cov(residual.T)
+        torch.testing.assert_close(factor @ factor.T, expected, atol=2e-9, rtol=1e-3)
+    few = torch.randn(5, 8)
+    factor = scatter_factor(few)
+    torch.testing.assert_close(factor @ factor.T, torch.cov(few.T), atol=1e-5, rtol=1e-3)
+    assert float(scatter_factor(torch.randn(1, 3)).abs().max()) < 1e-4
+    assert scatter_factor(torch.randn(9, 1)).shape == (1, 1)
+
+
 def test_scatter_is_of_real_steps_between_the_raw_simulator_and_the_target() -> None:
     torch.manual_seed(0)
     state, error = torch.randn(2, 50, 4), 0.1 * torch.randn(2, 50, 4)

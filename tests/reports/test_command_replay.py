@@ -1,6 +1,9 @@
-import pytest
+from dataclasses import replace
 
-from astra_data.reports.command_replay import replay_commands
+import pytest
+from small_cart import TASK
+
+from astra_data.reports.command_replay import can_replay, replay_commands
 from astra_data.worlds.registry import TASKS
 
 
@@ -19,3 +22,11 @@ def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -
     assert way[-1] == pytest.approx([-0.2 * 0.192, 0.0], abs=1e-5)
     assert replay.simulated[0, :2] == pytest.approx(start, abs=0.2)
     assert replay.target[:, 0, :2].mean(axis=0) == pytest.approx(start, abs=0.05)
+
+
+def test_only_targets_that_can_be_driven_from_the_start_cell_are() -> None:
+    task = TASKS["nao-navigation"]
+    assert can_replay(task) and can_replay(TASKS["antmaze-long"])
+    assert not can_replay(TASKS["nao-kick"]) and not can_replay(TASKS["humanoid-walker2d"])
+    assert not can_replay(replace(task, make_target=None))  # known from its logs alone
+    assert not can_replay(TASK)

@@ -181,6 +181,12 @@ def test_of_lasting_tasks_the_page_shows_survived_steps_and_return(results: Resu
     assert "success" not in page
 
 
+def test_another_headline_has_the_columns_of_success_beside_it(results: Results) -> None:
+    rows = rows_of(results, **{row: {"encoders": {}} for row in results.methods})
+    page = page_of(results, methods=rows, scores=(RETURN, SUCCESS))
+    assert "| method | seeds | return | IQM [95 %] | success | IQM [95 %] | failed | " in page
+
+
 def test_every_figure_has_a_place_on_a_page_and_only_those_drawn_are_shown(results: Results) -> None:
     assert "![" not in render(results, {})
     rows = rows_of(results, **{key: {"encoders": {}} for key in ROWS})

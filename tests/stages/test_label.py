@@ -119,6 +119,9 @@ def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(tmp_path
     labelled = label(CART, data=write(tmp_path / "logs", [drive(0.1, 3)]), out=tmp_path / "labelled")
     link = label(CART, data=labelled, out=tmp_path / "run" / "seed_0")
     assert link.is_symlink() and Dataset.open(link).content_hash == Dataset.open(labelled).content_hash
+    for taken in (link, labelled):
+        with pytest.raises(BadInputError, match="exists already; delete it or choose another folder"):
+            label(CART, data=labelled, out=taken)
     address = push(str(labelled), f"file://{tmp_path}/shared")
     pulled = label(CART, data=address, out=tmp_path / "run" / "seed_1")
     assert pulled.resolve() == home / "logs" / "data-2.0.0"

@@ -131,3 +131,16 @@ def test_a_share_of_many_robots_is_exact() -> None:
     mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
     mixed.start(100, seed=0)
     assert int(mixed.is_random.sum()) == 29
+
+
+@pytest.mark.parametrize("batch", [1, 7, 25])
+def test_batches_of_any_size_have_the_share_of_one(batch: int) -> None:
+    mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
+    mixed.start(100, seed=0)
+    found = []
+    for first in range(0, 100, batch):
+        rows = range(first, min(first + batch, 100))
+        acting = mixed.of(rows)
+        acting.start(len(rows), seed=first)
+        found += acting.is_random[:, 0].tolist()
+    assert found == mixed.is_random[:, 0].tolist()

@@ -61,11 +61,37 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
     _, curve = driving(command, steps=400)(given)
     points = curve["points"]
     assert [point["steps"] for point in points[:3]] == [8, 16, 24]
-    assert points[-1]["steps"] == 400 and len(points) == 51
+    assert points[-1]["steps"] == 400 and len(points) == 50
     ended = [point["success"] for point in points if point["success"] is not None]
     assert set(ended) == {success} and told[-1][0] == 1.0
     # Backward all four end at steps 160 and 320, by the horizon of 40.
     assert success or [point["steps"] for point in points if point["success"] == 0.0] == [160, 320]
+
+
+def test_a_curve_that_stops_between_two_points_ends_with_its_last_step(tmp_path: Path) -> None:
+    _, curve = driving(1.0, steps=12)(training(tmp_path))
+    assert [point["steps"] for point in curve["points"]] == [8, 12]
+
+
+def test_its_randomness_is_that_of_the_seed(tmp_path: Path) -> None:
+    drawn = []
+
+    def learn(env: WatchedEnv, training: Training) -> Constant:
+        drawn.append(float(torch.rand(())))
+        return Constant(0.0)
+
+    for seed in (7, 7, 8):
+        given = training(tmp_path)
+        object.__setattr__(given, "seed", seed)
+        OwnLearner(learn=learn, policy=Constant)(given)
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_it_runs_on_the_cpu_alone(tmp_path: Path) -> None:
+    given = training(tmp_path)
+    object.__setattr__(given, "device", "cuda")
+    with pytest.raises(BadInputError, match=r"--device cuda: a learner of your own .* expected --device cpu"):
+        driving(1.0, 8)(given)
 
 
 def test_the_same_seed_shows_it_the_same(tmp_path: Path) -> None:

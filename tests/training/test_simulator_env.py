@@ -332,6 +332,19 @@ def test_topples_that_are_drawn_are_no_part_of_the_predicted_reward() -> None:
     assert (failing < -1).all()
 
 
+def test_a_topple_that_is_drawn_costs_what_a_failure_costs() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    list(model.topple_head.parameters())[-1].fill_(50.0)
+    inner = PointMass(U_MAZE, 400, timestep_s=0.05)
+    one = SimulatorEnv(TASK, GroundedSimulator(inner, model), topple=True, reward="predicted")
+    one.reset()
+    step = one.step(torch.zeros(400, 2))
+    assert 5 < one.failed.sum() < 50 and torch.equal(step.terminated, one.failed)
+    assert TASK.failure_reward == -10.0
+    assert (step.reward[one.failed] < -9.0).all() and (step.reward[~one.failed] > -1.0).all()
+
+
 def test_recorded_starts_hand_over_their_history() -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from small_cart import TASK
+from small_cart import TASK, Cart
 from torch import Tensor
 
 from astra_data.training.own_world import Act
+from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.target_episodes import in_target
 
 
@@ -21,6 +24,48 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     assert late.outcome.success == [0.0] * 5 and late.outcome.steps == [TASK.objective.horizon] * 5
     assert late.filmed.shape == (TASK.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2)
     assert late.rate > 0
+
+
+def test_commands_beyond_the_recorded_are_of_robots_that_still_drive() -> None:
+    """One episode ends at its goal; the others go on, at a speed that was recorded."""
+    goals: list[Tensor] = []
+
+    def begin(goal: Tensor) -> Act:
+        goals.append(goal.clone())
+        fastest = (goal == goal.min()).float()
+        return lambda state, goal: ((0.9 * fastest - 0.5 * (1 - fastest)) - 1.5) / 2.5
+
+    asked = RecordedRange(torch.tensor([-1.0]), torch.tensor([0.8]), TASK.limits)
+    found = in_target(TASK, begin, 3, seed=3, asked=asked).outcome
+    short = min(found.steps)
+    assert sum(found.success) == 1.0 and short < TASK.objective.horizon
+    assert asked.share == pytest.approx(short / sum(found.steps))
+
+
+def test_goals_are_told_and_each_robot_is_built_and_started_once() -> None:
+    goals: list[Tensor] = []
+
+    def begin(goal: Tensor) -> Act:
+        goals.append(goal.clone())
+        return driving(0.9)
+
+    found = in_target(replace(TASK, robot=Unseeded), begin, 3, seed=3)
+    assert torch.equal(found.start_goal["goal"], goals[0])
+    assert Unseeded.made == Unseeded.began == 3
+
+
+class Unseeded(Cart):
+    """A robot that counts how often it is built and started."""
+
+    made = 0
+    began = 0
+
+    def __init__(self) -> None:
+        type(self).made += 1
+
+    def reset(self) -> list[float]:
+        type(self).began += 1
+        return super().reset()
 
 
 def test_starts_and_goals_depend_on_the_seed_alone() -> None:

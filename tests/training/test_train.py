@@ -219,6 +219,10 @@ def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     assert torch.equal(again.observation, first.env.observe())
     assert [point["steps"] for point in curve["points"]] == list(range(1, 13))
     assert curve["simulator_steps_per_second"] == pytest.approx(2 / 0.5)
+    ended = Counting(env, lambda step: {"success": 0.5})
+    ended.total_steps = 12
+    curve = optimise(cast(Learner, ended), env, WHOLE, given)
+    assert len(curve["points"]) == 12 and curve["simulator_steps_per_second"] is None
 
 
 def test_a_recipe_decides_the_reward_before_the_method(tmp_path: Path) -> None:

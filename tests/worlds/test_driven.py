@@ -35,6 +35,10 @@ class Walled(Rail):
 
     blocked = torch.tensor([True, False])
     varied = 0
+    kept_m = 0.0
+
+    def keep_clear(self, distance_m: float) -> None:
+        self.kept_m = distance_m
 
     def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
         self.reset_to(landed.clamp_max(1.0))
@@ -51,6 +55,9 @@ def test_walls_and_parameters_of_the_simulator_are_its_own() -> None:
     assert simulator.blocked.tolist() == [True, False]
     simulator.vary({"friction": torch.ones(2, 1)})
     assert walled.varied == 1
+    simulator.keep_clear(0.3)
+    assert walled.kept_m == 0.3
+    driven().keep_clear(0.3)  # no walls, nothing to keep clear of
 
 
 def test_commands_vary_from_episode_to_episode() -> None:

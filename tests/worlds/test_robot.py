@@ -4,9 +4,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_cart import TASK, Cart
+from small_cart import TASK, Cart, Reach
 
 from astra_data.core.errors import BadInputError
+from astra_data.training.target_episodes import in_target
 
 
 def test_robots_are_stepped_by_commands_in_their_units() -> None:
@@ -38,6 +39,34 @@ def test_an_episode_ends_at_its_goal() -> None:
         if step.terminated[0]:
             break
     assert step.success[0] and env.state[0, 0] >= env.goal[0, 0] > env.state[0, 0] - 0.225 - 1e-6
+
+
+class Edge(Reach):
+    """A rail that ends at -0.2 m."""
+
+    def missed(self, state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        return state[:, 0] < -0.2
+
+
+def test_what_the_objective_misses_is_a_failure_until_the_next_episode() -> None:
+    env = replace(TASK, objective=Edge(horizon=40)).target(2, seed=0)
+    env.reset()
+    back = torch.tensor([[-1.0], [-0.6]])
+    ended = [env.step(back).terminated.tolist() for _ in range(3)]
+    assert ended == [[False, False], [False, False], [True, False]]
+    assert env.failed.tolist() == [True, False]
+    # A robot that is done stays where it is, and failed.
+    assert env.step(back, torch.tensor([False, True])).terminated.tolist() == [True, False]
+    env.reset(torch.tensor([True, False]))
+    assert env.failed.tolist() == [False, False]
+    fell = env.step(torch.tensor([[1.0], [-0.6]]))
+    assert fell.terminated.tolist() == [True, False] and env.failed.tolist() == [True, False]
+    found = in_target(replace(TASK, objective=Edge(horizon=40)), lambda goal: driving_back, 3, seed=0).outcome
+    assert found.failed == [1.0] * 3 and found.success == [0.0] * 3 and found.steps == [3] * 3
+
+
+def driving_back(state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+    return torch.full_like(goal, -1.0)
 
 
 class Noted(Cart):

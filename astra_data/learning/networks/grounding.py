@@ -245,7 +245,7 @@ class GroundingModel(nn.Module):
             mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
             nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
             both = mask[:, :-1] * mask[:, 1:]
-            parts["latent"] = (nll * both).sum() / both.sum()
+            parts["latent"] = (nll * both).sum() / both.sum().clamp_min(1.0)
             total = total + weights.latent * parts["latent"]
         if weights.reward > 0:
             parts["reward"] = self._reward_loss(latent, windows)

@@ -55,8 +55,8 @@ class Panel:
     goal: Floats
 
 
-def trajectories(maze: Maze, panels: Sequence[Panel]) -> Figure:
-    """Draw one maze per row: dashed in the simulator, solid in the target; failures end with a cross."""
+def trajectories(maze: Maze, panels: Sequence[Panel], tested: str = "in the target") -> Figure:
+    """Draw one maze per row: dashed in the simulator, solid where tested; failures end with a cross."""
     columns = min(len(panels), COLUMNS)
     rows = -(-len(panels) // columns)
     across, up = (float(np.ptp(ends)) for ends in _view(maze))
@@ -77,7 +77,7 @@ def trajectories(maze: Maze, panels: Sequence[Panel]) -> Figure:
             axes.set_title(f"{panel.success:.2f}", loc="right", fontweight="normal")
         handles = [
             Line2D([], [], color=SIMULATED, ls="--", label="in its simulator"),
-            Line2D([], [], color=DEPLOYED, label="in the target"),
+            Line2D([], [], color=DEPLOYED, label=tested),
             Line2D([], [], color=INK, marker="x", ls="", mew=1.8, label="failed here"),
             Line2D([], [], marker="*", ls="", ms=11, mfc="#FFD23F", mec=INK, mew=0.8, label="goal"),
         ]

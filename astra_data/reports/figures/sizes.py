@@ -36,6 +36,7 @@ def data_efficiency(
     scores: Mapping[str, Sequence[Floats]],
     intervals: Mapping[str, Floats],
     covered: Mapping[str, Sequence[Visits]],
+    tested: str = "in the target",
 ) -> Figure:
     """Draw a map per size for each of `covered`, and below them a score with a band per row.
 
@@ -45,6 +46,7 @@ def data_efficiency(
         scores: those of each row's seeds, K times (seeds,).
         intervals: interquartile mean, low and high of each row, (3, K); low and high NaN for a single seed.
         covered: what is mapped, such as "position (m)" → the visits of each size.
+        tested: where.
     """
     with style():
         order = np.argsort(percents)
@@ -66,7 +68,7 @@ def data_efficiency(
         for method, seeds in scores.items():
             _band(
                 axes,
-                np.array(percents, dtype=float)[order],
+                sizes,
                 [seeds[k] for k in order],
                 intervals[method][:, order],
                 method,
@@ -74,7 +76,7 @@ def data_efficiency(
         axes.set_xticks(sizes, [f"{percent:g} %" for percent in sizes])
         axes.set_xlabel("size of the dataset")
         score_axis(axes, score)
-        axes.set_ylabel(f"{score.quantity} in the target")
+        axes.set_ylabel(f"{score.quantity} {tested}")
         axes.legend(loc="lower right", ncols=2)
         return figure
 

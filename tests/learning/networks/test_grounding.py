@@ -285,6 +285,14 @@ def test_the_latent_loss_is_the_negative_log_likelihood() -> None:
     torch.testing.assert_close(parts["latent"], -likelihood.mean() - constant)
 
 
+def test_a_window_without_two_steps_in_a_row_teaches_no_latent() -> None:
+    model = untrained("detach")
+    mask = torch.zeros_like(TRAINING.mask)
+    mask[:, 3] = 1.0
+    total, parts = model.losses(replace(TRAINING, mask=mask), LATENT_ALONE)
+    assert parts["latent"] == 0.0 and bool(total.isfinite())
+
+
 def test_nothing_is_made_on_another_device_than_the_models() -> None:
     """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
     windows = lagging_world(3, 5, seed=0)

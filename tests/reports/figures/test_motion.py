@@ -28,6 +28,10 @@ def panel(method: str, *, in_simulator: bool = True) -> Panel:
 
 def test_trajectories_draw_a_panel_per_row_with_crosses_where_episodes_fail() -> None:
     figure = trajectories(U_MAZE, [panel("astra"), panel("follower", in_simulator=False)])
+    told = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert told[1] == "in the target"
+    elsewhere = trajectories(U_MAZE, [panel("astra")], "in a simulator").legends[0].get_texts()
+    assert elsewhere[1].get_text() == "in a simulator"
     astra, follower = figure.axes
     assert (astra.get_title(loc="left"), astra.get_title(loc="right")) == ("ASTRA", "0.33")
     assert follower.get_title(loc="left") == "Careful follower"

@@ -24,4 +24,6 @@ def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
     other = data_efficiency(SURVIVED_STEPS, [100, 25, 150], scores, alone, {}).axes[0]
     assert (success.get_ylim(), other.get_ylim()[0]) == ((-0.02, 1.02), 0.0)
     assert success.get_ylabel() == "success rate in the target" != other.get_ylabel()
+    judged = data_efficiency(SUCCESS, [100, 25, 150], scores, alone, {}, "in a simulator").axes[0]
+    assert judged.get_ylabel() == "success rate in a simulator"
     assert png(figure)
