@@ -77,3 +77,26 @@ def test_the_loop_keeps_the_rate_and_begins_without_memory(folder: Path) -> None
     assert len(sent) == 3
     np.testing.assert_array_equal(sent[0], first)
     assert not np.array_equal(sent[1], first)
+
+
+def test_the_loop_sleeps_what_the_policy_leaves_of_a_period(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that only measuring and sleeping move: 20 ms, then 150 ms, then 20 ms again, at 10 Hz."""
+    now, slept, took = [100.0], list[float](), iter((0.02, 0.15, 0.02))
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        now[0] += seconds
+
+    def measure() -> list[float]:
+        now[0] += next(took)
+        return [0.5, 1.0]
+
+    monkeypatch.setattr("astra_data.deployment.run_policy.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("astra_data.deployment.run_policy.time.sleep", sleep)
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    policy.about["rate_hz"] = 10.0
+    run(policy, measure, lambda command: None, [1.0], steps=3)
+    # What one period is late, the next makes up for.
+    assert slept == pytest.approx([0.08, 0.0, 0.03])

@@ -23,6 +23,15 @@ def test_errors_are_taken_in_the_bodys_and_the_fields_frame() -> None:
     assert errors[:, 1].isnan().all(-1).sum() >= 20
 
 
+def test_of_too_many_starts_an_even_share_of_all_pieces_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    walks = Walks.of_pieces([piece(400, seed) for seed in range(3)], FPS, CONFIG)
+    every = Trial.of(walks, 4, (1,))
+    assert len(every.piece) > 300
+    monkeypatch.setattr("astra_data.studies.errors.MOST_STARTS", 30)
+    some = Trial.of(walks, 4, (1,))
+    assert len(some.piece) == 30 and np.bincount(some.piece).min() >= 9
+
+
 def test_summaries_weigh_starts_and_compare_with_the_raw_simulator() -> None:
     piece_of = np.array([0, 0, 0, 1])
     ones = np.ones((1, 4, 1, len(AXES)))

@@ -178,3 +178,11 @@ def test_a_single_joint_and_a_log_without_joints(tmp_path: Path) -> None:
     mapping.write_text(f'{head}[columns.action]\nfields = ["des_dof_pos"]\n')
     with pytest.raises(BadInputError, match=r"expected joints in observation\.state, found no such column"):
         read_recordings(tmp_path / "log.pt", mapping, tmp_path / "home", JointsConfig())
+
+
+def test_joints_that_respond_late_cover_the_share_of_a_control_step() -> None:
+    """Not that of a row, nor of a second: 4 rows at 400 Hz are 10 ms, a tenth of the time constant."""
+    slow = replace(piece(400, 0), body=Joints.named(NAMES, has_targets=True, time_constant_s=0.1))
+    walks = Walks.of_pieces([slow], FPS, CONFIG)
+    away = walks.action - walks.seen[:, :-1]
+    torch.testing.assert_close(walks.simulated[:, :99], (1 - math.exp(-0.1)) * away[:, :99])
