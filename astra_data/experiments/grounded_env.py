@@ -16,7 +16,7 @@ from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.trained_policy import settings_of
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
@@ -140,7 +140,7 @@ def _world(
     episodes = PairedEpisodes.load(of_train["dataset"])
     grounding: Grounding = NO_GROUNDING
     if of_train["grounding"]:
-        grounding = load_grounding(of_train["grounding"] / "grounding.safetensors")
+        grounding = load_grounding(of_train["grounding"] / GROUNDING)
     training = Training(
         task=task_named(of_train["task"]),
         config=of_train["config"],

@@ -17,7 +17,7 @@ from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.committee import Committee
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.methods import grounded_as, method_named
 from astra_data.reports.suggestion import maps_of, suggestion_page
 from astra_data.training.proposals import SuggestConfig, Suggestion, suggested
@@ -26,7 +26,6 @@ from astra_data.worlds.task import Task
 
 FOLDER = "suggest"
 PLAN = "plan.json"
-_GROUNDING = "grounding.safetensors"
 
 
 class Asked(Config):
@@ -86,13 +85,13 @@ def suggest(
     )
     target = out or folder / FOLDER
     try:
-        committee = Committee.of(task, [load_grounding(folder / one / _GROUNDING) for one in places])
+        committee = Committee.of(task, [load_grounding(folder / one / GROUNDING) for one in places])
     except BadInputError as error:
         raise BadInputError(f"{folder}: ground/{base}: {error}") from None
     with finished_folder(target, replace=out is None, config=asked.model_dump_json(indent=1)) as made:
         found = suggested(task, committee, asked.suggest, seed=seed, progress=part(progress, 0.0, 0.95))
         _write(made, task, found, asked)
-        write_manifest(made, {one: file_digest(folder / one / _GROUNDING) for one in places})
+        write_manifest(made, {one: file_digest(folder / one / GROUNDING) for one in places})
     progress(1.0, f"{len(found.taken)} episodes")
     return target, found, asked.task
 
@@ -116,7 +115,7 @@ def _places(folder: Path, recipe: dict[str, Any], base: str) -> list[str]:
     """Return the places of the finished groundings of a method at the largest size, seed by seed."""
     percent = max(recipe.get("sweep", {}).get("percent", ()), default=None)
     places = [f"ground/{base}/{place(seed, percent)}" for seed in recipe["seeds"]]
-    if found := [one for one in places if (folder / one / _GROUNDING).is_file()]:
+    if found := [one for one in places if (folder / one / GROUNDING).is_file()]:
         return found
     raise BadInputError(
         f"{folder}: expected groundings, {folder / places[0]} and the like: run the recipe until ground first"

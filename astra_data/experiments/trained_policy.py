@@ -7,11 +7,11 @@ from typing import Any
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import place
 from astra_data.experiments.own_methods import add_all
-from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named
 from astra_data.training.deployment import DeployedPolicy
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, deploy
 from astra_data.worlds.registry import task_named
 
 
@@ -78,11 +78,11 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")
     folder, base, where = Path(run), grounded_as(row), place(seed, percent)
-    files = {"train": folder / "train" / row / where / "policy.safetensors"}
+    files = {"train": folder / "train" / row / where / POLICY}
     if method.grounds:
-        files["ground"] = folder / "ground" / base / where / "grounding.safetensors"
+        files["ground"] = folder / "ground" / base / where / GROUNDING
     if method.aligns:
-        files["align"] = folder / "align" / base / where / "target_encoder.safetensors"
+        files["align"] = folder / "align" / base / where / TARGET_ENCODER
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
     return files

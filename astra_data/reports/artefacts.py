@@ -16,6 +16,7 @@ from astra_data.reports.schema import Machine
 
 EVALUATION = "evaluation.json"
 TRAJECTORIES = "trajectories.safetensors"
+CURVE = "curve.json"
 
 
 class Artefact(BaseModel):

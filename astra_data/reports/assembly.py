@@ -9,6 +9,7 @@ from pydantic import JsonValue
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
 from astra_data.reports.artefacts import (
+    CURVE,
     EVALUATION,
     TRAJECTORIES,
     Artefact,
@@ -103,7 +104,7 @@ def _read(
     episodes = check_alike(evaluations, task)
     metrics = read.optional("ground", "metrics.json", Metrics)
     gaps = read.optional("ground", "gap.json", Gap)
-    curves = read.optional("train", "curve.json", CurveFile)
+    curves = read.optional("train", CURVE, CurveFile)
     alignments = read.optional("align", "metrics.json", Metrics)
     datasets = {stage: read.datasets(stage) for stage in ("collect", "label", "pair", "subset")}
     gap_means = {owner: mean_gap(of_seeds) for owner, of_seeds in gaps.items()}

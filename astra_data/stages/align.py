@@ -15,7 +15,7 @@ from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
-from astra_data.grounding.files import load_history_model, save_target_encoder
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_history_model, save_target_encoder
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
@@ -67,7 +67,7 @@ def align(
         >>> align(AlignConfig(updates=2), dataset="pairs", grounding=Path("astra"), out=Path("encoder"))
     """
     made = origin(device)
-    grounding_file = grounding / "grounding.safetensors"
+    grounding_file = grounding / GROUNDING
     model = load_history_model(grounding_file, device)
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
@@ -100,7 +100,7 @@ def align(
                 rate = descent.done * config.batch_windows / descent.stopwatch.seconds
                 note = f"{rate:,.0f} windows/s  paired latent RMSE {agreement['latent_rmse']:.3f}"
                 progress(descent.share, note)
-        save_target_encoder(folder / "target_encoder.safetensors", encoder)
+        save_target_encoder(folder / TARGET_ENCODER, encoder)
         metrics: dict[str, Any] = made | {
             "windows_per_second": config.updates * config.batch_windows / descent.stopwatch.seconds,
             **descent.stopwatch.spent(),

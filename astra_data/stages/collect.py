@@ -31,7 +31,7 @@ from astra_data.training.behaviors import (
     held_steps,
 )
 from astra_data.training.plan import Plan, PlannedCommands
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, deploy
 from astra_data.training.recording import record
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
@@ -256,7 +256,7 @@ def _behavior(
         policy, metadata = by(
             task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress
         )
-        writer.policy = writer.folder / "policy.safetensors"
+        writer.policy = writer.folder / POLICY
         policy.save(writer.policy)
         metadata["policy_sha256"] = file_digest(writer.policy)
         return PolicyBehavior(deploy(task, policy)), metadata

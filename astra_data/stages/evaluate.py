@@ -23,15 +23,16 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import load_grounding, load_target_encoder
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
+from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES
 from astra_data.training.deployment import EncoderKind
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import Act, Begin, in_simulator, own_world, started
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, deploy
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.target_episodes import in_target
@@ -119,17 +120,17 @@ def evaluate(
         robots: dict[EncoderKind, Begin] = {headline: partial(_careful_in_target, world)}
         shown_abstract = True
     else:
-        trained = PolicyFile.load(policy / "policy.safetensors") if isinstance(policy, Path) else policy
+        trained = PolicyFile.load(policy / POLICY) if isinstance(policy, Path) else policy
         if isinstance(trained.policy, OwnPolicy):
             results["policy"] = trained.policy.name
         model: Grounding = NO_GROUNDING
         if grounding:
-            model = load_grounding(grounding / "grounding.safetensors")
+            model = load_grounding(grounding / GROUNDING)
         source = deploy(world, trained, model)
         begin = partial(started, source, source.act_in_simulator)
         robots = {"source": partial(started, source, source.act)}
         if target_encoder is not None:
-            encoder = load_target_encoder(target_encoder / "target_encoder.safetensors")
+            encoder = load_target_encoder(target_encoder / TARGET_ENCODER)
             aligned = replace(source, target_encoder=encoder)
             robots["target"] = partial(started, aligned, aligned.act)
         headline = config.encoder if config.encoder in robots else "source"
@@ -144,10 +145,10 @@ def evaluate(
     if shown_abstract:
         simulators |= _shared_simulators(world, reference, config)
     files = {
-        "policy": policy / "policy.safetensors" if isinstance(policy, Path) else None,
-        "grounding": grounding and grounding / "grounding.safetensors",
-        "target_encoder": target_encoder and target_encoder / "target_encoder.safetensors",
-        "reference": reference and reference / "grounding.safetensors",
+        "policy": policy / POLICY if isinstance(policy, Path) else None,
+        "grounding": grounding and grounding / GROUNDING,
+        "target_encoder": target_encoder and target_encoder / TARGET_ENCODER,
+        "reference": reference and reference / GROUNDING,
     }
     read = {name: file_digest(file) for name, file in files.items() if file}
     tensors: dict[str, Tensor] = {}
@@ -191,9 +192,9 @@ def evaluate(
     if asked is not None:
         results["beyond_recorded"] = asked.share
     with finished_folder(out) as folder:
-        save_tensors(folder / "trajectories.safetensors", tensors | start_goal, {})
+        save_tensors(folder / TRAJECTORIES, tensors | start_goal, {})
         results |= stopwatch.spent()
-        (folder / "evaluation.json").write_text(json.dumps(results, indent=1))
+        (folder / EVALUATION).write_text(json.dumps(results, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
         write_manifest(folder, read)
     first = scores[0]
@@ -209,7 +210,7 @@ def _careful_in_target(task: Task, goal: Tensor) -> Act:
 def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
-        groundings["grounded"] = load_grounding(reference / "grounding.safetensors")
+        groundings["grounded"] = load_grounding(reference / GROUNDING)
     return {
         name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()

@@ -10,7 +10,7 @@ from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import save_grounding
+from astra_data.grounding.files import GROUNDING, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -69,7 +69,7 @@ def ground(
         spent = stopwatch.spent()
         progress(1.0, "gap report")
         gap = gap_report(world, grounding, held_out, seed=seed)
-        save_grounding(folder / "grounding.safetensors", grounding, episodes)
+        save_grounding(folder / GROUNDING, grounding, episodes)
         (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / "gap.json").write_text(json.dumps(gap, indent=1))
         remove_checkpoints(folder)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER
 from astra_data.grounding.fit import GroundConfig
 from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.choice import SELECTED
@@ -18,6 +19,7 @@ from astra_data.stages.report import ReportConfig, report
 from astra_data.stages.select import SelectConfig, select
 from astra_data.stages.subset import subset
 from astra_data.stages.train import train
+from astra_data.training.policy_file import POLICY
 from astra_data.training.train import AnyTrainConfig
 
 
@@ -61,9 +63,9 @@ STAGES: dict[str, Stage] = {
         Stage("augment", augment, "seed", ("collect", "label"), AugmentConfig, asked_by="augment"),
         Stage("pair", pair, "seed", ("collect", "label", "augment"), PairConfig),
         Stage("subset", subset, "size", ("pair",)),
-        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result="grounding.safetensors"),
-        Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result="policy.safetensors"),
-        Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result="target_encoder.safetensors"),
+        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result=GROUNDING),
+        Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result=POLICY),
+        Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result=TARGET_ENCODER),
         Stage(
             *("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig),
             asked_by="select",

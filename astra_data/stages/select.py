@@ -22,7 +22,7 @@ from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.meta_files import read_description
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named
@@ -31,11 +31,10 @@ from astra_data.reports.choice_page import select_page
 from astra_data.reports.runs import Reported
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, deploy
 from astra_data.worlds.registry import task_named
 
 FOLDER = "select"
-_POLICY, _GROUNDING = "policy.safetensors", "grounding.safetensors"
 _BEGUN = "begun.json"
 """Digests of a policy and of its judge → success, of a choice that was interrupted."""
 
@@ -69,8 +68,8 @@ class Entry:
 
     def load(self, root: Path, task: str) -> DeployedPolicy:
         """Return the policy, with the encoder of its own grounding."""
-        model = load_grounding(root / self.grounding / _GROUNDING) if self.grounding else NO_GROUNDING
-        return deploy(task_named(task), PolicyFile.load(root / self.policy / _POLICY), model)
+        model = load_grounding(root / self.grounding / GROUNDING) if self.grounding else NO_GROUNDING
+        return deploy(task_named(task), PolicyFile.load(root / self.policy / POLICY), model)
 
 
 @dataclass(frozen=True)
@@ -97,10 +96,10 @@ class Bench:
         entries = [
             one
             for one in self.entries
-            if (root / one.policy / _POLICY).is_file()
-            and (one.grounding is None or (root / one.grounding / _GROUNDING).is_file())
+            if (root / one.policy / POLICY).is_file()
+            and (one.grounding is None or (root / one.grounding / GROUNDING).is_file())
         ]
-        judges = {seed: of for seed, of in self.judges.items() if (root / of[0] / _GROUNDING).is_file()}
+        judges = {seed: of for seed, of in self.judges.items() if (root / of[0] / GROUNDING).is_file()}
         return Bench(self.percent, tuple(entries), judges)
 
 
@@ -224,11 +223,11 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
 
 def _judge(bench: Bench, task: str, root: Path, config: SelectConfig, seed: int) -> Judge:
     grounding, dataset = bench.judges[seed]
-    made, episodes = load_grounding(root / grounding / _GROUNDING), PairedEpisodes.load(root / dataset)
+    made, episodes = load_grounding(root / grounding / GROUNDING), PairedEpisodes.load(root / dataset)
     return Judge.of(task_named(task), made, episodes, config.failure_members, config.failure_steps)
 
 
 def _digest(folder: Path) -> str:
-    files = [folder / name for name in (_POLICY, _GROUNDING)]
+    files = [folder / name for name in (POLICY, GROUNDING)]
     file = next((file for file in files if file.is_file()), None)
     return file_digest(file) if file else str(read_description(folder)["content_hash"])

@@ -11,12 +11,13 @@ from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
-from astra_data.training.policy_file import PolicyFile
-from astra_data.training.restarts import POLICY, with_restarts
+from astra_data.reports.artefacts import CURVE
+from astra_data.training.policy_file import POLICY, PolicyFile
+from astra_data.training.restarts import with_restarts
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
 from astra_data.worlds.registry import task_named
 
@@ -75,8 +76,8 @@ def train(
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
     episodes.check(world.limits)
-    grounding_file = grounding and grounding / "grounding.safetensors"
-    initial_file = initial and initial / "policy.safetensors"
+    grounding_file = grounding and grounding / GROUNDING
+    initial_file = initial and initial / POLICY
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
     grounding_digest = file_digest(grounding_file) if grounding_file else None
@@ -111,7 +112,7 @@ def train(
         else:
             policy, curve = base.learn(training)
         policy.save(folder / POLICY)
-        (folder / "curve.json").write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
+        (folder / CURVE).write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
         remove_checkpoints(folder)
         read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
         write_manifest(folder, read)

@@ -22,6 +22,8 @@ from astra_data.training.own_policy import KINDS, OwnPolicy, SavedPolicy
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
+POLICY = "policy.safetensors"
+"""Name of the file of its artefact."""
 _KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
     "actor_critic": (ActorCritic, ActorCriticShape),
     "adaptive": (Student, AdaptiveShape),

@@ -8,10 +8,8 @@ from astra_data.core.progress import part
 from astra_data.core.seeding import derive
 from astra_data.grounding.protocols import Grounding
 from astra_data.training.own_world import Reached, trial
-from astra_data.training.policy_file import PolicyFile
+from astra_data.training.policy_file import POLICY, PolicyFile
 from astra_data.training.train import Learn, Training
-
-POLICY = "policy.safetensors"
 
 
 def with_restarts(
