@@ -9,12 +9,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from astra_data.core.config import Config, Count, validated
 from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError
 from astra_data.dataset.columns import Column
-from astra_data.dataset.description import NAME
+from astra_data.dataset.description import NAME, VERSION
 from astra_data.dataset.format import DATASET_PATH, INFO_PATH, SUBSETS_PATH
 from astra_data.dataset.plain import MOST_FPS, read_object
 from astra_data.dataset.seal import is_description_sealed
 
 _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
+
+NameText = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+VersionText = Annotated[str, Field(pattern=f"^{VERSION.pattern}$")]
+"""Names and versions of datasets in files."""
 
 
 def is_data_path(pattern: object) -> bool:
@@ -61,14 +65,14 @@ class _Info(_Open):
 
 
 class _Identity(Config):
-    name: str = Field(pattern=f"^{NAME.pattern}$")
-    version: str = Field(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+$")
+    name: NameText
+    version: VersionText
     hash: str
 
 
 class _Description(_Open):
-    name: str = Field(pattern=f"^{NAME.pattern}$")
-    version: str = Field(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+$")
+    name: NameText
+    version: VersionText
     parents: tuple[_Identity, ...]
     stage: str = Field(min_length=1)
     config: dict[str, Any]

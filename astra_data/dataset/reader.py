@@ -118,7 +118,7 @@ class Dataset(Contents):
     def blocks(
         self, names: Sequence[str], episodes: Collection[int] | None = None
     ) -> Iterator[dict[str, Array]]:
-        """Yield the values of `columns` in blocks of whole episodes; memory stays bounded.
+        """Yield the values of the columns `names` in blocks of whole episodes; memory stays bounded.
 
         Raises:
             CorruptDatasetError: a file cannot be read, or values of the block differ from their digests.

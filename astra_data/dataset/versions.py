@@ -17,13 +17,12 @@ from typing import Any, Literal
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.description import NAME
+from astra_data.dataset.description import NAME, VERSION
 from astra_data.dataset.reader import Dataset
 
 Change = Literal["columns", "episodes", "description"]
 
-_NUMBERS = r"\d+\.\d+\.\d+"
-_REFERENCE = re.compile(rf"(?P<name>{NAME.pattern})(@(data-)?(?P<version>{_NUMBERS}))?")
+_REFERENCE = re.compile(rf"(?P<name>{NAME.pattern})(@(data-)?(?P<version>{VERSION.pattern}))?")
 
 
 @dataclass(frozen=True, order=True)
@@ -41,7 +40,7 @@ class Version:
         Raises:
             BadInputError: it is not three numbers.
         """
-        if not re.fullmatch(_NUMBERS, text):
+        if not VERSION.fullmatch(text):
             raise BadInputError(f"version '{text}': expected three numbers such as 1.2.0")
         return cls(*map(int, text.split(".")))
 
@@ -53,7 +52,7 @@ class Version:
     @classmethod
     def from_tag(cls, tag: str) -> "Version | None":
         """Read "data-1.2.0"; None if it is no such tag."""
-        return cls.parse(tag[5:]) if re.fullmatch(f"data-{_NUMBERS}", tag) else None
+        return cls.parse(tag[5:]) if re.fullmatch(f"data-{VERSION.pattern}", tag) else None
 
     def __str__(self) -> str:
         """Write "1.2.0"."""

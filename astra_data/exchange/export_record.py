@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from astra_data.core.config import Config, Count, Number, faults_of
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
-from astra_data.dataset.description import NAME
+from astra_data.dataset.meta_files import NameText, VersionText
 from astra_data.dataset.reader import Dataset
 
 Uid = Annotated[int, Field(ge=0, lt=2**63)]
@@ -34,9 +34,9 @@ class Place(Config):
 class ExportRecord(Config):
     """What an export says of its dataset."""
 
-    name: Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+    name: NameText
     """The dataset's name."""
-    version: Annotated[str, Field(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+$")]
+    version: VersionText
     """Its version."""
     content_hash: str
     """Its hash."""

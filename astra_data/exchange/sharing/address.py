@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.description import VERSION
 from astra_data.dataset.versions import Version
 
 _WORD = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 _HUB = re.compile(rf"(hf://datasets/)?(?P<repo>{_WORD}/{_WORD})/?")
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://.+")
-_VERSION = re.compile(r"[@/](data-)?(?P<version>\d+\.\d+\.\d+)/?$")
+_VERSION = re.compile(rf"[@/](data-)?(?P<version>{VERSION.pattern})/?$")
 
 
 @dataclass(frozen=True)
