@@ -17,10 +17,11 @@ policy = RobotPolicy(
     state={state_names},
     goal={goal_names},
 )
-run(policy, measure, send, goal, steps={minute})
+run(policy, measure, send, goal, steps={minute}, stop={still})
 ```
 
-`measure()` returns the robot's state, `send(command)` gives it a command; both are yours.
+`measure()` returns the robot's state, `send(command)` gives it a command, and `stop` is the command that
+stops it, which is sent in the end, after an error and after Ctrl-C: all of these are yours.
 `policy.start()` begins an episode and `policy.act(state, goal)` takes one step. Another rate, other
 values, and values that are not finite are refused with a `ValueError`. `pip install numpy onnxruntime`
 brings all that it takes; `python run_policy.py` tries it with zeros.
@@ -58,6 +59,7 @@ def page(about: Mapping[str, Any]) -> str:
     return _PAGE.format(
         **{key: about[key] for key in ("task", "row", "seed", "rate_hz")},
         minute=round(60 * about["rate_hz"]),
+        still=[0.0] * len(about["command"]["names"]),
         state_names=about["state"]["names"],
         goal_names=about["goal"]["names"],
         state=_table(about["state"]),

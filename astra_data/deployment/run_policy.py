@@ -57,18 +57,28 @@ def run(
     send: Callable[[Any], None],
     goal: Sequence[float],
     steps: int,
+    stop: Sequence[float],
 ) -> None:
-    """Measure the state, send the command, and wait for the next control period, `steps` times."""
+    """Measure the state, send the command, and wait for the next control period, `steps` times.
+
+    The last command is `stop`, what stops the robot: also after an error, and after Ctrl-C. A period that
+    took too long is not made up for: the next command is due a period after the late one.
+    """
     policy.start()
     due = time.perf_counter()
-    for _ in range(steps):
-        send(policy.act(measure(), goal))
-        due += 1.0 / policy.about["rate_hz"]
-        time.sleep(max(0.0, due - time.perf_counter()))
+    try:
+        for _ in range(steps):
+            send(policy.act(measure(), goal))
+            now = time.perf_counter()
+            due = max(due + 1.0 / policy.about["rate_hz"], now)
+            time.sleep(due - now)
+    finally:
+        send(np.asarray(stop, np.float32))
 
 
 if __name__ == "__main__":
     described = json.loads((HERE / "policy.json").read_text())
     state, goal = described["state"]["names"], described["goal"]["names"]
     policy = RobotPolicy(rate_hz=described["rate_hz"], state=state, goal=goal)
-    run(policy, lambda: np.zeros(len(state)), print, [0.0] * len(goal), steps=10)
+    still = [0.0] * len(described["command"]["names"])
+    run(policy, lambda: np.zeros(len(state)), print, [0.0] * len(goal), steps=10, stop=still)

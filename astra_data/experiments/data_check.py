@@ -3,7 +3,7 @@
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import ACTION
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.experiments.condition import Condition
@@ -20,7 +20,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
     """Return the condition of a recipe's `data`; None if it has none, or has yet to pull it.
 
     Raises:
-        BadInputError: there are no such data, or their columns are not those of the task.
+        BadInputError: there are no such data, their columns are not those of the task, or they were paired.
     """
     if recipe.data is None or is_address(recipe.data):
         return None
@@ -28,6 +28,11 @@ def data_condition(recipe: Recipe) -> Condition | None:
         source = open_dataset(recipe.data)
     except BadInputError as error:
         raise BadInputError(f"data: {error}: import or pull it first") from None
+    if ABSTRACT_STATE in source.features:
+        raise BadInputError(
+            f"data: {source.reference} has been paired, and a recipe pairs by itself: give it the dataset "
+            "that this one was made from, as `astra-data log` tells"
+        )
     task = task_named(recipe.task)
     check_fits(source, task)
     return Condition("finished", "; ".join(unrecorded(task.limits, source)))

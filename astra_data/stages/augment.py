@@ -40,6 +40,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
+from astra_data.worlds.own_code import is_own_code
 from astra_data.worlds.plane.geometry import PlanarMap
 from astra_data.worlds.plane.relocation import Relocation, Rotations, outcomes, positions
 from astra_data.worlds.registry import TASKS, task_named
@@ -191,6 +192,11 @@ def _task_of(source: Dataset, task: str | None) -> Task:
     if task is None and collected_for is None:
         raise BadInputError(
             f"{source.reference} does not name the task that it was collected for: give --task"
+        )
+    if task is None and is_own_code(str(collected_for)):
+        raise BadInputError(
+            f"{source.reference} was collected for {collected_for}, which is code that would be run: "
+            f"read it, and give --task {collected_for}"
         )
     if task is not None and collected_for in TASKS and task != collected_for:
         raise BadInputError(f"{source.reference} was collected for {collected_for}, not for {task}")

@@ -20,7 +20,9 @@ State = NDArray[np.floating[Any]] | Sequence[float]
 
 
 class Robot(Protocol):
-    """One robot, real or simulated.
+    """A simulated robot: as many are made as episodes run side by side, and nobody waits for the time.
+
+    `astra-data deploy` is for a physical one.
 
     `reset` may take a keyword `seed`, for what is random about it, and a keyword `start`: the abstract state
     (X,) that a planned episode starts at.

@@ -70,7 +70,7 @@ def test_its_page_runs(folder: Path) -> None:
     given = "measure, send, goal = lambda: [0.0] * 29, print, [1.0, 2.0]\n"
     code = code.replace("steps=1200", "steps=2")
     shown = alone(folder, given + code)
-    assert len(shown.splitlines()) == 2
+    assert len(shown.splitlines()) == 3 and shown.endswith("[0. 0.]\n")
 
 
 def test_it_runs_without_this_package_and_without_torch(folder: Path, run: Path, tmp_path: Path) -> None:

@@ -73,8 +73,8 @@ def test_the_loop_keeps_the_rate_and_begins_without_memory(folder: Path) -> None
     policy.about["rate_hz"] = 1000.0
     first = policy.act([0.5, 1.0], [1.0])
     assert first.shape == (1,) and policy.hidden.any()
-    run(policy, lambda: [0.5, 1.0], sent.append, [1.0], steps=3)
-    assert len(sent) == 3
+    run(policy, lambda: [0.5, 1.0], sent.append, [1.0], steps=3, stop=[-1.0])
+    assert len(sent) == 4 and sent[-1].tolist() == [-1.0]
     np.testing.assert_array_equal(sent[0], first)
     assert not np.array_equal(sent[1], first)
 
@@ -97,6 +97,23 @@ def test_the_loop_sleeps_what_the_policy_leaves_of_a_period(
     monkeypatch.setattr("astra_data.deployment.run_policy.time.sleep", sleep)
     policy = RobotPolicy(**GIVEN, folder=folder)
     policy.about["rate_hz"] = 10.0
-    run(policy, measure, lambda command: None, [1.0], steps=3)
-    # What one period is late, the next makes up for.
-    assert slept == pytest.approx([0.08, 0.0, 0.03])
+    run(policy, measure, lambda command: None, [1.0], steps=3, stop=[0.0])
+    # The period that took too long is not made up for: commands never come closer than a period.
+    assert slept == pytest.approx([0.08, 0.0, 0.08])
+
+
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_the_robot_is_stopped_whatever_happens(folder: Path, error: type[BaseException]) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    policy.about["rate_hz"] = 1000.0
+    sent: list[Any] = []
+    states = iter([[0.5, 1.0]])
+
+    def measure() -> list[float]:
+        for state in states:
+            return state
+        raise error("no state any more")
+
+    with pytest.raises(error):
+        run(policy, measure, sent.append, [1.0], steps=9, stop=[0.25])
+    assert len(sent) == 2 and sent[-1].tolist() == [0.25]

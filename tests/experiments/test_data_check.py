@@ -6,9 +6,11 @@ import pytest
 from fake_dataset import writer
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.run import check, run
+from astra_data.stages.pair import pair
 
 ROOT = Path(__file__).parents[2]
 
@@ -52,6 +54,18 @@ def test_bounds_beyond_what_was_recorded_are_told(
 def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(recipe.parent / "home"))
     with pytest.raises(BadInputError, match=r"data: no dataset 'logs' in .*: import or pull it first"):
+        check(recipe, root=recipe.parent / "runs")
+
+
+def test_data_that_were_paired_are_refused(recipe: Path) -> None:
+    write_logs(recipe.parent / "first", -1.0, 4.0)
+    pair(
+        f"{recipe.parent}/rail.py:TASK",
+        dataset=recipe.parent / "first",
+        out=recipe.parent / "logs",
+        progress=silent,
+    )
+    with pytest.raises(BadInputError, match=r"data: fake@.* has been paired, and a recipe pairs by itself"):
         check(recipe, root=recipe.parent / "runs")
 
 

@@ -253,6 +253,20 @@ def test_datasets_that_do_not_fit_are_refused(
     assert not (tmp_path / "out").exists()
 
 
+def test_code_that_a_dataset_names_is_not_run(collected: Path, tmp_path: Path) -> None:
+    """Nobody asked for it: datasets come from strangers."""
+    code = tmp_path / "task.py"
+    code.write_text(f"from pathlib import Path\nPath({str(tmp_path / 'ran')!r}).touch()\n")
+    source = Dataset.open(collected)
+    foreign = tmp_path / "foreign"
+    description = {"name": "foreign", "stage": "import", "environment": {"id": f"{code}:TASK"}}
+    with DatasetWriter(foreign, source.schema, fps=20, task="run", description=description) as writer:
+        writer.add(next(source.episodes()))
+    with pytest.raises(BadInputError, match=r"task\.py:TASK, which is code that would be run: read it"):
+        augment(None, CONFIG, dataset=foreign, seed=0, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "ran").exists()
+
+
 def test_episodes_with_a_ball_are_refused(tmp_path: Path) -> None:
     kicking = tmp_path / "kicking"
     collect("nao-kick", CollectConfig(episodes=2, max_steps=4), seed=0, out=kicking, progress=silent)
