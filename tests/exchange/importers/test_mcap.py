@@ -5,10 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap_recordings import MAPPING, command, log, ns, pose, write_json, write_protobuf, write_ros2
+from mcap_ros2.writer import Writer
 from recordings import imported
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.exchange.importing import import_dataset
 
 
 @pytest.mark.parametrize("write", [write_json, write_protobuf, write_ros2])
@@ -86,3 +89,60 @@ def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
     with pytest.raises(BadInputError, match=r'pip install "astra-data\[mcap\]"'):
         imported(tmp_path, path, MAPPING)
+
+
+ODOMETRY = """std_msgs/Header header
+string child_frame_id
+geometry_msgs/PoseWithCovariance pose
+geometry_msgs/TwistWithCovariance twist
+"""
+PARTS = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+}
+"""The messages of ROS 2 that odometry is made of."""
+
+
+def definition(text: str, *parts: str) -> str:
+    return text + "".join(f"\n{'=' * 80}\nMSG: {name}\n{PARTS[name]}\n" for name in parts)
+
+
+def test_the_bag_of_a_wheeled_base_is_read_by_the_mapping_that_comes_with_the_package(tmp_path: Path) -> None:
+    """A circle of 1 m at 0.5 m/s, odometry at 50 Hz and commands at 10 Hz."""
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = Writer(file)
+        odometry = writer.register_msgdef("nav_msgs/Odometry", definition(ODOMETRY, *PARTS))
+        twist = definition(PARTS["geometry_msgs/Twist"], "geometry_msgs/Vector3")
+        command = writer.register_msgdef("geometry_msgs/Twist", twist)
+        nothing = {"x": 0.0, "y": 0.0, "z": 0.0}
+        for tick in range(250):
+            time, heading = tick / 50, 0.5 * tick / 50
+            place = {"x": np.sin(heading), "y": 1 - np.cos(heading), "z": 0.0}
+            turned = {"x": 0.0, "y": 0.0, "z": np.sin(heading / 2), "w": np.cos(heading / 2)}
+            speed = {"linear": nothing | {"x": 0.5}, "angular": nothing | {"z": 0.5}}
+            content = {
+                "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "odom"},
+                "child_frame_id": "base_link",
+                "pose": {"pose": {"position": place, "orientation": turned}, "covariance": [0.0] * 36},
+                "twist": {"twist": speed, "covariance": [0.0] * 36},
+            }
+            writer.write_message("/odom", odometry, content, ns(time))
+            if tick % 5 == 0:
+                writer.write_message("/cmd_vel", command, speed, ns(time))
+        writer.finish()  # type: ignore[no-untyped-call]
+    mapping = Path(__file__).parents[3] / "recipes/imports/ros2_base.toml"
+    report = import_dataset([tmp_path / "drive.mcap"], mapping, out=tmp_path / "set")
+    [episode] = Dataset.open(report.root).episodes()
+    state = episode.columns[STATE]
+    heading = 2 * np.arctan2(state[:, 2], state[:, 3])
+    assert len(episode) == 49
+    np.testing.assert_allclose(heading, 0.05 * np.arange(49), atol=0.011)
+    np.testing.assert_allclose(state[:, 0], np.sin(heading), atol=1e-6)
+    assert episode.columns[ACTION].tolist() == [[0.5, 0.5]] * 49
