@@ -142,12 +142,12 @@ def test_notebooks_are_pages_with_what_they_printed_and_drew(site: Path, path: P
 
 
 def test_pictures_of_a_page_are_in_the_site(site: Path) -> None:
-    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "docs/antmaze.md").read_text())
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "docs/antmaze_older.md").read_text())
     assert len(pictures) > 5
-    shown = page(site / "antmaze/index.html").pictures
+    shown = page(site / "antmaze_older/index.html").pictures
     for picture in pictures:
         (loaded,) = (link for link in shown if Path(link).name == Path(picture).name)
-        assert (site / "antmaze" / loaded).read_bytes() == (ROOT / "docs" / picture).read_bytes()
+        assert (site / "antmaze_older" / loaded).read_bytes() == (ROOT / "docs" / picture).read_bytes()
 
 
 def models_of(schema: dict[str, Any]) -> list[dict[str, Any]]:

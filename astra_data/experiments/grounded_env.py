@@ -107,7 +107,8 @@ def evaluate_policy(
     own = OwnPolicy(policy, env.observation_size, env.action_size)
     episodes = training.episodes
     settings = settings_of(run)
-    tested = settings | {"methods": list(dict.fromkeys([*settings["methods"], row]))}
+    rows = list(dict.fromkeys([*settings.get("methods", []), row]))
+    tested = {"seeds": [seed]} | settings | {"methods": rows}
     evaluate = _planned(run, tested, "evaluate", row, seed, percent)
     _check_made(evaluate.keywords, ("target_encoder", "reference"))
     evaluate(
