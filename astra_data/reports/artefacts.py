@@ -78,6 +78,8 @@ class Evaluation(Artefact):
     """In the reference grounded simulator; None if there is none, or likewise."""
     beyond_recorded: float | None = None
     """Share of the steps, where the row was tested, whose command is beyond the range of its dataset."""
+    encoder: str | None = None
+    """Which one its figures in the target are of; None for a hand-written row."""
     encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
     """Mean of each measure by encoder, if there is more than one."""
 

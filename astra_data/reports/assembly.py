@@ -180,7 +180,10 @@ def _values(
 ) -> dict[str, object]:
     """Return the value of each field in `PER_SEED`."""
     means = evaluation.outcomes.means()
-    simulated = {} if evaluation.simulated is None else evaluation.simulated.means()
+    own = evaluation.simulated
+    if own is None and evaluation.encoder is None:
+        own = evaluation.grounded  # a hand-written row has no simulator of its own
+    simulated = {} if own is None else own.means()
     shared = {world: getattr(evaluation, world) for world in SHARED_WORLDS}
     return {
         **{measure: means[measure] for measure in ("success", "failed", "wall_contact", "steps")},

@@ -172,7 +172,8 @@ class MethodResults(Section):
     distance: list[Number]
     """Path length of the robot in successful episodes, in m; NaN for a seed without any."""
     simulated_success: list[float] | None
-    """Success in the simulator that the policy was trained in; None if it was trained in none."""
+    """Success in the simulator that the policy was trained in; of a hand-written row, in the shared grounded
+    one. None if there is none."""
     simulated_steps: list[float] | None = None
     """Length of an episode in that simulator, in control steps."""
     tries: list[float] | None = Field(default=None, exclude_if=lambda counts: counts is None)

@@ -3,10 +3,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, edit_json, write_elsewhere, write_runs
+from fake_runs import ROWS, SEEDS, edit_json, outcomes, write_elsewhere, write_runs
 
 from astra_data.core.errors import MissingStageError
 from astra_data.reports.assembly import assemble
+from astra_data.reports.page import hand_written, render
 from astra_data.reports.schema import Results
 
 
@@ -135,6 +136,22 @@ def test_a_grounding_of_some_finished_seeds_only_is_missing(root: Path) -> None:
     for row in ("astra", "astra_plus"):
         shutil.rmtree(root / f"evaluate/{row}/seed_2")
     assert assembled(root).methods["astra"].seeds == [0, 1]
+
+
+def test_a_hand_written_row_has_the_success_of_the_grounded_simulator(root: Path) -> None:
+    """It was trained in none, and tells what that one allows."""
+    for seed in (0, 1, 2):
+        path = root / f"evaluate/follower/seed_{seed}/evaluation.json"
+        edit_json(path, grounded=outcomes([1, 0, 0, 0], seed))
+    found = assembled(root)
+    assert found.methods["follower"].simulated_success == [0.25] * 3
+    assert hand_written(found) == "the careful follower"
+    told = "What the careful follower reaches in the grounded simulator tells whether that allows what the"
+    assert told in render(found, {}) and "0.25 ± 0.00 |" in render(found, {})
+    assert "follower" not in found.probability_of_improvement["astra"]
+    write_elsewhere(root, "iql")
+    edit_json(root / "evaluate/iql/seed_0/evaluation.json", grounded=outcomes([1, 0, 0, 0], 0))
+    assert assembled(root, ("iql",), (0,)).methods["iql"].simulated_success is None
 
 
 def test_a_row_that_was_in_no_simulator_has_no_success_there(root: Path) -> None:

@@ -141,8 +141,8 @@ def test_the_bag_of_a_wheeled_base_is_read_by_the_mapping_that_comes_with_the_pa
     report = import_dataset([tmp_path / "drive.mcap"], mapping, out=tmp_path / "set")
     [episode] = Dataset.open(report.root).episodes()
     state = episode.columns[STATE]
-    heading = 2 * np.arctan2(state[:, 2], state[:, 3])
+    yaw = 2 * np.arctan2(state[:, 2], state[:, 3])
     assert len(episode) == 49
-    np.testing.assert_allclose(heading, 0.05 * np.arange(49), atol=0.011)
-    np.testing.assert_allclose(state[:, 0], np.sin(heading), atol=1e-6)
+    np.testing.assert_allclose(yaw, 0.05 * np.arange(49), atol=0.011)
+    np.testing.assert_allclose(state[:, 0], np.sin(yaw), atol=1e-6)
     assert episode.columns[ACTION].tolist() == [[0.5, 0.5]] * 49
