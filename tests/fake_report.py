@@ -31,7 +31,8 @@ def task(**changes: object) -> SimpleNamespace:
         "ball_index": None,
         "facts": {},
     }
-    return SimpleNamespace(**usual | {"objective": SimpleNamespace(scores=(SUCCESS,))} | changes)
+    objective = SimpleNamespace(scores=(SUCCESS,), action_size=2)
+    return SimpleNamespace(**usual | {"objective": objective, "make_target": object()} | changes)
 
 
 def images(folder: Path) -> set[str]:

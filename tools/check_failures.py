@@ -71,13 +71,14 @@ def main(
         failures = int(part.windows.topples_soon.any(1).sum())
         for name, others in measured.items():
             said = fitted.probability(replayed_inputs(world, grounding, fitted, others))
-            print(f"| {count} episodes | {failures} | {name} {_figures(foresight(said, others, windows))}")
+            found = foresight(said, failing(world, others, fitted.shape.risk_steps), windows)
+            print(f"| {count} episodes | {failures} | {name} {_figures(found, len(windows))}")
     fit = method_named(row).fit
     predicts_reward = isinstance(fit, HistoryFit) and fit.reward
     for name, others in measured.items():
-        compared = compared_foresight(world, grounding, others, predicts_reward)
+        compared = compared_foresight(world, grounding, others, predicts_reward, windows)
         for head, found in compared.items():
-            print(f"| {row}: {head} | | {name} {_figures(found)}")
+            print(f"| {row}: {head} | | {name} {_figures(found, len(windows))}")
     if grounding.failures is not None:
         _print_rates(world, grounding, measured)
 
@@ -90,6 +91,8 @@ def _print_likelihoods(
     for steps in within:
         episodes = failing(task, whole, steps)
         mask, fails = episodes.windows.mask, episodes.windows.topples_soon.any(1)
+        if fails.sum() < 2:
+            raise typer.BadParameter(f"expected two episodes that fail to cross-fit, got {int(fails.sum())}")
         hazard = torch.zeros_like(mask)
         torch.manual_seed(0)
         for fold in folds(fails):
@@ -108,11 +111,13 @@ def _print_likelihoods(
         )
 
 
-def _figures(found: Mapping[str, Any]) -> str:
+def _figures(found: Mapping[str, Any], windows: int) -> str:
     if not found["failures"]:
-        return "| | | | |"
-    auc = " | ".join(f"{value:.2f}" for value in found["auc"].values())
-    return f"({found['failures']} failures) | {auc} | {found['brier_skill']:.2f} |"
+        return "| " * (windows + 2) + "|"
+    told = [
+        "-" if value is None else f"{value:.2f}" for value in (*found["auc"].values(), found["brier_skill"])
+    ]
+    return f"({found['failures']} failures) | {' | '.join(told)} |"
 
 
 @torch.no_grad()

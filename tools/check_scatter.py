@@ -98,19 +98,23 @@ def _unsteadiness(paths: list[Tensor], timestep_s: float, lag_s: float) -> float
 
 def _print_speeds(task: Task, known: dict[str, HistoryGrounding], episodes: PairedEpisodes) -> None:
     steps = round(HELD_S / task.timestep_s)
-    episode, first = torch.tensor(list(_held(task, episodes, steps))).unbind(1)
+    held = list(_held(task, episodes, steps))
+    if not held:
+        print(f"\nNo command is held for {HELD_S:g} s away from walls.")
+        return
+    episode, first = torch.tensor(held).unbind(1)
     moments, windows = Moments(episodes.windows, episode, first), episodes.windows
     after = torch.stack([windows.next_state[episode, first + step, :2] for step in range(steps)], dim=1)
     paths = {"recorded": torch.cat([moments.state[:, None, :2], after], dim=1)}
     paths |= {name: replayed(task, one, moments, steps) for name, one in known.items()}
     command = windows.action[episode, first]
-    length = command.norm(dim=-1)
+    length, half_s = command.norm(dim=-1), (steps - steps // 2) * task.timestep_s
     print(f"\n| command, in the second second | held | {' | '.join(paths)} |\n|---|---|{'---|' * len(paths)}")
     for low, high in SPEEDS:
         of = (length >= low) & (length < high)
         along = (command / length[:, None])[of]
         speeds = [
-            float(((path[of, -1] - path[of, steps // 2]) * along).sum(-1).mean()) / (HELD_S / 2)
+            float(((path[of, -1] - path[of, steps // 2]) * along).sum(-1).mean()) / half_s
             for path in paths.values()
         ]
         told = " | ".join(f"{speed:.2f} m/s" for speed in speeds)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from astra_data.reports.drawing import training_curves
 from astra_data.reports.figures.scores import on_one_grid
-from astra_data.reports.figures.style import FAINT, INK, method_title, style
+from astra_data.reports.figures.style import FAINT, INK, method_title, score_axis, style
 from astra_data.reports.files import read_published
 from astra_data.reports.schema import Results
 
@@ -43,9 +43,9 @@ def main(
                 axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.2, lw=0)
                 axes.plot(steps / 1e6, scores.mean(axis=0), color=colour, label=one.recipe)
                 print(f"{row}: {one.recipe} {scores[:, -1].mean():.2f} of {len(scores)} trainings")
-            axes.set_ylim(0, 1)
+        score_axis(figure.axes[0], results[1].headline)
         figure.supxlabel("million steps of training")
-        figure.supylabel("success of training episodes")
+        figure.supylabel(f"{results[1].headline.title} of training episodes")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
         figure.savefig(out)
 

@@ -10,6 +10,8 @@ import os
 from pathlib import Path
 from typing import Annotated
 
+os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco chooses when it is imported
+
 import mujoco
 import numpy as np
 import typer
@@ -42,7 +44,6 @@ def main(
     width: Annotated[int, typer.Option(help="Of a frame, in pixels.")] = 320,
 ) -> None:
     """Render and write `out`."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     frames = render(robot_seed, width)
     if out.suffix == ".gif":
         milliseconds = round(1000 * CONTROL_STEP_S)

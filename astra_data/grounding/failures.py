@@ -171,6 +171,7 @@ def compared_foresight(
     grounding: HistoryGrounding,
     held_out: PairedEpisodes,
     predicts_reward: bool,
+    ahead: Sequence[tuple[int, int]] = AHEAD_STEPS,
 ) -> dict[str, Any]:
     """Return the `foresight` on held-out episodes: of R_pred, and of failure model or topple head, as fitted.
 
@@ -182,13 +183,15 @@ def compared_foresight(
     if predicts_reward and model.failure_weight > 0:
         parts = model.predict_reward_parts(latent, windows.action)
         probability = (parts[..., 1] / model.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
-        found["predicted_reward"] = foresight(probability, held_out)
+        found["predicted_reward"] = foresight(probability, held_out, ahead)
     if failures is not None:
         probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
-        found["failure_model"] = foresight(probability, failing(task, held_out, failures.shape.risk_steps))
+        found["failure_model"] = foresight(
+            probability, failing(task, held_out, failures.shape.risk_steps), ahead
+        )
     else:
         probability = model.topple_logit(latent, windows.action, windows.next_state).sigmoid()
-        found["topple_head"] = foresight(probability, held_out)
+        found["topple_head"] = foresight(probability, held_out, ahead)
     return found
 
 
@@ -212,7 +215,8 @@ def foresight(
     count = int(fails.any(1).sum())
     if not count:
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
-    left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), mask.shape[1] + 1)
+    calm = ahead[-1][1] + mask.shape[1]  # no failure comes, however short the episode is
+    left = torch.where(fails.any(1, keepdim=True), mask.flip(1).cumsum(1).flip(1), calm)
     safe = probability[mask & (left > ahead[-1][1])].numpy(force=True)
     auc: dict[str, float | None] = {}
     for first, last in ahead:

@@ -7,6 +7,7 @@ from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.failures import (
+    compared_foresight,
     failing,
     fit_failures,
     foresight,
@@ -268,3 +269,72 @@ def test_every_step_is_cross_fitted_once_and_what_was_found_is_used(monkeypatch:
     assert float(fails.sum()) == 7 * 5
     said = said_of(model, episodes)
     torch.testing.assert_close(said, torch.full_like(said, 1 / (1 + 2.718281828)))
+
+
+@pytest.mark.parametrize("steps", [30, 60])
+def test_calm_episodes_are_calm_however_short_they_are(steps: int) -> None:
+    episodes = hurried(6, 0)
+    mask, soon = torch.ones(6, steps), torch.zeros(6, steps)
+    mask[0, 25:], soon[0, 5:25] = 0, 1
+    windows = replace(episodes.windows, mask=mask, topples_soon=soon)
+    found = foresight(soon.clone(), replace(episodes, windows=windows))["auc"]
+    assert found == {"1-20": 1.0, "11-30": pytest.approx(5 / 6, abs=0.02), "21-40": 0.5}
+
+
+def test_a_single_failure_leaves_nothing_to_cross_fit_and_is_foreseen_at_its_rate() -> None:
+    training = by_chance(0)
+    soon = training.windows.topples_soon.clone()
+    soon[1:] = 0
+    training = replace(training, windows=replace(training.windows, topples_soon=soon))
+    model = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, seed=0)
+    rate = training.steps(soon).mean()
+    torch.testing.assert_close(model.log_odds_shift, rate.logit() - torch.tensor(0.25).logit())
+    assert float(training.steps(said_of(model, training)).mean()) == pytest.approx(float(rate), rel=0.5)
+
+
+def test_heads_that_know_are_found_to_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes, model = hurried(4, 0), grounding_model()
+    soon = episodes.windows.topples_soon
+    model.failure_weight.fill_(1.0)
+    model.failure_cost.fill_(-10.0)
+    parts = torch.stack([torch.ones_like(soon), -10.0 * soon / RISK_STEPS], dim=-1)
+    monkeypatch.setattr(model, "predict_reward_parts", lambda latent, action: parts)
+    monkeypatch.setattr(model, "topple_logit", lambda latent, action, after: 40.0 * (soon - 0.5))
+    found = compared_foresight(TASK, HistoryGrounding(model), episodes, predicts_reward=True)
+    skills = {head: round(told["brier_skill"], 4) for head, told in found.items()}
+    assert skills == {"predicted_reward": 1.0, "topple_head": 1.0}
+    other = compared_foresight(TASK, HistoryGrounding(model), episodes, predicts_reward=True, ahead=[(1, 5)])
+    assert [list(told["auc"]) for told in other.values()] == [["1-5"], ["1-5"]]
+
+
+def test_a_failure_model_is_measured_on_what_it_foresees(monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes = hurried(4, 0)
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1, risk_steps=3)).eval()
+    soon = failing(TASK, episodes, 3).windows.topples_soon
+    monkeypatch.setattr(failures, "probability", lambda inputs: soon)
+    made = HistoryGrounding(grounding_model(), failures)
+    found = compared_foresight(TASK, made, episodes, predicts_reward=False, ahead=[(1, 3)])
+    assert found["failure_model"]["brier_skill"] == 1.0 and list(found["failure_model"]["auc"]) == ["1-3"]
+
+
+def test_members_have_no_say_in_what_is_seen_of_a_step() -> None:
+    episodes, used = hurried(2, 0), grounding_model()
+    other = GroundingModel(used.shape).requires_grad_(False).eval()
+    list(other.corrections.parameters())[-2].normal_(std=0.05)
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    failures.set_move_scales(episodes.windows)
+    alone, beside = (
+        replayed_inputs(TASK, HistoryGrounding(used, members=members), failures, episodes)
+        for members in ((), (other,))
+    )
+    assert torch.equal(alone, beside)
+
+
+def test_inputs_are_seen_in_their_own_scale_and_weights_decay(monkeypatch: pytest.MonkeyPatch) -> None:
+    training, grounding = hurried(6, 0), HistoryGrounding(grounding_model())
+    model = fit_failures(TASK, grounding, training, 1, seed=0)
+    seen = training.steps(replayed_inputs(TASK, grounding, model, training))
+    torch.testing.assert_close(model.input_mean, seen.mean(0), atol=1e-5, rtol=1e-4)
+    monkeypatch.setattr("astra_data.grounding.failures._WEIGHT_DECAY", 300.0)
+    decayed = fit_failures(TASK, grounding, training, 1, seed=0)
+    assert float(decayed.log_odds(seen).std()) < 0.1 * float(model.log_odds(seen).std())

@@ -8,6 +8,7 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
+from astra_data.grounding import fit as fit_module
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, _optimise, residual_rewards
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, LossWeights
@@ -207,3 +208,45 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
     assert metrics["failures"].keys() == {"failure_model"}
     assert "failure_members" not in config.model_dump() and asked.model_dump()["failure_members"] == 2
     assert "failure_steps" not in config.model_dump() and asked.model_dump()["failure_steps"] == 3
+
+
+@pytest.mark.parametrize("reward", ["whole", "correction"])
+def test_what_is_told_of_a_fit_is_measured_on_held_out_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reward: str
+) -> None:
+    given: dict[str, tuple[Any, ...]] = {}
+    for name in ("telemetry", "fit_scatter", "compared_foresight"):
+        made = getattr(fit_module, name)
+
+        def noted(*args: Any, name: str = name, made: Any = made) -> Any:  # noqa: ANN401
+            given[name] = args
+            return made(*args)
+
+        monkeypatch.setattr(fit_module, name, noted)
+    _, fitting = fit(tmp_path, "fit", scatter=True, failure_members=1, reward=reward)
+    training, held_out = fitting.training, fitting.held_out
+    if reward == "correction":
+        training, held_out = (residual_rewards(fitting.task, part) for part in (training, held_out))
+
+    def is_alike(one: PairedEpisodes, other: PairedEpisodes) -> bool:
+        first, second = one.windows, other.windows
+        return torch.equal(first.state, second.state) and torch.equal(first.reward, second.reward)
+
+    assert is_alike(given["telemetry"][1], held_out)
+    assert is_alike(given["fit_scatter"][1], training) and is_alike(given["fit_scatter"][2], held_out)
+    assert is_alike(given["compared_foresight"][2], held_out)
+
+
+def test_failures_weigh_what_is_asked(tmp_path: Path) -> None:
+    whole, half = (fit(tmp_path, str(of), failure_weight=of)[0] for of in (1.0, 0.5))
+    assert 0 < float(half.failure_weight) == pytest.approx(0.5 * float(whole.failure_weight))
+
+
+def test_members_cost_time_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spent = {"wall_seconds": 2.0, "cpu_seconds": 3.0, "epochs": [{}]}
+    monkeypatch.setattr(fit_module, "_optimise", lambda *_: dict(spent))
+    config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8, members=2)
+    parts = (episodes(0), episodes(1, 3))
+    given = Fitting(TASKS["antmaze-umaze"], config, None, *parts, 0, "cpu", tmp_path, silent)
+    _, metrics = HistoryFit(latent=True, reward=True)(given)
+    assert (metrics["wall_seconds"], metrics["cpu_seconds"]) == (6.0, 9.0)

@@ -75,8 +75,10 @@ def test_forms_are_as_wild_as_held_out_steps_where_training_ones_are_not() -> No
     windows = calm.windows
     wilder = windows.state + 3 * (windows.next_state - windows.state)
     held_out = replace(calm, windows=replace(windows, next_state=wilder))
-    scatters, _ = fit_scatter(grounding_model(), training, held_out, seed=0)
+    scatters, figures = fit_scatter(grounding_model(), training, held_out, seed=0)
     assert float(scatters.forms.std()) == pytest.approx(3.0, abs=0.45)
+    _, usual = fit_scatter(grounding_model(), training, calm, seed=0)
+    assert figures["gain_nats"] == pytest.approx(usual["gain_nats"], abs=1e-3)  # a size alone tells nothing
 
 
 def test_the_same_seed_fits_the_same_one(fitted: tuple[ScatterModel, dict[str, float]]) -> None:

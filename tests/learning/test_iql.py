@@ -271,3 +271,23 @@ def test_resuming_gives_the_same_parameters_to_the_bit(updates: int) -> None:
     resumed.load_state_dict(unflatten(flatten(begun.state_dict())))
     trained(resumed)
     assert all(map(torch.equal, whole.policy.parameters(), resumed.policy.parameters()))
+
+
+def test_slow_action_values_follow_at_their_rate() -> None:
+    iql = learner(walks(), config(target_rate=0.3))
+    critics = iql._critics
+    before = [values.clone() for values in critics.slow_action_values.parameters()]
+    iql.iterate()
+    slow, fast = (part.parameters() for part in (critics.slow_action_values, critics.action_values))
+    for now, then, new in zip(slow, before, fast, strict=True):
+        torch.testing.assert_close(now, 0.7 * then + 0.3 * new)
+
+
+def test_the_policys_learning_rate_falls_along_a_half_cosine() -> None:
+    iql = learner(walks(), config(critic_updates=1, policy_updates=4))
+    iql.iterate()
+    rates = []
+    while not iql.done:
+        iql.iterate()
+        rates.append(iql._optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-2 * share for share in (1.0, 0.85355, 0.5, 0.14645)], rel=1e-3)

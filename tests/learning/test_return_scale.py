@@ -12,6 +12,8 @@ def test_rewards_are_scaled_as_by_stable_baselines() -> None:
     ours, rng = ReturnScale(4, 0.9, torch.device("cpu")), np.random.default_rng(0)
     for step in range(60):
         reward = (rng.normal(size=4) * (100.0 if step == 30 else 3.0)).astype(np.float32)
+        if step == 50:
+            reward[0] = 1e4  # of one row, so that it is clipped
         done = rng.random(4) < 0.2
         theirs._update_reward(reward)
         expected = theirs.normalize_reward(reward)

@@ -342,3 +342,56 @@ def test_the_buffer_has_to_hold_a_window() -> None:
     with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
         sac(GoToZero(8), 10, buffer_size=55, **sizes)
     sac(GoToZero(8), 10, buffer_size=56, **sizes)
+
+
+def still(steps: int = 9) -> Recorded:
+    nothing = torch.zeros(2, steps, 1)
+    return Recorded(nothing, nothing, nothing + 0.5, torch.full((2,), steps))
+
+
+@pytest.mark.parametrize(("memory", "windows"), [(0, 64), (8, 10)])
+def test_an_update_takes_as_many_windows_as_its_steps_make(
+    memory: int, windows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = sac(GoToZero(8), 40, horizon=9, memory=memory, window=6, burn_in=2, recorded=still())
+    drawn: list[int] = []
+    for of in (type(learner._replay), Recorded):
+        draw = of.windows
+
+        def counted(self: Any, count: int, *sizes: int, draw: Any = draw) -> Any:  # noqa: ANN401
+            drawn.append(count)
+            return draw(self, count, *sizes)
+
+        monkeypatch.setattr(of, "windows", counted)
+    learner.iterate()
+    assert set(drawn) == {windows}
+
+
+def test_imitation_weighs_as_much_as_values_are_large_and_leaves_them_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learner = sac(GoToZero(8), 40, horizon=9, recorded=still(), imitation_weight=0.4)
+    learner.iterate()
+    parameters, parts = [*learner.policy.parameters()], list[tuple[float, Any]]()
+    compute, distance = learner._losses, learner._distance
+
+    def noted(loss: torch.Tensor) -> None:
+        gradient = torch.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
+        parts.append((abs(float(loss.detach())), gradient))
+
+    def losses(*given: Any) -> Any:  # noqa: ANN401
+        found = compute(*given)
+        noted(found[1])
+        return found
+
+    def apart(recorded: Recorded) -> torch.Tensor:
+        found = distance(recorded)
+        noted(found)
+        return found
+
+    monkeypatch.setattr(learner, "_losses", losses)
+    monkeypatch.setattr(learner, "_distance", apart)
+    learner._learn()
+    (size, of_costs), (_, of_distance) = parts
+    for parameter, one, other in zip(parameters, of_costs, of_distance, strict=True):
+        torch.testing.assert_close(parameter.grad, one + (0.0 if other is None else 0.4 * size * other))

@@ -114,3 +114,15 @@ def test_what_the_stage_wrote_is_read(tmp_path: Path) -> None:
     file.write_text(json.dumps({"judge": "nas", "episodes": 5, "candidates": []}))
     with pytest.raises(BadInputError, match="candidates"):
         read_judged(tmp_path)
+
+
+def test_level_quartiles_are_told_apart_by_the_mean() -> None:
+    candidates = [
+        Candidate(row="a", seed=seed, success=dict(enumerate([0.2, 0.2, 0.2, 0.2, most])))
+        for seed, most in enumerate((0.4, 0.6, 0.8))
+    ]
+    of = Judged(judge="nas", episodes=5, candidates=candidates)
+    measured = {("a", seed): 0.1 * seed for seed in range(3)}
+    found = choice_of(of, None, measured=measured, replicates=50)
+    assert found is not None and found.rank_correlation is not None
+    assert found.rank_correlation.value == pytest.approx(1.0)

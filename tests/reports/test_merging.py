@@ -56,6 +56,7 @@ def test_seeds_found_apart_amount_to_what_they_do_together(root: Path) -> None:
     counted = ("wall_seconds", "cpu_seconds", "throughput")
     assert content(merged, *counted) == content(whole, *counted)
     assert merged.wall_seconds["evaluate"] == whole.wall_seconds["evaluate"]
+    assert merged.cpu_seconds["evaluate"] == whole.cpu_seconds["evaluate"]
     assert merged.methods["astra"].cost["evaluate"] == Cost(wall_seconds=13.0, cpu_seconds=20.0)
     assert sorted(merged.throughput["evaluate"]["target_steps_per_second"]["astra"]) == [1000, 1001, 1002]
     gap = merged.gaps()["astra"]
@@ -126,6 +127,8 @@ def test_a_row_without_a_measure_stays_without(root: Path) -> None:
     [
         ({"episodes": 5}, "episodes per row and seed: 5 and 4"),
         ({"leg_scale": 1.25}, r"scale of the legs: 1.25 and 1.0"),
+        ({"task": "antmaze-long"}, "task: antmaze-long and antmaze-u"),
+        ({"tested_in": "simulators"}, "place of the tests: simulators and target"),
     ],
 )
 def test_results_that_are_not_alike_are_not_added(

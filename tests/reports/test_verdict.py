@@ -127,6 +127,8 @@ def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Result
     untested = shown.model_copy(update={"choice": choice, "tested_in": "simulators"})
     verdict = verdict_of(untested)
     assert (verdict.opening, verdict.title) == ("Deploy", "ASTRA, seed 1")
+    unfinished = choice.model_copy(update={"candidates": [candidate("nas", 0, 1.0), *candidates]})
+    assert verdict_of(untested.model_copy(update={"choice": unfinished})).title == "ASTRA, seed 1"
     assert "Direct transfer is predicted 0.10, a mean over its seeds." in verdict.remarks
     assert "By the mean over seeds ASTRA+ is ahead: predicted success 0.80." in verdict.remarks
     assert not any("overlap" in remark for remark in verdict.remarks)
@@ -219,3 +221,11 @@ def test_a_published_choice_is_the_first_candidate() -> None:
     choice = found.choice.model_copy(update={"candidates": [unsure, *found.choice.candidates[1:]]})
     reason = verdict_of(found.model_copy(update={"choice": choice})).reason
     assert "interval withheld" in reason
+
+
+def test_a_choice_below_the_floor_does_not_overlap_with_it(results: Results) -> None:
+    candidates = [candidate("astra", 0, 0.9)]
+    choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
+    apart = with_success(results, astra=[0.25, 0.25, 0.25], direct_transfer=[1.0, 1.0, 1.0])
+    found = verdict_of(apart.model_copy(update={"choice": choice}))
+    assert not any("overlap" in remark for remark in found.remarks)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,9 +16,11 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.own_policy import KINDS, OwnPolicy
+from astra_data.training.own_world import Reached
 from astra_data.training.policy_file import PolicyFile
-from astra_data.training.restarts import with_restarts
+from astra_data.training.restarts import _masters, with_restarts
 from astra_data.training.train import PpoTrainConfig, Training
+from astra_data.worlds.registry import TASKS
 
 SEEDS = [7, derive(7, "try 1"), derive(7, "try 2")]
 
@@ -99,3 +102,23 @@ def test_one_that_is_late_does_not_master_it(tmp_path: Path) -> None:
 def test_without_tries_nothing_is_tested(tmp_path: Path) -> None:
     command, curve, seeds = restarted(tmp_path, [-1.0])
     assert (command, seeds) == (-1.0, [7]) and "tries" not in curve
+
+
+def test_what_is_to_last_has_no_time_to_spare() -> None:
+    task = TASKS["humanoid-walker2d"]
+    training: Any = SimpleNamespace(task=task, config=PpoTrainConfig(tries=2))
+    assert _masters(Reached(1.0, float(task.objective.horizon)), training)
+    training.task = TASK
+    assert not _masters(Reached(1.0, float(TASK.objective.horizon)), training)
+
+
+def test_all_tries_meet_the_same_starts_and_goals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+
+    def tested(task: Any, policy: Any, grounding: Any, seed: int) -> Reached:  # noqa: ANN401
+        seeds.append(seed)
+        return Reached(0.0, 40.0)
+
+    monkeypatch.setattr("astra_data.training.restarts.trial", tested)
+    restarted(tmp_path, [-1.0, -0.9], tries=2)
+    assert seeds == [7, 7]

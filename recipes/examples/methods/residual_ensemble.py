@@ -1,6 +1,7 @@
 """An ensemble of networks without memory, each of which predicts by how much the simulator's step is wrong.
 
-They are fitted to bootstraps of the steps; the mean is the correction, what it leaves is added as noise.
+They are fitted to bootstraps of the steps; the mean is the correction. What it leaves is the scatter that
+judges add, and trainings with `residual_noise`.
 """
 
 from dataclasses import dataclass
