@@ -40,11 +40,16 @@ def test_a_changelog_that_does_not_lead_there_is_refused() -> None:
         released(texts, "0.3.0", date(2026, 12, 1))
 
 
-def test_this_checkout_can_be_released() -> None:
+def test_this_checkout_can_be_released_once() -> None:
+    """Also while it is: the checks run with the version of the release in the files."""
     texts = {name: (ROOT / name).read_text() for name in FILES}
-    version = tomllib.loads(texts["pyproject.toml"])["project"]["version"].removesuffix(".dev0")
-    made = released(texts, version, date(2026, 12, 1))
-    assert tomllib.loads(made["pyproject.toml"])["project"]["version"] == version
+    current = tomllib.loads(texts["pyproject.toml"])["project"]["version"]
+    version = current.removesuffix(".dev0")
+    if version != current:
+        texts = released(texts, version, date(2026, 12, 1))
+    assert tomllib.loads(texts["pyproject.toml"])["project"]["version"] == version
+    with pytest.raises(typer.BadParameter, match="should hold this once"):
+        released(texts, version, date(2026, 12, 1))
 
 
 def test_links_of_the_readme_lead_to_the_released_files() -> None:

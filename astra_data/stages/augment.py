@@ -188,18 +188,16 @@ def augment(
 
 
 def _task_of(source: Dataset, task: str | None) -> Task:
-    collected_for = source.description["environment"].get("id")
+    called, collected_for = source.reference, source.description["environment"].get("id")
     if task is None and collected_for is None:
-        raise BadInputError(
-            f"{source.reference} does not name the task that it was collected for: give --task"
-        )
+        raise BadInputError(f"{called} does not name the task that it was collected for: give --task")
     if task is None and is_own_code(str(collected_for)):
         raise BadInputError(
-            f"{source.reference} was collected for {collected_for}, which is code that would be run: "
-            f"read it, and give --task {collected_for}"
+            f"{called} was collected for {collected_for}, which is code that would be run: read it, and give "
+            f"--task {collected_for}"
         )
     if task is not None and collected_for in TASKS and task != collected_for:
-        raise BadInputError(f"{source.reference} was collected for {collected_for}, not for {task}")
+        raise BadInputError(f"{called} was collected for {collected_for}, not for {task}")
     return task_named(task or str(collected_for))
 
 
