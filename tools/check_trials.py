@@ -6,6 +6,7 @@ The target episodes of a report's policies are the pool that trials are drawn fr
 is taken for the truth, so the report needs a choice and a target.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from timing import complain
 
 from astra_data.core.errors import AstraDataError
 from astra_data.experiments.trial_regret import (
+    Pool,
     at_random,
     by_equal_shares,
     by_halving,
@@ -34,23 +36,23 @@ def main(
     resamples: Annotated[int, typer.Option(help="Of the seeds, for the intervals.")] = 200,
 ) -> None:
     """Print a table for each report and size."""
+    counts = (0, *(trials or (10, 20, 50, 100, 200)))
     try:
         for report in reports:
             for percent, results in by_size(read_published(report)).items():
                 pools = pools_of(results)
                 size = f", {percent} %" if percent else ""
                 head = f"{results.recipe}{size}: {len(pools)} candidates, regret by trials, 95 % over seeds"
-                print(f"{head}\n")
-                lines = []
-                for count in (0, *(trials or (10, 20, 50, 100, 200))):
-                    found = [
-                        estimate(pools, count, choose, repeats=repeats, resamples=resamples)
-                        for choose in WAYS.values()
-                    ]
-                    lines.append([f"{count}", *(interval(one.mean, one.low, one.high) for one in found)])
-                print(table(["trials", *WAYS], lines) + "\n", flush=True)
+                lines = [line(pools, count, repeats, resamples) for count in counts]
+                print(f"{head}\n\n{table(['trials', *WAYS], lines)}\n", flush=True)
     except AstraDataError as error:
         raise typer.Exit(complain(str(error))) from None
+
+
+def line(pools: Sequence[Pool], count: int, repeats: int, resamples: int) -> list[str]:
+    """Return a line of the table: the regret of each way with so many trials."""
+    found = [estimate(pools, count, choose, repeats=repeats, resamples=resamples) for choose in WAYS.values()]
+    return [f"{count}", *(interval(one.mean, one.low, one.high) for one in found)]
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ def main(
     texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in FILES}
     for name, text in released(texts, version, datetime.now(UTC).date()).items():
         (ROOT / name).write_text(text, encoding="utf-8")
-    is_tried = False
     try:
         _output("uv", "lock")
         subprocess.run([ROOT / ".ci" / "run"], cwd=ROOT, check=True)
@@ -37,14 +36,13 @@ def main(
         _output("uv", "build", "--clear")
         README.write_text(readme, encoding="utf-8")
         _try_wheel(next((ROOT / "dist").glob("*.whl")))
-        is_tried = True
-    except subprocess.CalledProcessError as error:
+    except BaseException as error:
+        _output("git", "checkout", "--", ".")
+        if not isinstance(error, subprocess.CalledProcessError):
+            raise
         command = " ".join(map(str, error.cmd))
         print(f"not released, and the files are as before: {command} failed, as it says above")
         raise typer.Exit(1) from None
-    finally:
-        if not is_tried:
-            _output("git", "checkout", "--", ".")
     _output("git", "commit", "--all", "--message", f"Release {version}")
     _output("git", "tag", "--annotate", f"v{version}", "--message", f"Release {version}")
     print(f"released {version} here; to the world: git push --follow-tags && uv publish")

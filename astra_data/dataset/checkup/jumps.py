@@ -36,9 +36,7 @@ class Jumps:
 
     def __init__(self, column: Column, steps: int) -> None:
         self._column = column
-        astra = column.astra or {}
-        units = astra.get("unit", [""] * column.size)
-        roles = astra.get("role", [""] * column.size)
+        units, roles = _units_and_roles(column)
         # A velocity may change at once, where the robot hits something, and so may a force or a timer.
         self._placed = np.array(
             [unit in PLACES and role != "vector" for unit, role in zip(units, roles, strict=True)]
@@ -121,14 +119,17 @@ class Jumps:
 
 def full_turns(column: Column) -> Floats:
     """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
-    astra = column.astra or {}
-    units = astra.get("unit", [""] * column.size)
-    roles = astra.get("role", [""] * column.size)
     turns = [
         _TURN.get(unit, 2 * np.pi if role == "heading" else 0.0)
-        for unit, role in zip(units, roles, strict=True)
+        for unit, role in zip(*_units_and_roles(column), strict=True)
     ]
     return np.array(turns)
+
+
+def _units_and_roles(column: Column) -> tuple[list[str], list[str]]:
+    """Return both of each value; "" where they are unknown."""
+    unknown, astra = [""] * column.size, column.astra or {}
+    return astra.get("unit", unknown), astra.get("role", unknown)
 
 
 def shortest(steps: Floats, turns: Floats) -> Floats:
