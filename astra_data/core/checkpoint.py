@@ -14,13 +14,24 @@ from safetensors.torch import save
 from torch import Tensor
 
 from astra_data.core.disk import writing
-from astra_data.core.durable import clean, discard, make_folder, move, sweep, sync_tree, write_file
+from astra_data.core.durable import (
+    clean,
+    discard,
+    make_folder,
+    move,
+    remove_empty,
+    sweep,
+    sync_tree,
+    write_file,
+)
 from astra_data.core.errors import BadInputError
 
 type Nested = (
     Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
 )
 """A training state, such as an optimizer's `state_dict()`."""
+
+_SETTINGS = "config.json"
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
@@ -129,9 +140,10 @@ def understood(
 def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds.
 
-    After a failure the working folder, `.<name>.partial` beside `out`, stays: the next call yields it again
-    with its contents, so that training can resume from its last checkpoint. With `replace` it begins empty
-    instead; the older `out` is kept as `.<name>.old` until the new one is in its place.
+    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than its
+    settings: the next call yields it again with its contents, so that training can resume from its last
+    checkpoint. With `replace` it begins empty instead; the older `out` is kept as `.<name>.old` until the new
+    one is in its place.
 
     Args:
         out: the finished folder.
@@ -152,11 +164,17 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         for folder in (partial, old):
             if replace and folder.exists():
                 discard(folder, out)
-        make_folder(partial)
+        made = make_folder(partial)
         clean(partial)
         if config is not None:
             _begin(partial, config)
-        yield partial
+        try:
+            yield partial
+        except BaseException:
+            if {path.name for path in partial.iterdir()} <= {_SETTINGS}:
+                discard(partial, out)
+                remove_empty(made)
+            raise
         clean(partial)
         sync_tree(partial)
         _put(partial, out, old)
@@ -189,7 +207,7 @@ def _is_usable(name: str, tensor: Tensor) -> bool:
 
 def _begin(partial: Path, config: str) -> None:
     """Write the settings to `partial`, unless it was begun with them."""
-    settings = partial / "config.json"
+    settings = partial / _SETTINGS
     if not any(partial.iterdir()):
         write_file(settings, config)
     elif not (settings.exists() and settings.read_text() == config):

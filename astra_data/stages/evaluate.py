@@ -6,7 +6,8 @@ own reward. Of a task without a target, there are the simulators alone.
 """
 
 import json
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -97,7 +98,6 @@ def evaluate(
         [1.0, 1.0]
     """
     world, base = task_named(task), method_named(method)
-    scores = world.objective.scores
     if base.trains and policy is None:
         raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
     if not (base.trains or world.has_target):
@@ -105,101 +105,148 @@ def evaluate(
     if base.grounds and grounding is None:
         raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     stopwatch = Stopwatch()
-    results: dict[str, Any] = {
-        "task": world.name,
-        "method": method,
-        "seed": seed,
-        "episodes": config.episodes,
-    }
-    results["leg_scale"] = config.leg_scale
-    results |= origin()
-    simulators: dict[str, SimulatorEnv] = {}
-    headline: EncoderKind = "source"
-    if policy is None:
-        begin: Begin = partial(careful, world)
-        robots: dict[EncoderKind, Begin] = {headline: partial(_careful_in_target, world)}
-        shown_abstract = True
-    else:
-        trained = PolicyFile.load(policy / POLICY) if isinstance(policy, Path) else policy
-        if isinstance(trained.policy, OwnPolicy):
-            results["policy"] = trained.policy.name
-        model: Grounding = NO_GROUNDING
-        if grounding:
-            model = load_grounding(grounding / GROUNDING)
-        source = deploy(world, trained, model)
-        begin = partial(started, source, source.act_in_simulator)
-        robots = {"source": partial(started, source, source.act)}
-        if target_encoder is not None:
-            encoder = load_target_encoder(target_encoder / TARGET_ENCODER)
-            aligned = replace(source, target_encoder=encoder)
-            robots["target"] = partial(started, aligned, aligned.act)
-        headline = config.encoder if config.encoder in robots else "source"
-        results |= {
-            "encoder": headline,
-            "dataset_version": trained.dataset,
-            "dataset_hash": trained.content_hash,
-        }
-        shown_abstract = trained.observed == "abstract"
-        if trained.simulation is not None:
-            simulators["simulated"] = own_world(world, trained.simulation, model, config.episodes)
-    if shown_abstract:
-        simulators |= _shared_simulators(world, reference, config)
     files = {
         "policy": policy / POLICY if isinstance(policy, Path) else None,
         "grounding": grounding and grounding / GROUNDING,
         "target_encoder": target_encoder and target_encoder / TARGET_ENCODER,
         "reference": reference and reference / GROUNDING,
     }
-    read = {name: file_digest(file) for name, file in files.items() if file}
-    tensors: dict[str, Tensor] = {}
+    read = {name: file for name, file in files.items() if file}
+    if policy is None:
+        row = _follower(world)
+    else:
+        row = _policy(world, policy if isinstance(policy, PolicyFile) else None, read, config)
+    shared = _shared_simulators(world, read.get("reference"), config) if row.shown_abstract else {}
+    simulators = row.simulators | shared
+    manifest = {name: file_digest(file) for name, file in read.items()}
     asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
     tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
+    results: dict[str, Any] = {
+        "task": world.name,
+        "method": method,
+        "seed": seed,
+        "episodes": config.episodes,
+        "leg_scale": config.leg_scale,
+        **origin(),
+        **row.facts,
+    }
+    tensors: dict[str, Tensor] = {}
     if world.has_target:
-        outcomes, filmed = {}, {}
-        for kind, robot in robots.items():
-            counted = asked if kind == headline else None
-            outcomes[kind], filmed[kind], rate, start_goal = in_target(
-                world,
-                robot,
-                config.episodes,
-                derive(seed, "evaluation"),
-                leg_scale=config.leg_scale,
-                num_threads=num_threads,
-                progress=progress,
-                asked=counted,
-            )
-        if policy is not None:
-            results["encoders"] = {
-                kind: {score.measure: fmean(outcome.to_json()[score.measure]) for score in scores}
-                for kind, outcome in outcomes.items()
-            }
-        results |= {"target": outcomes[headline].to_json(), "target_steps_per_second": rate}
-        tensors["target.position"] = outcomes[headline].position
-        if world.photograph is not None:
-            tensors["target.state"] = filmed[headline]
+        figures, tensors = _in_target(world, row, config, seed, asked, num_threads, progress)
+        results |= figures
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
-    for name, simulated in simulators.items():
+    for name, simulator in simulators.items():
         counted = asked if name == tested_in else None
-        outcome, simulated_starts = in_simulator(
-            simulated, begin, world.objective.horizon, derive(seed, "simulated evaluation"), counted
+        outcome, start_goal = in_simulator(
+            simulator, row.begin, world.objective.horizon, derive(seed, "simulated evaluation"), counted
         )
         if name == tested_in:
-            start_goal = simulated_starts
+            tensors |= start_goal
         results[name] = outcome.to_json()
         if name in ("simulated", tested_in):
             tensors[f"{name}.position"] = outcome.position
     if asked is not None:
         results["beyond_recorded"] = asked.share
     with finished_folder(out) as folder:
-        save_tensors(folder / TRAJECTORIES, tensors | start_goal, {})
+        save_tensors(folder / TRAJECTORIES, tensors, {})
         results |= stopwatch.spent()
         (folder / EVALUATION).write_text(json.dumps(results, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
-        write_manifest(folder, read)
-    first = scores[0]
+        write_manifest(folder, manifest)
+    first = world.objective.scores[0]
     where = "target" if world.has_target else f"{tested_in} simulator"
     progress(1.0, f"{first.title} in the {where} {first.text(fmean(results[tested_in][first.measure]))}")
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What is tested.
+
+    Attributes:
+        begin: starts it in simulators. robots: start it in the target, by the encoder it is deployed with.
+        headline: the encoder whose figures are the row's. simulators: the one that it was trained in, if any.
+        shown_abstract: whether it sees abstract states, and so can act in simulators. facts: to be reported.
+    """
+
+    begin: Begin
+    robots: dict[EncoderKind, Begin]
+    headline: EncoderKind
+    simulators: dict[str, SimulatorEnv]
+    shown_abstract: bool
+    facts: dict[str, Any]
+
+
+def _follower(task: Task) -> _Row:
+    return _Row(partial(careful, task), {"source": partial(_careful_in_target, task)}, "source", {}, True, {})
+
+
+def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
+    trained = loaded or PolicyFile.load(files["policy"])
+    grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
+    source = deploy(task, trained, grounding)
+    robots: dict[EncoderKind, Begin] = {"source": partial(started, source, source.act)}
+    if "target_encoder" in files:
+        aligned = replace(source, target_encoder=load_target_encoder(files["target_encoder"]))
+        robots["target"] = partial(started, aligned, aligned.act)
+    headline = config.encoder if config.encoder in robots else "source"
+    facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, OwnPolicy) else {}
+    facts |= {
+        "encoder": headline,
+        "dataset_version": trained.dataset,
+        "dataset_hash": trained.content_hash,
+    }
+    simulators = {}
+    if trained.simulation is not None:
+        simulators["simulated"] = own_world(task, trained.simulation, grounding, config.episodes)
+    return _Row(
+        partial(started, source, source.act_in_simulator),
+        robots,
+        headline,
+        simulators,
+        trained.observed == "abstract",
+        facts,
+    )
+
+
+def _in_target(
+    task: Task,
+    row: _Row,
+    config: EvaluateConfig,
+    seed: int,
+    asked: RecordedRange | None,
+    num_threads: int | None,
+    progress: Progress,
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Test a row with each of its encoders; return the figures, and the headline's paths and starts."""
+    tested = {
+        kind: in_target(
+            task,
+            robot,
+            config.episodes,
+            derive(seed, "evaluation"),
+            leg_scale=config.leg_scale,
+            num_threads=num_threads,
+            progress=progress,
+            asked=asked if kind == row.headline else None,
+        )
+        for kind, robot in row.robots.items()
+    }
+    headline = tested[row.headline]
+    figures: dict[str, Any] = {}
+    if row.facts:
+        figures["encoders"] = {
+            kind: {
+                score.measure: fmean(episodes.outcome.to_json()[score.measure])
+                for score in task.objective.scores
+            }
+            for kind, episodes in tested.items()
+        }
+    figures |= {"target": headline.outcome.to_json(), "target_steps_per_second": headline.rate}
+    tensors = {"target.position": headline.outcome.position} | headline.start_goal
+    if task.photograph is not None:
+        tensors["target.state"] = headline.filmed
+    return figures, tensors
 
 
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
@@ -210,7 +257,7 @@ def _careful_in_target(task: Task, goal: Tensor) -> Act:
 def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
-        groundings["grounded"] = load_grounding(reference / GROUNDING)
+        groundings["grounded"] = load_grounding(reference)
     return {
         name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()

@@ -179,6 +179,7 @@ def test_an_interrupted_folder_is_found_again(tmp_path: Path) -> None:
 def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt), finished_folder(out, config="1") as folder:
+        (folder / "checkpoint").touch()
         raise KeyboardInterrupt
     with (
         pytest.raises(BadInputError, match=f"{folder} was begun with other settings"),
@@ -187,7 +188,18 @@ def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
         pass
     with finished_folder(out, config="1"):
         pass
-    assert [(path.name, path.read_text()) for path in out.iterdir()] == [("config.json", "1")]
+    assert (out / "config.json").read_text() == "1"
+
+
+@pytest.mark.parametrize("config", [None, "1"])
+def test_a_failure_before_anything_is_made_leaves_nothing(tmp_path: Path, config: str | None) -> None:
+    (tmp_path / "train").mkdir()
+    with (
+        pytest.raises(BadInputError, match="no episodes"),
+        finished_folder(tmp_path / "train" / "astra" / "seed_0", config=config),
+    ):
+        raise BadInputError("no episodes")
+    assert [path.name for path in tmp_path.rglob("*")] == ["train"]
 
 
 def test_a_folder_begun_without_a_config_is_refused(tmp_path: Path) -> None:
