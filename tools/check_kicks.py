@@ -2,8 +2,8 @@
 
     uv run python tools/check_kicks.py runs/nao_kick_fresh --seed 101
 
-A kick begins where it is asked for and was not in the step before, with the ball at rest. The target has no
-say: data, groundings and the careful kicker in their simulators are looked at.
+A kick begins where it is asked for and was not in the step before, with the ball at rest. Recorded kicks are
+replayed in the grounded simulators, and the careful kicker plays there. The target has no say.
 """
 
 from functools import partial
@@ -20,6 +20,7 @@ from astra_data.core.naming import place
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.methods.follower import careful
@@ -31,10 +32,10 @@ from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
 EDGES_M = (0.0, 0.17, 0.20, 0.23, 0.27, 0.35)
-STEPS = 8
-"""After the beginning of a kick, 1.5 s of the NAO, that are looked at."""
+STEPS = 12
+"""After the beginning of a kick, 2.3 s of the NAO, that are looked at."""
 AT_REST_M_S, MOVED_M = 0.15, 0.15
-EPISODES = 100
+REPLAYS, EPISODES = 50, 100
 
 
 def main(
@@ -42,51 +43,61 @@ def main(
     seed: Annotated[int, typer.Option(help="Of the run.")],
     row: Annotated[list[str] | None, typer.Option(help="Rows whose groundings are looked at.")] = None,
 ) -> None:
-    """Print a table of the data, one of the groundings, and what a careful kicker reaches in these."""
+    """Print tables of kicks in data and groundings, and of what a careful kicker reaches in the latter."""
     task = task_named(settings_of(run)["task"])
     windows = PairedEpisodes.load(run / "pair" / place(seed)).windows
-    begins, distance = kicks(windows)
-    ball = windows.state[..., 4:6]
-    moved = (ball[:, STEPS:] - ball[:, :-STEPS]).norm(dim=-1) > MOVED_M
+    moments, distance = kicks(windows)
+    later = moments.after(STEPS)
+    way = {"data": (windows.state[moments.episode, later, 4:6] - moments.state[:, 4:6]).norm(dim=-1)}
+    reached = []
+    for name in row or ("nas", "astra"):
+        made = load_grounding(run / "ground" / name / place(seed) / GROUNDING)
+        assert isinstance(made, HistoryGrounding)
+        way[name] = replayed(task, made, moments)
+        simulator = SimulatorEnv(task.objective, made.simulator(task, EPISODES))
+        outcome, _ = in_simulator(simulator, partial(careful, task), task.objective.horizon, 0)
+        reached.append([name, f"{fmean(outcome.success):.2f}"])
+    columns = [f"{what}, {name}" for name in way for what in ("move it", "m")]
     lines = []
     for low, high in pairwise(EDGES_M):
-        there = begins & (distance >= low) & (distance < high)
-        share = moved[there[:, :-STEPS]]
-        lines.append([f"{low:.2f} to {high:.2f}", f"{len(share)}", f"{int(share.sum())}"])
-    print(table(["distance of the ball in m", "kicks", "of them that move it"], lines), "\n")
-    lines = [grounded(task, run / "ground" / name / place(seed), windows) for name in row or ("nas", "astra")]
-    print(table(["grounding", "a kicked ball moves, m a step", "predicted", "careful kicker"], lines))
+        there = (distance >= low) & (distance < high)
+        cells = [cell for ways in way.values() for cell in told(ways[..., there])]
+        lines.append([f"{low:.2f} to {high:.2f}", f"{int(there.sum())}", *cells])
+    print(table(["distance of the ball in m", "kicks", *columns], lines), "\n")
+    print(table(["grounding", "careful kicker"], reached))
 
 
-def kicks(windows: PairedWindows) -> tuple[Tensor, Tensor]:
-    """Return where kicks begin (E, T), bool, with `STEPS` to come, and how far the ball is (E, T), in m."""
+def kicks(windows: PairedWindows) -> tuple[Moments, Tensor]:
+    """Return where kicks begin, with `STEPS` to come, and how far the ball is (N,), in m."""
     robot, _, ball, rolling = windows.state.split(2, dim=-1)
     asked = asks_to_kick(windows.action.flatten(0, 1)).view(windows.mask.shape)
     begins = torch.zeros_like(asked)
     begins[:, 1:-STEPS] = asked[:, 1:-STEPS] & ~asked[:, : -STEPS - 1] & windows.mask[:, 1 + STEPS :].bool()
-    return begins & (rolling.norm(dim=-1) < AT_REST_M_S), (robot - ball).norm(dim=-1)
+    at = begins & (rolling.norm(dim=-1) < AT_REST_M_S)
+    return Moments(windows, *at.nonzero(as_tuple=True)), (robot - ball).norm(dim=-1)[at]
 
 
 @torch.no_grad()
-def grounded(task: Task, folder: Path, windows: PairedWindows) -> list[str]:
-    """Return a line of the second table."""
-    made = load_grounding(folder / GROUNDING)
-    assert isinstance(made, HistoryGrounding)
-    model = made.model
-    latent, _ = model.encoder(model.encoder_input(windows.state, windows.goal, windows.previous_action))
-    predicted = model.ensemble_predictions(latent, windows.action, windows.simulated_next).mean(0)
-    begins, distance = kicks(windows)
-    episode, step = (begins & (distance < EDGES_M[3])).nonzero().T
-    after = step + torch.arange(1, STEPS).unsqueeze(1)
-    true, told = (
-        (following[episode, after, 4:6] - windows.state[episode, after, 4:6]).norm(dim=-1).mean()
-        for following in (windows.next_state, predicted)
-    )
-    simulator = SimulatorEnv(task.objective, made.simulator(task, EPISODES))
-    outcome, _ = in_simulator(simulator, partial(careful, task), task.objective.horizon, 0)
-    return [folder.parent.name, f"{true:.3f}", f"{told:.3f}", f"{fmean(outcome.success):.2f}"]
+def replayed(task: Task, made: HistoryGrounding, moments: Moments) -> Tensor:
+    """Return how far the ball is after `STEPS` simulated ones from where it lay, (REPLAYS, N), in m."""
+    hidden = made.hidden_before(moments.windows)[moments.episode, moments.first]
+    simulator = made.corrected(task.simulator(len(moments)), None)
+    ways = []
+    for _ in range(REPLAYS):
+        moments.start(simulator, hidden)
+        for count in range(STEPS):
+            state = simulator.step(moments.windows.action[moments.episode, moments.after(count)])
+        ways.append((state[:, 4:6] - moments.state[:, 4:6]).norm(dim=-1))
+    return torch.stack(ways)
+
+
+def told(way: Tensor) -> tuple[str, str]:
+    """Return which share of kicks moves the ball, and how far those do on average, in m."""
+    moved = way > MOVED_M
+    return f"{moved.float().mean():.2f}", f"{way[moved].mean():.2f}"
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
+    torch.manual_seed(0)
     typer.run(main)

@@ -6,13 +6,15 @@ robot could have recorded, with three exceptions:
 * Walls. A robot that was stopped by a wall would not be stopped elsewhere. So only stretches of an episode
   that keep clear of the walls are copied, and the copies keep clear of them too.
 * The goal belongs to the maze and is not moved: every copy gets a goal of its own, drawn as the task draws
-  it. The task computes the copy's rewards and ends; a copy ends where it reaches its goal.
+  it. The task computes the copy's rewards and ends; a copy ends where it reaches its goal. A ball is moved
+  with its robot, and an episode that ended by where its ball was is copied without that step.
 * Commands. Where commands are clipped to ±1 m/s along each axis, a command that is rotated out of that square
   is no longer what the robot did; such rotations are drawn again.
 
 Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -26,14 +28,10 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import (
     ABSTRACT_STATE,
-    DONE,
     GOAL,
     NEXT_STATE,
     OUTCOME_COLUMNS,
-    REWARD,
     STATE,
-    SUCCESS,
-    TERMINATED,
     Column,
     Episode,
 )
@@ -41,8 +39,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.worlds.own_code import is_own_code
-from astra_data.worlds.plane.geometry import PlanarMap
-from astra_data.worlds.plane.relocation import Relocation, Rotations, outcomes, positions
+from astra_data.worlds.plane.relocation import Relocation, Rotations
 from astra_data.worlds.registry import TASKS, task_named
 from astra_data.worlds.task import Task
 
@@ -160,7 +157,7 @@ def augment(
         seeds=source.description["seeds"] | {"augment": seed},
     )
     taken = set(source.uids.tolist())
-    placed, lost = 0, 0
+    placed, lost, moving = 0, 0, _moving(source)
     with DatasetWriter.like(source, out, description) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
@@ -168,13 +165,13 @@ def augment(
                 writer.add(Episode(episode.uid, episode.columns, metadata))
             for copy in range(copies[index]):
                 rng = generator(seed, f"augment {episode.uid} {copy}")
-                drawn = relocation.draw(episode, rng)
-                if drawn is None:
+                copied = relocation.copied(episode, moving, rng)
+                if copied is None:
                     lost += 1
                     continue
                 purpose = f"{source.content_hash} {config.model_dump_json()} {episode.uid} {copy}"
                 uid = _free_uid(derive(seed, purpose), taken)
-                writer.add(_copied(source, world, episode, uid, *drawn, rng))
+                writer.add(replace(copied, uid=uid))
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
@@ -213,8 +210,6 @@ def _check(source: Dataset, world: Task) -> None:
         faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")
-    if world.ball_index is not None:
-        faults.append("it has a ball: rewards of copies are computed from the robot's place alone")
     faults += [
         f"{column.name}: it has no roles, which say how it is rotated"
         for column in _moving(source)
@@ -257,40 +252,6 @@ def _shares(
         copies[usable] = each
         copies[order[usable[order]][:more]] += 1
     return held_out, copies
-
-
-def _copied(
-    source: Dataset,
-    world: Task,
-    episode: Episode,
-    uid: int,
-    change: PlanarMap,
-    steps: slice,
-    rng: np.random.Generator,
-) -> Episode:
-    """Return the steps `steps` of `episode` after `change`, with a goal of its own, judged by the task."""
-    cut = {name: values[steps] for name, values in episode.columns.items()}
-    moved = {column.name: change.of_column(column, cut[column.name]) for column in _moving(source)}
-    goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
-    columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
-    before, after = (positions(world, columns[name]) for name in (STATE, NEXT_STATE))
-    judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
-    length = len(judged[DONE])
-    return Episode(
-        uid,
-        {name: values[:length] for name, values in columns.items()} | judged,
-        {
-            "success": bool(judged[SUCCESS][-1]),
-            "failed": bool(judged[TERMINATED][-1] and not judged[SUCCESS][-1]),
-            "return": float(judged[REWARD].sum(dtype=np.float64)),
-            "held_out": False,
-            "source_episode": episode.uid,
-            "augmentation_first_step": int(steps.start),
-            "augmentation_rotation_rad": change.rotation_rad,
-            "augmentation_x_m": change.shift_m[0],
-            "augmentation_y_m": change.shift_m[1],
-        },
-    )
 
 
 def _free_uid(uid: int, taken: set[int]) -> int:

@@ -267,12 +267,21 @@ def test_code_that_a_dataset_names_is_not_run(collected: Path, tmp_path: Path) -
     assert not (tmp_path / "ran").exists()
 
 
-def test_episodes_with_a_ball_are_refused(tmp_path: Path) -> None:
-    kicking = tmp_path / "kicking"
-    collect("nao-kick", CollectConfig(episodes=2, max_steps=4), seed=0, out=kicking, progress=silent)
-    with pytest.raises(BadInputError, match="it has a ball"):
-        augment(None, CONFIG, dataset=kicking, seed=0, out=tmp_path / "out", progress=silent)
-    assert not (tmp_path / "out").exists()
+def test_balls_are_moved_with_their_robots(tmp_path: Path) -> None:
+    kicking, task = tmp_path / "kicking", TASKS["nao-kick"]
+    collect("nao-kick", CollectConfig(episodes=3, max_steps=20), seed=0, out=kicking, progress=silent)
+    config = AugmentConfig(episodes=9, held_out_share=0.3, min_steps=5)
+    folder = augment(None, config, dataset=kicking, seed=0, out=tmp_path / "out", progress=silent)
+    made = list(copies(Dataset.open(kicking), Dataset.open(folder)))
+    assert len(made) == 6
+    for copy, source in made:
+        states = (episode.columns[STATE][: len(copy)] for episode in (copy, source))
+        paths = [np.asarray(task.abstraction(state), np.float64) for state in states]
+        apart, before = (path[:, 4:6] - path[:, :2] for path in paths)
+        np.testing.assert_allclose(np.linalg.norm(apart, axis=1), np.linalg.norm(before, axis=1), atol=1e-5)
+        assert np.abs(apart - before).max() > 0.01
+    paired = pair("nao-kick", PairConfig(), dataset=folder, out=tmp_path / "paired", progress=silent)
+    assert len(PairedEpisodes.load(paired)) == 9
 
 
 def test_grounding_holds_out_what_was_not_copied(augmented: Path, tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ from astra_data.worlds.plane.states import PlanarStates
 _LIES_M_S = 0.15
 """A corrected ball slower than this is put back to rest where it was before the step: it would roll on for at
 most 4 cm, and a robot's estimate of the speed is never quite zero."""
+_LEAVES_M_S = 0.5
+"""Speed at which a correction sets a ball rolling that lay, if it says no more."""
 
 
 class BallAgent(PlanarStates):
@@ -22,9 +24,9 @@ class BallAgent(PlanarStates):
     the line between the centres, one that the mass walks into at another. Left out: the legs, the positions
     and timing of the feet, and the robot's heading.
 
-    Corrections move only balls that rolled or were touched in the step, and leave none at less than 0.15 m/s:
-    an expected correction mixes balls that are touched with others that are not into one that creeps, and
-    policies wait for it.
+    Corrections move only balls that rolled or were touched in the step, and leave none at less than 0.15 m/s.
+    Whether one sets a ball rolling that lay is drawn, such that the expected speed is kept: an expected
+    correction mixes balls that are hit with others that are missed into one that creeps, or never moves.
     """
 
     state_size = 8
@@ -95,9 +97,16 @@ class BallAgent(PlanarStates):
         return self.state
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the masses to `landed` (B, 8); balls at rest that nothing touched, and slow ones, stay."""
+        """Slide the masses to `landed` (B, 8), and move the balls as far as they can: see the class."""
         moved = super().settle(before, landed)
-        still = torch.cat([before[:, 4:6], torch.zeros_like(before[:, 6:])], dim=-1)
-        rolls = self._rolls & (moved[:, 6:].norm(dim=-1, keepdim=True) > _LIES_M_S)
-        self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, moved[:, 4:], still)], dim=-1))
+        velocity = moved[:, 6:]
+        speed = velocity.norm(dim=-1, keepdim=True)
+        lay = before[:, 6:].norm(dim=-1, keepdim=True) <= _LIES_M_S
+        is_hit = torch.rand_like(speed) < speed / _LEAVES_M_S
+        leaving = velocity / speed.clamp_min(1e-9) * _LEAVES_M_S
+        hit = roll(before[:, 4:6], leaving, self.period_s, self._deceleration_m_s2)
+        still = torch.cat([before[:, 4:6], torch.zeros_like(velocity)], dim=-1)
+        rolls = self._rolls & torch.where(lay, is_hit, speed > _LIES_M_S)
+        ball = torch.where(lay & (speed < _LEAVES_M_S), torch.cat(hit, dim=-1), moved[:, 4:])
+        self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, ball, still)], dim=-1))
         return self.state

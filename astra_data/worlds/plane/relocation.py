@@ -1,6 +1,7 @@
 """Candidate placements of an episode elsewhere in its maze, and its rewards and outcome there."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
+    GOAL,
     NEXT_STATE,
     REWARD,
     STATE,
@@ -16,6 +18,7 @@ from astra_data.dataset.columns import (
     TERMINATED,
     TRUNCATED,
     Array,
+    Column,
     Episode,
 )
 from astra_data.worlds.objective import Objective
@@ -85,6 +88,54 @@ class Relocation:
                 return PlanarMap(turn.rotation_rad, (float(x), float(y))), steps
         return None
 
+    def copied(self, episode: Episode, moving: Sequence[Column], rng: np.random.Generator) -> Episode | None:
+        """Return a moved part of `episode`, with a goal of its own, judged by the task; None without room.
+
+        Its uid is still that of `episode`. It begins with its ball, if there is one, neither in the goal nor
+        out of the field.
+
+        Args:
+            episode: to be copied.
+            moving: columns that are moved.
+            rng: draws the part, its place and the goal.
+        """
+        world, movable = self.task, episode
+        if world.ball_index is not None and episode.columns[TERMINATED][-1]:
+            movable = replace(episode, columns={name: each[:-1] for name, each in episode.columns.items()})
+            if not self.stretches(movable):
+                return None
+        for _ in range(self.tries):
+            drawn = self.draw(movable, rng)
+            if drawn is None:
+                return None
+            change, steps = drawn
+            cut = {name: values[steps] for name, values in movable.columns.items()}
+            moved = {column.name: change.of_column(column, cut[column.name]) for column in moving}
+            goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
+            columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
+            before, after = (np.asarray(world.abstraction(columns[name])) for name in (STATE, NEXT_STATE))
+            if world.ball_index is None or not _is_decided(world.objective, before[0], goal):
+                break
+        else:
+            return None
+        judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
+        length = len(judged[DONE])
+        return Episode(
+            episode.uid,
+            {name: values[:length] for name, values in columns.items()} | judged,
+            {
+                "success": bool(judged[SUCCESS][-1]),
+                "failed": bool(judged[TERMINATED][-1] and not judged[SUCCESS][-1]),
+                "return": float(judged[REWARD].sum(dtype=np.float64)),
+                "held_out": False,
+                "source_episode": episode.uid,
+                "augmentation_first_step": int(steps.start),
+                "augmentation_rotation_rad": change.rotation_rad,
+                "augmentation_x_m": change.shift_m[0],
+                "augmentation_y_m": change.shift_m[1],
+            },
+        )
+
     def _is_free(self, points: Array) -> Array:
         return self.task.maze.clearance(points) > self.margin_m
 
@@ -106,6 +157,12 @@ class Relocation:
         return rng.uniform(low, np.maximum(low, high), (_SHIFTS, 2))
 
 
+def _is_decided(objective: Objective, state: Array, goal: Array) -> bool:
+    """Return whether the goal (2,) is reached, or out of reach, in an abstract state (X,)."""
+    states, goals = torch.from_numpy(state[None]), torch.from_numpy(goal[None])
+    return bool(objective.reached(states, goals) | objective.missed(states, goals))
+
+
 def outcomes(
     objective: Objective, before: Array, after: Array, goal: Array, toppled: Array
 ) -> dict[str, Array]:
@@ -113,8 +170,8 @@ def outcomes(
 
     Args:
         objective: of the task.
-        before: positions before each step, (T, 2) in m.
-        after: after it, (T, 2) in m.
+        before: abstract states before each step, (T, X).
+        after: after it, (T, X).
         goal: (2,) in m.
         toppled: whether the robot toppled in the step, (T,) bool.
 
@@ -122,13 +179,14 @@ def outcomes(
         the outcome columns up to the step that ends the episode, (T',) with T' <= T.
     """
     start, end = torch.from_numpy(before), torch.from_numpy(after)
-    goals, fallen = torch.from_numpy(goal).expand(len(start), 2), torch.from_numpy(toppled)
+    goals = torch.from_numpy(goal).expand(len(start), 2)
     success = objective.reached(end, goals)
-    terminated = (success | fallen).numpy()
+    failed = torch.from_numpy(toppled) | objective.missed(end, goals)
+    terminated = (success | failed).numpy()
     length = int(terminated.argmax()) + 1 if terminated.any() else len(terminated)
     done = np.arange(length) == length - 1
     return {
-        REWARD: objective.reward(start, end, goals, fallen).numpy()[:length],
+        REWARD: objective.reward(start, end, goals, failed).numpy()[:length],
         TERMINATED: terminated[:length],
         TRUNCATED: done & ~terminated[:length],
         DONE: done,

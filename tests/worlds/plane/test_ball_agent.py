@@ -138,7 +138,7 @@ def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
     states[1, 6] = 0.3
     simulator.reset_to(states)
     simulator.step(torch.cat([-AHEAD, -AHEAD, AHEAD]))
-    landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.5, 0.5, 0.3, 0.3]).repeat(3, 1)
+    landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.5, 0.5, 0.4, 0.4]).repeat(3, 1)
     settled = simulator.settle(states, landed)
     assert torch.equal(settled[:, :4], landed[:, :4])
     assert torch.equal(settled[0, 4:], START[0, 4:])
@@ -146,10 +146,30 @@ def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
     assert torch.equal(simulator.state, settled)
 
 
-def test_a_correction_that_all_but_stops_a_ball_leaves_it_where_it_lay() -> None:
-    simulator = one()
-    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]))
-    landed = torch.tensor([[0.1, 0.1, 0.2, 0.2, 0.24, 0.01, 0.1, 0.1]])
-    settled = simulator.settle(START, landed)
+def test_a_correction_that_all_but_stops_a_ball_leaves_it_where_it_was() -> None:
+    simulator = one(2)
+    rolling = START.repeat(2, 1)
+    rolling[:, 6] = 0.3
+    simulator.reset_to(rolling)
+    simulator.step(STAY.repeat(2, 1))
+    landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.24, 0.01, 0.1, 0.1]).repeat(2, 1)
+    landed[1, 6] = 0.12
+    settled = simulator.settle(rolling, landed)
     assert torch.equal(settled[:, :4], landed[:, :4])
-    assert torch.equal(settled[:, 4:], START[:, 4:])
+    assert torch.equal(settled[0, 4:], START[0, 4:])
+    assert torch.equal(settled[1, 4:], landed[1, 4:])
+
+
+def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_speed() -> None:
+    simulator, count = one(20_000), 20_000
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
+    landed = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.3, 0.1, 0.06, -0.08]]).expand(count, 8)
+    torch.manual_seed(0)
+    ball = simulator.settle(START.expand(count, 8), landed)[:, 4:]
+    hit = ball[:, 2:].norm(dim=-1) > 0
+    # A fifth of 0.5 m/s. The ball is slowed by 0.3 m/s² in the 0.2 s that it rolls.
+    assert hit.float().mean().item() == pytest.approx(0.2, abs=0.01)
+    way = 0.5 * 0.2 - 0.3 * 0.2**2 / 2
+    expected = torch.tensor([0.22 + 0.6 * way, -0.8 * way, 0.6 * 0.44, -0.8 * 0.44])
+    torch.testing.assert_close(ball[hit], expected.expand(int(hit.sum()), 4))
+    assert torch.equal(ball[~hit], START[:, 4:].expand(int((~hit).sum()), 4))

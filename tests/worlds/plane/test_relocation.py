@@ -1,14 +1,27 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array, Episode
+from astra_data.dataset.columns import (
+    ACTION,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Episode,
+)
 from astra_data.worlds.plane.relocation import Relocation, outcomes, positions
 from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
-GOAL = np.array(TASK.maze.cell_centre(*TASK.maze.goal), np.float32)
+KICKING = TASKS["nao-kick"]
+AIM = np.array(TASK.maze.cell_centre(*TASK.maze.goal), np.float32)
 
 
 def relocation(**changes: Any) -> Relocation:  # noqa: ANN401
@@ -106,10 +119,10 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
     toppled_at: int | None, length: int, success: bool
 ) -> None:
     # 0.1 m per step along the lower corridor; within 0.45 m of the goal from step 15 on.
-    path = straight((GOAL[0] + 2.0, GOAL[1]), (GOAL[0] - 1.0, GOAL[1]), 30)
+    path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
     before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
     toppled = np.arange(30) == toppled_at
-    judged = outcomes(TASK.objective, before, after, GOAL, toppled)
+    judged = outcomes(TASK.objective, before, after, AIM, toppled)
     assert {len(values) for values in judged.values()} == {length}
     assert judged["next.success"].tolist() == [False] * (length - 1) + [success]
     assert judged["next.terminated"].tolist() == judged["next.done"].tolist()
@@ -122,6 +135,78 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
 def test_an_episode_that_just_stops_is_truncated() -> None:
     path = straight((4.0, 4.0), (3.0, 4.0), 10)
     before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
-    judged = outcomes(TASK.objective, before, after, GOAL, np.zeros(10, dtype=bool))
+    judged = outcomes(TASK.objective, before, after, AIM, np.zeros(10, dtype=bool))
     assert judged["next.truncated"].tolist() == judged["next.done"].tolist() == [False] * 9 + [True]
     assert not judged["next.terminated"].any()
+
+
+def kick(steps: int, ball_m: float, *, ends: bool = False) -> Episode:
+    """Return an episode of a robot that stands at the origin, and whose ball rolls on by `ball_m` a step."""
+    state = np.zeros((steps + 1, KICKING.state.size), np.float32)
+    state[:, 2] = 1.0
+    state[:, -5] = 0.2 + ball_m * np.arange(steps + 1)
+    state[1:, -3] = ball_m / KICKING.timestep_s
+    last = np.arange(steps) == steps - 1
+    columns = {
+        STATE: state[:-1].copy(),
+        NEXT_STATE: state[1:].copy(),
+        ACTION: np.tile(np.float32([0.3, 0.0, 1.0]), (steps, 1)),
+        GOAL: np.tile(np.float32([1.5, 0.0]), (steps, 1)),
+        TERMINATED: last & ends,
+        SUCCESS: np.zeros(steps, dtype=bool),
+    }
+    return Episode(7, columns, {})
+
+
+def kicks(count: int, episode: Episode) -> list[Episode]:
+    place, rng = replace(relocation(margin_m=0.3, rotations="any"), task=KICKING), np.random.default_rng(0)
+    moving = [KICKING.state, replace(KICKING.state, name=NEXT_STATE), KICKING.action]
+    copied = [place.copied(episode, moving, rng) for _ in range(count)]
+    return [copy for copy in copied if copy is not None]
+
+
+def test_a_ball_moves_with_its_robot() -> None:
+    episode = kick(12, 0.1)
+    made = kicks(100, episode)
+    assert len(made) == 100
+    turns = set()
+    for copy in made:
+        start, end = (KICKING.abstraction(copy.columns[name]) for name in (STATE, NEXT_STATE))
+        apart, heading = start[:, 4:6] - start[:, :2], copy.columns[STATE][:, 2:4]
+        distance = 0.2 + 0.1 * np.arange(len(copy))
+        np.testing.assert_allclose(apart, distance[:, None] * heading, atol=1e-5)
+        np.testing.assert_allclose(copy.columns[ACTION][:, :2], 0.3 * heading, atol=1e-6)
+        assert (copy.columns[ACTION][:, 2] == 1.0).all()
+        np.testing.assert_allclose(end[1:, 6:], 0.1 / KICKING.timestep_s * heading[1:], atol=1e-5)
+        turns.add(round(float(np.arctan2(heading[0, 1], heading[0, 0])), 2))
+    assert len(turns) > 80
+
+
+def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> None:
+    ends = {"goal": 0, "out": 0, "field": 0}
+    for copy in kicks(300, kick(12, 0.1)):
+        columns = copy.columns
+        x, y = KICKING.abstraction(columns[STATE])[0, 4:6]
+        assert -2.0 <= x < 1.5
+        assert abs(y) <= 2.0
+        end = KICKING.abstraction(columns[NEXT_STATE])
+        (*_, x), (*_, y) = end[:, 4], end[:, 5]
+        how = (
+            "goal" if x >= 1.5 and abs(y) <= 0.75 else "out" if x >= 1.5 or x < -2 or abs(y) > 2 else "field"
+        )
+        ends[how] += 1
+        assert columns[SUCCESS].tolist() == [False] * (len(copy) - 1) + [how == "goal"]
+        assert columns[TERMINATED].tolist() == [False] * (len(copy) - 1) + [how != "field"]
+        assert columns[TRUNCATED][-1] == (how == "field")
+        assert len(copy) == 12 or how != "field"
+        assert copy.metadata["failed"] == (how == "out")
+        # All but the end is paid by the metres that ball and robot come closer, less than 0.15 a step.
+        assert columns[REWARD][-1] == pytest.approx({"goal": 10, "out": -10, "field": 0}[how], abs=0.2)
+    assert min(ends.values()) > 10
+
+
+def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
+    made = kicks(50, kick(12, 0.0, ends=True))
+    assert {len(copy) for copy in made} == {11}
+    assert not any(copy.columns[TERMINATED].any() for copy in made)
+    assert kicks(3, kick(5, 0.0, ends=True)) == []
