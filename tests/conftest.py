@@ -61,5 +61,5 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     monkeypatch.setattr(condition, "read_description", fake_stages.read_description)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
-    monkeypatch.setattr("torch.set_num_threads", int)
+    monkeypatch.setattr("astra_data.experiments.run._prepare", fake_stages.prepare)
     return model

@@ -185,6 +185,14 @@ class FakeDataset:
         return ["a value was altered"] if (self.root / "altered").exists() else []
 
 
+def prepare(own_methods: Mapping[str, Any]) -> None:
+    """Make a process ready as a run does, without torch."""
+    if own_methods:
+        from astra_data.experiments.own_methods import add_all
+
+        add_all(own_methods)
+
+
 def collect(
     task: str, config: FakeCollectConfig, *, seed: int, out: Path, progress: Progress, num_threads: int
 ) -> None:
