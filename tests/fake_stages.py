@@ -3,6 +3,7 @@
 Spawned processes find them by name; nothing slow is imported.
 """
 
+import importlib
 import json
 import os
 import shutil
@@ -188,9 +189,7 @@ class FakeDataset:
 def prepare(own_methods: Mapping[str, Any]) -> None:
     """Make a process ready as a run does, without torch."""
     if own_methods:
-        from astra_data.experiments.own_methods import add_all
-
-        add_all(own_methods)
+        importlib.import_module("astra_data.experiments.own_methods").add_all(own_methods)
 
 
 def collect(
