@@ -154,8 +154,10 @@ _EXPECTED = {
 
 def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     location = error["loc"]
-    key = ".".join(str(part) for part in location if not _is_choice(part)) or "recipe"
     kind, message = error["type"], error["msg"]
+    if kind == "value_error" and not location:  # of the file as a whole; the message names the keys
+        return message.removeprefix("Value error, ")
+    key = ".".join(str(part) for part in location if not _is_choice(part)) or "recipe"
     if kind == "extra_forbidden":
         hint = _choice_hint(location, model) or _key_hint(
             str(location[-1]), _section(model, location[:-1]), model

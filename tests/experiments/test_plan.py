@@ -187,11 +187,11 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
             "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without "
             "effect: leave out _plus",
         ),
-        (HEAD.replace("7", "0"), "recipe: expected each of seeds once, got [0, 0]"),
-        (HEAD + "[sweep]\npercent = [5, 5]", "recipe: expected each of sweep.percent once, got [5, 5]"),
+        (HEAD.replace("7", "0"), "expected each of seeds once, got [0, 0]"),
+        (HEAD + "[sweep]\npercent = [5, 5]", "expected each of sweep.percent once, got [5, 5]"),
         (
             HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
-            "recipe: sweep.percent: 5 % of 9 episodes are none: expected more",
+            "sweep.percent: 5 % of 9 episodes are none: expected more",
         ),
         (HEAD.replace("[0, 7]", "[]"), "seeds: expected 1 or more, got none"),
     ],
