@@ -32,6 +32,7 @@ type Nested = (
 """A training state, such as an optimizer's `state_dict()`."""
 
 _SETTINGS = "config.json"
+"""Name of the file of the settings in a folder."""
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
@@ -140,7 +141,7 @@ def understood(
 def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds.
 
-    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than its
+    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than the
     settings: the next call yields it again with its contents, so that training can resume from its last
     checkpoint. With `replace` it begins empty instead; the older `out` is kept as `.<name>.old` until the new
     one is in its place.
@@ -152,7 +153,7 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
 
     Raises:
         BadInputError: `out` exists and `replace` is not set, or was begun with other settings.
-        DiskError: it cannot be written; the working folder stays.
+        DiskError: it cannot be written.
     """
     partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
     with writing(out):
@@ -165,15 +166,17 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
             if replace and folder.exists():
                 discard(folder, out)
         made = make_folder(partial)
-        clean(partial)
-        if config is not None:
-            _begin(partial, config)
         try:
+            clean(partial)
+            if config is not None:
+                _begin(partial, config)
             yield partial
         except BaseException:
-            if {path.name for path in partial.iterdir()} <= {_SETTINGS}:
-                discard(partial, out)
-                remove_empty(made)
+            # Not where an earlier call made it, which may be under way in another process.
+            with suppress(OSError):
+                if made and {path.name for path in partial.iterdir()} <= {_SETTINGS}:
+                    discard(partial, out)
+                    remove_empty(made)
             raise
         clean(partial)
         sync_tree(partial)

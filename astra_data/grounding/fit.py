@@ -219,8 +219,8 @@ def _fitted(
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     """Subtract the task's own reward on abstract states from the rewards in the windows of `episodes`.
 
-    Where abstract states show that the goal is reached, or out of reach, but the target goes on, there is no
-    residual: there the simulator ends the episode, and R_pred is not used.
+    Where abstract states show that the goal is reached, or out of reach, there is no residual, and no failure
+    to foresee: there the simulator ends the episode and pays, and R_pred is not used.
     """
     windows, objective = episodes.windows, task.objective
     before, after, goal = (
@@ -234,7 +234,7 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     residual = torch.stack(
         [
             torch.where(goes_on.bool(), going_on - own, 0.0),
-            torch.where(~decided & (failing != 0), failing - own, failing),
+            torch.where(~decided & (failing != 0), failing - own, 0.0),
         ],
         dim=-1,
     )

@@ -7,14 +7,13 @@ robot could have recorded, with three exceptions:
   that keep clear of the walls are copied, and the copies keep clear of them too.
 * The goal belongs to the maze and is not moved: every copy gets a goal of its own, drawn as the task draws
   it. The task computes the copy's rewards and ends; a copy ends where it reaches its goal. A ball is moved
-  with its robot, and an episode that ended by where its ball was is copied without that step.
+  with its robot; the step that ended its episode is not copied, for where the ball was may have ended it.
 * Commands. Where commands are clipped to ±1 m/s along each axis, a command that is rotated out of that square
   is no longer what the robot did; such rotations are drawn again.
 
 Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +30,10 @@ from astra_data.dataset.columns import (
     GOAL,
     NEXT_STATE,
     OUTCOME_COLUMNS,
+    REWARD,
     STATE,
+    SUCCESS,
+    TERMINATED,
     Column,
     Episode,
 )
@@ -39,7 +41,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.worlds.own_code import is_own_code
-from astra_data.worlds.plane.relocation import Relocation, Rotations
+from astra_data.worlds.plane.relocation import Copy, Relocation, Rotations
 from astra_data.worlds.registry import TASKS, task_named
 from astra_data.worlds.task import Task
 
@@ -171,7 +173,7 @@ def augment(
                     continue
                 purpose = f"{source.content_hash} {config.model_dump_json()} {episode.uid} {copy}"
                 uid = _free_uid(derive(seed, purpose), taken)
-                writer.add(replace(copied, uid=uid))
+                writer.add(_episode(uid, episode.uid, copied))
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
@@ -252,6 +254,26 @@ def _shares(
         copies[usable] = each
         copies[order[usable[order]][:more]] += 1
     return held_out, copies
+
+
+def _episode(uid: int, source: int, copied: Copy) -> Episode:
+    """Return a copy of the episode `source` with what is told of it."""
+    columns, change, steps = copied
+    return Episode(
+        uid,
+        columns,
+        {
+            "success": bool(columns[SUCCESS][-1]),
+            "failed": bool(columns[TERMINATED][-1] and not columns[SUCCESS][-1]),
+            "return": float(columns[REWARD].sum(dtype=np.float64)),
+            "held_out": False,
+            "source_episode": source,
+            "augmentation_first_step": int(steps.start),
+            "augmentation_rotation_rad": change.rotation_rad,
+            "augmentation_x_m": change.shift_m[0],
+            "augmentation_y_m": change.shift_m[1],
+        },
+    )
 
 
 def _free_uid(uid: int, taken: set[int]) -> int:

@@ -99,6 +99,7 @@ def suggested(
             f"episodes: expected at most {config.proposals}, the proposals, got {config.episodes}"
         )
     proposals = drawn(task, config, seed)
+    torch.manual_seed(derive(seed, "proposed rollouts"))
     rollouts = committee.follow(proposals.start, proposals.goal, proposals.action, part(progress, 0.0, 0.9))
     every = max(1, round(_COMPARED_S / task.timestep_s))
     features = torch.cat([rollouts.state, proposals.action], dim=-1)

@@ -43,6 +43,27 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     assert residual.goes_on[0, :4].tolist() == [1.0, 0.0, 0.0, 0.0]
 
 
+def test_balls_that_leave_the_field_are_no_failures_to_foresee() -> None:
+    """Steps: the ball leaves the field, the robot falls."""
+    task, goal = TASKS["nao-kick"], torch.tensor([1.5, 0.0])
+    before = torch.zeros(1, 2, 8)
+    after = before.clone()
+    before[0, 0, 5], after[0, 0, 5] = 1.95, 2.05
+    failing = torch.tensor([[-10.1, -9.9]])
+    given = toy_episodes(
+        before,
+        torch.zeros(1, 2, 3),
+        next_state=after,
+        goal=goal.expand(1, 2, 2),
+        parts=torch.stack([torch.zeros(1, 2), failing], dim=-1),
+        reward=failing,
+        terminated=torch.ones(1, 2, dtype=torch.bool),
+    )
+    residual = residual_rewards(task, given).windows
+    assert residual.reward[0, :, 1].tolist() == pytest.approx([0.0, -9.9])
+    assert residual.goes_on.sum() == 0
+
+
 def episodes(seed: int, count: int = 4) -> PairedEpisodes:
     """Return episodes of 10 steps whose simulator lacks a constant and noise; the last step of one fails."""
     generator = torch.Generator().manual_seed(seed)

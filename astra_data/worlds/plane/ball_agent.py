@@ -10,10 +10,12 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.states import PlanarStates
 
 _LIES_M_S = 0.15
-"""A corrected ball slower than this is put back to rest where it was before the step: it would roll on for at
-most 4 cm, and a robot's estimate of the speed is never quite zero."""
+"""A ball that is not faster lies: it would roll on for at most 4 cm, and a robot's estimate of its speed is
+never quite zero."""
 _LEAVES_M_S = 0.5
-"""Speed at which a correction sets a ball rolling that lay, if it says no more."""
+"""Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
+_NOTHING_M_S = 0.05
+"""Corrections to less than this set no ball rolling: scatter alone is as fast."""
 
 
 class BallAgent(PlanarStates):
@@ -24,9 +26,10 @@ class BallAgent(PlanarStates):
     the line between the centres, one that the mass walks into at another. Left out: the legs, the positions
     and timing of the feet, and the robot's heading.
 
-    Corrections move only balls that rolled or were touched in the step, and leave none at less than 0.15 m/s.
-    Whether one sets a ball rolling that lay is drawn, such that the expected speed is kept: an expected
-    correction mixes balls that are hit with others that are missed into one that creeps, or never moves.
+    Corrections move only balls that rolled or were touched in the step. Those that rolled go on as corrected,
+    or lie again if that is slow. Whether one that lay starts to roll is drawn, such that the speed expected
+    after the step is the corrected one: an expected correction mixes balls that are hit with others that are
+    missed into one that creeps, or never moves.
     """
 
     state_size = 8
@@ -97,16 +100,16 @@ class BallAgent(PlanarStates):
         return self.state
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the masses to `landed` (B, 8), and move the balls as far as they can: see the class."""
+        """Slide masses to `landed` (B, 8); move the balls, or draw whether they move: see the class."""
         moved = super().settle(before, landed)
-        velocity = moved[:, 6:]
-        speed = velocity.norm(dim=-1, keepdim=True)
+        speed = moved[:, 6:].norm(dim=-1, keepdim=True)
         lay = before[:, 6:].norm(dim=-1, keepdim=True) <= _LIES_M_S
-        is_hit = torch.rand_like(speed) < speed / _LEAVES_M_S
-        leaving = velocity / speed.clamp_min(1e-9) * _LEAVES_M_S
-        hit = roll(before[:, 4:6], leaving, self.period_s, self._deceleration_m_s2)
-        still = torch.cat([before[:, 4:6], torch.zeros_like(velocity)], dim=-1)
+        leaving = moved[:, 6:] / speed.clamp_min(1e-9) * _LEAVES_M_S
+        hit = torch.cat(roll(before[:, 4:6], leaving, self.period_s, self._deceleration_m_s2), dim=-1)
+        left = hit[:, 2:].norm(dim=-1, keepdim=True)
+        is_hit = (speed > _NOTHING_M_S) & (torch.rand_like(speed) * left < speed)
+        still = torch.cat([before[:, 4:6], torch.zeros_like(leaving)], dim=-1)
         rolls = self._rolls & torch.where(lay, is_hit, speed > _LIES_M_S)
-        ball = torch.where(lay & (speed < _LEAVES_M_S), torch.cat(hit, dim=-1), moved[:, 4:])
+        ball = torch.where(lay & (speed < left), hit, moved[:, 4:])
         self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, ball, still)], dim=-1))
         return self.state

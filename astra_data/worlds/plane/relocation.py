@@ -1,8 +1,8 @@
 """Candidate placements of an episode elsewhere in its maze, and its rewards and outcome there."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -39,6 +39,14 @@ def positions(task: Task, states: Array) -> Array:
     return np.ascontiguousarray(task.abstraction(states)[:, group])
 
 
+class Copy(NamedTuple):
+    """A moved part of an episode: its columns, how they were moved, and its steps of the episode."""
+
+    columns: dict[str, Array]
+    change: PlanarMap
+    steps: slice
+
+
 @dataclass(frozen=True)
 class Relocation:
     """How segments of episodes may be moved within the maze of `task`.
@@ -66,14 +74,14 @@ class Relocation:
         edges = np.flatnonzero(np.diff(free, prepend=False, append=False)).reshape(-1, 2)
         return [(int(first), int(end)) for first, end in edges if end - first >= self.min_steps]
 
-    def draw(self, episode: Episode, rng: np.random.Generator) -> tuple[PlanarMap, slice] | None:
-        """Draw a segment of `episode`, which must have one, and a placement for it.
+    def placements(self, episode: Episode, rng: np.random.Generator) -> Iterator[tuple[PlanarMap, slice]]:
+        """Draw segments of `episode`, in proportion to their lengths, and a placement for each.
 
-        Segments are drawn in proportion to their lengths. None where no placement was found.
+        There is one for each of `tries` rotations that has one, and none if it has no segment.
         """
         stretches = self.stretches(episode)
         lengths = np.array([end - first for first, end in stretches])
-        for _ in range(self.tries):
+        for _ in range(self.tries if stretches else 0):
             steps = slice(*stretches[rng.choice(len(stretches), p=lengths / lengths.sum())])
             turn = self._draw_turn(rng)
             if not self._is_commanded(turn, episode.columns[ACTION][steps]):
@@ -85,14 +93,13 @@ class Relocation:
             fits = self._is_free((path + shifts[:, None]).astype(np.float32)).all(axis=1)
             if fits.any():
                 x, y = shifts[fits.argmax()]
-                return PlanarMap(turn.rotation_rad, (float(x), float(y))), steps
-        return None
+                yield PlanarMap(turn.rotation_rad, (float(x), float(y))), steps
 
-    def copied(self, episode: Episode, moving: Sequence[Column], rng: np.random.Generator) -> Episode | None:
-        """Return a moved part of `episode`, with a goal of its own, judged by the task; None without room.
+    def copied(self, episode: Episode, moving: Sequence[Column], rng: np.random.Generator) -> Copy | None:
+        """Move a part of `episode`, with a goal of its own, judged by the task; None where there is no room.
 
-        Its uid is still that of `episode`. It begins with its ball, if there is one, neither in the goal nor
-        out of the field.
+        With a ball, the step that ended the episode is left out, for where the ball was may have ended it,
+        and the copy begins with the ball neither in the goal nor out of the field.
 
         Args:
             episode: to be copied.
@@ -102,39 +109,19 @@ class Relocation:
         world, movable = self.task, episode
         if world.ball_index is not None and episode.columns[TERMINATED][-1]:
             movable = replace(episode, columns={name: each[:-1] for name, each in episode.columns.items()})
-            if not self.stretches(movable):
-                return None
-        for _ in range(self.tries):
-            drawn = self.draw(movable, rng)
-            if drawn is None:
-                return None
-            change, steps = drawn
+        for change, steps in self.placements(movable, rng):
             cut = {name: values[steps] for name, values in movable.columns.items()}
             moved = {column.name: change.of_column(column, cut[column.name]) for column in moving}
             goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
             columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
             before, after = (np.asarray(world.abstraction(columns[name])) for name in (STATE, NEXT_STATE))
             if world.ball_index is None or not _is_decided(world.objective, before[0], goal):
-                break
-        else:
-            return None
-        judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
-        length = len(judged[DONE])
-        return Episode(
-            episode.uid,
-            {name: values[:length] for name, values in columns.items()} | judged,
-            {
-                "success": bool(judged[SUCCESS][-1]),
-                "failed": bool(judged[TERMINATED][-1] and not judged[SUCCESS][-1]),
-                "return": float(judged[REWARD].sum(dtype=np.float64)),
-                "held_out": False,
-                "source_episode": episode.uid,
-                "augmentation_first_step": int(steps.start),
-                "augmentation_rotation_rad": change.rotation_rad,
-                "augmentation_x_m": change.shift_m[0],
-                "augmentation_y_m": change.shift_m[1],
-            },
-        )
+                judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
+                length = len(judged[DONE])
+                return Copy(
+                    {name: values[:length] for name, values in columns.items()} | judged, change, steps
+                )
+        return None
 
     def _is_free(self, points: Array) -> Array:
         return self.task.maze.clearance(points) > self.margin_m

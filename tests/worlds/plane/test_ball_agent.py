@@ -160,16 +160,39 @@ def test_a_correction_that_all_but_stops_a_ball_leaves_it_where_it_was() -> None
     assert torch.equal(settled[1, 4:], landed[1, 4:])
 
 
-def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_speed() -> None:
-    simulator, count = one(20_000), 20_000
+@pytest.mark.parametrize("before_m_s", [0.0, 0.1])
+@pytest.mark.parametrize("friction", [1.0, 2.0])
+def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_speed(
+    before_m_s: float, friction: float
+) -> None:
+    count = 20_000
+    simulator = VariedPlanar(one(count), BallVariation(ball_friction=(friction, friction)))
+    start = START.clone()
+    start[0, 7] = before_m_s  # an estimate of a ball that lies
+    simulator.reset_to(start.expand(count, 8))
     simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
     landed = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.3, 0.1, 0.06, -0.08]]).expand(count, 8)
     torch.manual_seed(0)
-    ball = simulator.settle(START.expand(count, 8), landed)[:, 4:]
+    ball = simulator.settle(start.expand(count, 8), landed)[:, 4:]
+    torch.testing.assert_close(ball[:, 2:].mean(0), landed[0, 6:], atol=0.003, rtol=0.0)
     hit = ball[:, 2:].norm(dim=-1) > 0
-    # A fifth of 0.5 m/s. The ball is slowed by 0.3 m/s² in the 0.2 s that it rolls.
-    assert hit.float().mean().item() == pytest.approx(0.2, abs=0.01)
-    way = 0.5 * 0.2 - 0.3 * 0.2**2 / 2
-    expected = torch.tensor([0.22 + 0.6 * way, -0.8 * way, 0.6 * 0.44, -0.8 * 0.44])
+    # It leaves at 0.5 m/s, and is slowed by 0.3 m/s² in the 0.2 s that it rolls.
+    slowed = 0.3 * friction
+    speed, way = 0.5 - slowed * 0.2, 0.5 * 0.2 - slowed * 0.2**2 / 2
+    expected = torch.tensor([0.22 + 0.6 * way, -0.8 * way, 0.6 * speed, -0.8 * speed])
     torch.testing.assert_close(ball[hit], expected.expand(int(hit.sum()), 4))
-    assert torch.equal(ball[~hit], START[:, 4:].expand(int((~hit).sum()), 4))
+    assert torch.equal(ball[~hit], torch.tensor([[0.22, 0.0, 0.0, 0.0]]).expand(int((~hit).sum()), 4))
+
+
+def test_a_correction_as_slow_as_scatter_sets_no_ball_rolling() -> None:
+    simulator, count = one(2000), 2000
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
+    landed = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.3, 0.1, 0.04, 0.02]]).expand(count, 8)
+    assert torch.equal(simulator.settle(START.expand(count, 8), landed)[:, 4:], START[:, 4:].expand(count, 4))
+
+
+def test_a_fast_correction_is_taken_over() -> None:
+    simulator = one()
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]))
+    landed = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.3, 0.1, 0.0, 0.46]])
+    assert torch.equal(simulator.settle(START, landed), landed)

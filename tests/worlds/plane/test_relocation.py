@@ -60,7 +60,7 @@ def test_only_what_keeps_its_distance_may_move() -> None:
 
 def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:  # noqa: ANN401
     rng = np.random.default_rng(0)
-    drawn = [relocation(**changes).draw(episode, rng) for _ in range(count)]
+    drawn = [next(relocation(**changes).placements(episode, rng), None) for _ in range(count)]
     assert None not in drawn
     return drawn
 
@@ -106,12 +106,11 @@ def test_without_rotation_the_bearing_stays() -> None:
 def test_what_fits_nowhere_is_given_up() -> None:
     # Nine metres fit into a corridor, but not at right angles to it where they start.
     path = straight((-4.5, 4.0), (4.5, 4.0), 60)
-    change = relocation(translations=False, tries=50).draw(path, np.random.default_rng(0))
-    assert change is not None
-    assert change[0].rotation_rad == 0.0
+    change, _ = next(relocation(translations=False, tries=50).placements(path, np.random.default_rng(0)))
+    assert change.rotation_rad == 0.0
     long = straight((-4.5, 4.0), (4.5, 4.0), 60)
     long.columns[ACTION][:] = 2.0
-    assert relocation(tries=5).draw(long, np.random.default_rng(0)) is None
+    assert list(relocation(tries=5).placements(long, np.random.default_rng(0))) == []
 
 
 @pytest.mark.parametrize(("toppled_at", "length", "success"), [(None, 16, True), (9, 10, False)])
@@ -120,7 +119,7 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
 ) -> None:
     # 0.1 m per step along the lower corridor; within 0.45 m of the goal from step 15 on.
     path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
-    before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
+    before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
     toppled = np.arange(30) == toppled_at
     judged = outcomes(TASK.objective, before, after, AIM, toppled)
     assert {len(values) for values in judged.values()} == {length}
@@ -134,7 +133,7 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
 
 def test_an_episode_that_just_stops_is_truncated() -> None:
     path = straight((4.0, 4.0), (3.0, 4.0), 10)
-    before, after = (positions(TASK, path.columns[name]) for name in (STATE, NEXT_STATE))
+    before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
     judged = outcomes(TASK.objective, before, after, AIM, np.zeros(10, dtype=bool))
     assert judged["next.truncated"].tolist() == judged["next.done"].tolist() == [False] * 9 + [True]
     assert not judged["next.terminated"].any()
@@ -158,25 +157,24 @@ def kick(steps: int, ball_m: float, *, ends: bool = False) -> Episode:
     return Episode(7, columns, {})
 
 
-def kicks(count: int, episode: Episode) -> list[Episode]:
+def kicks(count: int, episode: Episode) -> list[dict[str, Array]]:
     place, rng = replace(relocation(margin_m=0.3, rotations="any"), task=KICKING), np.random.default_rng(0)
     moving = [KICKING.state, replace(KICKING.state, name=NEXT_STATE), KICKING.action]
     copied = [place.copied(episode, moving, rng) for _ in range(count)]
-    return [copy for copy in copied if copy is not None]
+    return [copy.columns for copy in copied if copy is not None]
 
 
 def test_a_ball_moves_with_its_robot() -> None:
-    episode = kick(12, 0.1)
-    made = kicks(100, episode)
+    made = kicks(100, kick(12, 0.1))
     assert len(made) == 100
     turns = set()
-    for copy in made:
-        start, end = (KICKING.abstraction(copy.columns[name]) for name in (STATE, NEXT_STATE))
-        apart, heading = start[:, 4:6] - start[:, :2], copy.columns[STATE][:, 2:4]
-        distance = 0.2 + 0.1 * np.arange(len(copy))
+    for columns in made:
+        start, end = (KICKING.abstraction(columns[name]) for name in (STATE, NEXT_STATE))
+        apart, heading = start[:, 4:6] - start[:, :2], columns[STATE][:, 2:4]
+        distance = 0.2 + 0.1 * np.arange(len(start))
         np.testing.assert_allclose(apart, distance[:, None] * heading, atol=1e-5)
-        np.testing.assert_allclose(copy.columns[ACTION][:, :2], 0.3 * heading, atol=1e-6)
-        assert (copy.columns[ACTION][:, 2] == 1.0).all()
+        np.testing.assert_allclose(columns[ACTION][:, :2], 0.3 * heading, atol=1e-6)
+        assert (columns[ACTION][:, 2] == 1.0).all()
         np.testing.assert_allclose(end[1:, 6:], 0.1 / KICKING.timestep_s * heading[1:], atol=1e-5)
         turns.add(round(float(np.arctan2(heading[0, 1], heading[0, 0])), 2))
     assert len(turns) > 80
@@ -184,29 +182,47 @@ def test_a_ball_moves_with_its_robot() -> None:
 
 def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> None:
     ends = {"goal": 0, "out": 0, "field": 0}
-    for copy in kicks(300, kick(12, 0.1)):
-        columns = copy.columns
+    for columns in kicks(300, kick(12, 0.1)):
         x, y = KICKING.abstraction(columns[STATE])[0, 4:6]
         assert -2.0 <= x < 1.5
         assert abs(y) <= 2.0
         end = KICKING.abstraction(columns[NEXT_STATE])
-        (*_, x), (*_, y) = end[:, 4], end[:, 5]
-        how = (
-            "goal" if x >= 1.5 and abs(y) <= 0.75 else "out" if x >= 1.5 or x < -2 or abs(y) > 2 else "field"
-        )
+        x, y = end[-1, 4:6]
+        is_out = x >= 1.5 or x < -2 or abs(y) > 2
+        how = "goal" if x >= 1.5 and abs(y) <= 0.75 else "out" if is_out else "field"
         ends[how] += 1
-        assert columns[SUCCESS].tolist() == [False] * (len(copy) - 1) + [how == "goal"]
-        assert columns[TERMINATED].tolist() == [False] * (len(copy) - 1) + [how != "field"]
-        assert columns[TRUNCATED][-1] == (how == "field")
-        assert len(copy) == 12 or how != "field"
-        assert copy.metadata["failed"] == (how == "out")
+        before = [False] * (len(end) - 1)
+        assert columns[SUCCESS].tolist() == [*before, how == "goal"]
+        assert columns[TERMINATED].tolist() == [*before, how != "field"]
+        assert columns[TRUNCATED].tolist() == [*before, how == "field"]
+        assert len(end) == 12 or how != "field"
         # All but the end is paid by the metres that ball and robot come closer, less than 0.15 a step.
         assert columns[REWARD][-1] == pytest.approx({"goal": 10, "out": -10, "field": 0}[how], abs=0.2)
     assert min(ends.values()) > 10
 
 
+def test_a_ball_that_can_only_begin_in_the_goal_is_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(KICKING.objective), "reached", lambda _, state, goal: state[:, 0] == state[:, 0])
+    assert kicks(3, kick(12, 0.1)) == []
+
+
 def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
     made = kicks(50, kick(12, 0.0, ends=True))
-    assert {len(copy) for copy in made} == {11}
-    assert not any(copy.columns[TERMINATED].any() for copy in made)
+    assert {len(columns[TERMINATED]) for columns in made} == {11}
+    assert not any(columns[TERMINATED].any() for columns in made)
     assert kicks(3, kick(5, 0.0, ends=True)) == []
+
+
+def test_a_topple_of_a_robot_without_a_ball_is_copied() -> None:
+    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
+    last = np.arange(20) == 19
+    columns = path.columns | {
+        GOAL: np.tile(AIM, (20, 1)),
+        TERMINATED: last,
+        SUCCESS: np.zeros(20, dtype=bool),
+    }
+    moving = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action]
+    copied = relocation().copied(Episode(0, columns), moving, np.random.default_rng(0))
+    assert copied is not None and copied.steps == slice(0, 20)
+    assert copied.columns[TERMINATED].tolist() == last.tolist()
+    assert copied.columns[REWARD][-1] == pytest.approx(-10.0, abs=0.1)
