@@ -32,6 +32,7 @@ from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
 EDGES_M = (0.0, 0.17, 0.20, 0.23, 0.27, 0.35)
+"""Of distances from the ball; the simulator's kicks reach as far as the last."""
 STEPS = 12
 """After the beginning of a kick, 2.3 s of the NAO, that are looked at."""
 AT_REST_M_S, MOVED_M = 0.15, 0.15
@@ -61,7 +62,7 @@ def main(
     lines = []
     for low, high in pairwise(EDGES_M):
         there = (distance >= low) & (distance < high)
-        cells = [cell for ways in way.values() for cell in told(ways[..., there])]
+        cells = [cell for ways in way.values() for cell in share_and_way(ways[..., there])]
         lines.append([f"{low:.2f} to {high:.2f}", f"{int(there.sum())}", *cells])
     print(table(["distance of the ball in m", "kicks", *columns], lines), "\n")
     print(table(["grounding", "careful kicker"], reached))
@@ -73,8 +74,9 @@ def kicks(windows: PairedWindows) -> tuple[Moments, Tensor]:
     asked = asks_to_kick(windows.action.flatten(0, 1)).view(windows.mask.shape)
     begins = torch.zeros_like(asked)
     begins[:, 1:-STEPS] = asked[:, 1:-STEPS] & ~asked[:, : -STEPS - 1] & windows.mask[:, 1 + STEPS :].bool()
-    at = begins & (rolling.norm(dim=-1) < AT_REST_M_S)
-    return Moments(windows, *at.nonzero(as_tuple=True)), (robot - ball).norm(dim=-1)[at]
+    distance = (robot - ball).norm(dim=-1)
+    at = begins & (rolling.norm(dim=-1) < AT_REST_M_S) & (distance < EDGES_M[-1])
+    return Moments(windows, *at.nonzero(as_tuple=True)), distance[at]
 
 
 @torch.no_grad()
@@ -91,10 +93,11 @@ def replayed(task: Task, made: HistoryGrounding, moments: Moments) -> Tensor:
     return torch.stack(ways)
 
 
-def told(way: Tensor) -> tuple[str, str]:
+def share_and_way(way: Tensor) -> tuple[str, str]:
     """Return which share of kicks moves the ball, and how far those do on average, in m."""
     moved = way > MOVED_M
-    return f"{moved.float().mean():.2f}", f"{way[moved].mean():.2f}"
+    share = f"{moved.float().mean():.2f}" if moved.numel() else "-"
+    return share, f"{way[moved].mean():.2f}" if moved.any() else "-"
 
 
 if __name__ == "__main__":

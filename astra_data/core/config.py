@@ -154,10 +154,10 @@ _EXPECTED = {
 
 def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     location = error["loc"]
-    kind, message = error["type"], error["msg"]
-    if kind == "value_error" and not location:  # of the file as a whole; the message names the keys
-        return message.removeprefix("Value error, ")
-    key = ".".join(str(part) for part in location if not _is_choice(part)) or "recipe"
+    kind, message = error["type"], error["msg"].removeprefix("Value error, ")
+    if not location:  # the message names the keys
+        return message
+    key = ".".join(str(part) for part in location if not _is_choice(part))
     if kind == "extra_forbidden":
         hint = _choice_hint(location, model) or _key_hint(
             str(location[-1]), _section(model, location[:-1]), model
@@ -171,7 +171,7 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{key}: expected a value, but the key is missing"
     if kind == "value_error":
-        return f"{key}: {message.removeprefix('Value error, ')}"
+        return f"{key}: {message}"
     if kind == "too_short":
         least, got = error["ctx"]["min_length"], error["ctx"]["actual_length"]
         return f"{key}: expected {least} or more, got {got or 'none'}"

@@ -132,7 +132,7 @@ def evaluate(
     }
     tensors: dict[str, Tensor] = {}
     if world.has_target:
-        figures, tensors = _in_target(world, row, config, seed, asked, num_threads, progress)
+        figures, tensors = _tested_in_target(world, row, config, seed, asked, num_threads, progress)
         results |= figures
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
@@ -166,7 +166,8 @@ class _Row:
     Attributes:
         begin: starts it in simulators. robots: start it in the target, by the encoder it is deployed with.
         headline: the encoder whose figures are the row's. simulators: the one that it was trained in, if any.
-        shown_abstract: whether it sees abstract states, and so can act in simulators. facts: to be reported.
+        shown_abstract: whether it sees abstract states, and so can act in simulators.
+        is_policy: whether it was trained. facts: to be reported.
     """
 
     begin: Begin
@@ -174,11 +175,13 @@ class _Row:
     headline: EncoderKind
     simulators: dict[str, SimulatorEnv]
     shown_abstract: bool
+    is_policy: bool
     facts: dict[str, Any]
 
 
 def _follower(task: Task) -> _Row:
-    return _Row(partial(careful, task), {"source": partial(_careful_in_target, task)}, "source", {}, True, {})
+    robot: Begin = partial(_careful_in_target, task)
+    return _Row(partial(careful, task), {"source": robot}, "source", {}, True, False, {})
 
 
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
@@ -205,11 +208,12 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
         headline,
         simulators,
         trained.observed == "abstract",
+        True,
         facts,
     )
 
 
-def _in_target(
+def _tested_in_target(
     task: Task,
     row: _Row,
     config: EvaluateConfig,
@@ -234,7 +238,7 @@ def _in_target(
     }
     headline = tested[row.headline]
     figures: dict[str, Any] = {}
-    if row.facts:
+    if row.is_policy:
         figures["encoders"] = {
             kind: {
                 score.measure: fmean(episodes.outcome.to_json()[score.measure])

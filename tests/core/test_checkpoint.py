@@ -192,14 +192,34 @@ def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("config", [None, "1"])
-def test_a_failure_before_anything_is_made_leaves_nothing(tmp_path: Path, config: str | None) -> None:
+@pytest.mark.parametrize("error", [BadInputError("no episodes"), KeyboardInterrupt()])
+def test_a_failure_before_anything_is_made_leaves_nothing(
+    tmp_path: Path, config: str | None, error: BaseException
+) -> None:
     (tmp_path / "train").mkdir()
     with (
-        pytest.raises(BadInputError, match="no episodes"),
+        pytest.raises(type(error)),
         finished_folder(tmp_path / "train" / "astra" / "seed_0", config=config),
     ):
-        raise BadInputError("no episodes")
+        raise error
     assert [path.name for path in tmp_path.rglob("*")] == ["train"]
+
+
+def test_the_folder_of_another_that_is_under_way_stays(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with (
+        finished_folder(out, config="1"),
+        pytest.raises(BadInputError, match="no episodes"),
+        finished_folder(out, config="1"),
+    ):
+        raise BadInputError("no episodes")
+    assert (out / "config.json").read_text() == "1"
+
+
+def test_a_folder_that_is_gone_hides_no_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="the true error"), finished_folder(tmp_path / "out") as folder:
+        folder.rmdir()
+        raise ValueError("the true error")
 
 
 def test_a_folder_begun_without_a_config_is_refused(tmp_path: Path) -> None:
