@@ -3,7 +3,6 @@
 Spawned processes find them by name; nothing slow is imported.
 """
 
-import importlib
 import json
 import os
 import shutil
@@ -187,9 +186,7 @@ class FakeDataset:
 
 
 def prepare(own_methods: Mapping[str, Any]) -> None:
-    """Make a process ready as a run does, without torch."""
-    if own_methods:
-        importlib.import_module("astra_data.experiments.own_methods").add_all(own_methods)
+    """Leave out what takes the processes of a run long: to import torch."""
 
 
 def collect(

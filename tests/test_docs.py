@@ -226,6 +226,18 @@ def test_the_checks_call_the_test_command() -> None:
     assert TEST in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"])
+def test_links_of_pages_that_are_not_in_the_site_lead_somewhere(page: str) -> None:
+    links = re.findall(r"\]\((?!https?:)([^)#]*)(?:#([^)]+))?\)", (ROOT / page).read_text())
+    assert links or page == "SECURITY.md"
+    for name, heading in links:
+        file = ROOT / (name or page)
+        assert file.exists(), f"{page}: {name}"
+        if heading:
+            titles = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
+            assert heading in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 def test_the_readme_is_one_screen() -> None:
     assert len(README.split()) <= 1200
 

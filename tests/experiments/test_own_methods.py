@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
+from astra_data.experiments import run
 from astra_data.experiments.own_methods import OwnMethod, add_all, looked_up
 from astra_data.methods import METHODS
 
@@ -42,6 +43,13 @@ def test_those_that_it_does_not_have_are_refused_before_anything_runs() -> None:
 def test_all_of_a_recipe_are_added_as_recipe_json_has_them() -> None:
     add_all({"one": DELTA, "other": {"method": ENSEMBLE}})
     assert {"one", "other"} <= METHODS.keys()
+
+
+def test_the_process_of_an_item_knows_them_and_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+    monkeypatch.setattr("torch.set_num_threads", told.append)
+    run._prepare({"one": OwnMethod.model_validate(DELTA)})
+    assert "one" in METHODS and told == [1]
 
 
 def test_files_are_looked_up_beside_the_recipe() -> None:

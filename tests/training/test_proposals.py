@@ -1,3 +1,6 @@
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -6,7 +9,7 @@ from small_cart import TASK
 from toy_corrections import OFFSETS_M, shifted
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.committee import Committee
+from astra_data.grounding.committee import Committee, Rollouts
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.training.proposals import SuggestConfig, chosen, drawn, planned, suggested
 from astra_data.worlds.registry import TASKS
@@ -65,6 +68,21 @@ def test_starts_are_anywhere_in_a_maze_and_only_there() -> None:
     assert anywhere[:, :2].std(0).min() > 2 * usual[:, :2].std(0).max()
     with pytest.raises(BadInputError, match="expected a task in a maze"):
         drawn(TASK, CONFIG.model_copy(update={"start": "anywhere"}), 0)
+
+
+def test_what_a_simulator_draws_is_of_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a ball may start to roll."""
+    committee = Committee.of(TASK, [HistoryGrounding(shifted(*OFFSETS_M))])
+    follow = Committee.follow
+
+    def drawn_too(self: Committee, *given: Any) -> Rollouts:  # noqa: ANN401 - handed on
+        known = follow(self, *given)
+        return replace(known, information=torch.rand_like(known.information))
+
+    monkeypatch.setattr(Committee, "follow", drawn_too)
+    first = suggested(TASK, committee, CONFIG, seed=1)
+    torch.rand(3)
+    assert suggested(TASK, committee, CONFIG, seed=1).taken.tolist() == first.taken.tolist()
 
 
 def test_a_suggestion_is_what_was_taken_of_the_proposals() -> None:
