@@ -149,8 +149,8 @@ def kick(steps: int, ball_m: float, *, ends: bool = False) -> Episode:
     columns = {
         STATE: state[:-1].copy(),
         NEXT_STATE: state[1:].copy(),
-        ACTION: np.tile(np.float32([0.3, 0.0, 1.0]), (steps, 1)),
-        GOAL: np.tile(np.float32([1.5, 0.0]), (steps, 1)),
+        ACTION: np.tile(np.array([0.3, 0.0, 1.0], np.float32), (steps, 1)),
+        GOAL: np.tile(np.array([1.5, 0.0], np.float32), (steps, 1)),
         TERMINATED: last & ends,
         SUCCESS: np.zeros(steps, dtype=bool),
     }
@@ -216,7 +216,8 @@ def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
 def test_a_topple_of_a_robot_without_a_ball_is_copied() -> None:
     path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
     last = np.arange(20) == 19
-    columns = path.columns | {
+    columns = {
+        **path.columns,
         GOAL: np.tile(AIM, (20, 1)),
         TERMINATED: last,
         SUCCESS: np.zeros(20, dtype=bool),
