@@ -20,6 +20,7 @@ def validate(
     from astra_data.dataset.doctor.check import check
     from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
     from astra_data.dataset.endings import endings_of
+    from astra_data.dataset.opening import can_be_repaired
     from astra_data.dataset.reader import Dataset
     from astra_data.dataset.versions import locate
 
@@ -32,9 +33,9 @@ def validate(
     if report.faults:
         count = "1 fault" if report.fault_count == 1 else f"{report.fault_count} faults"
         message = "\n  ".join([f"{root} has {count}:", *report.faults])
-        raise CorruptDatasetError(
-            f"{message}\nTo save its whole episodes: astra-data repair {root} --out DIR"
-        )
+        if can_be_repaired(root):
+            message += f"\nTo save its whole episodes: astra-data repair {root} --out DIR"
+        raise CorruptDatasetError(message)
     typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
     try:
         whole = Dataset.open(root)

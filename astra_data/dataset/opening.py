@@ -6,6 +6,7 @@ from pathlib import Path
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.plain import read_object
 
 
 def refuse_others(root: Path) -> None:
@@ -24,8 +25,17 @@ def explained(root: Path) -> Iterator[None]:
         yield
     except (CorruptDatasetError, KeyError) as error:
         fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
+        others = " or run the stage that wrote it again"
+        if can_be_repaired(root):
+            others = (
+                ", run the stage that wrote it again, or save what is whole of it: "
+                f"`astra-data repair {root} --out FOLDER`"
+            )
         raise CorruptDatasetError(
-            f"{root} is incomplete or was altered: {fault}. "
-            f"Restore it from a copy, run the stage that wrote it again, or save what is whole of it: "
-            f"`astra-data repair {root} --out FOLDER`."
+            f"{root} is incomplete or was altered: {fault}. Restore it from a copy{others}."
         ) from error
+
+
+def can_be_repaired(root: Path) -> bool:
+    """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
+    return not isinstance(read_object(root / INFO_PATH), str)

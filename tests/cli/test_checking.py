@@ -36,6 +36,17 @@ def test_validate_and_repair(
     assert run(monkeypatch, "validate", tmp_path / "saved") == 0
 
 
+def test_repair_is_not_advised_where_it_cannot_help(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    (root / "meta/info.json").write_text("{")
+    assert run(monkeypatch, "validate", root) == 1
+    told = capsys.readouterr().err
+    assert "meta/info.json is no JSON object" in told and "repair" not in told
+    assert run(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
+
+
 def test_validate_counts_all_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
