@@ -43,7 +43,7 @@ def test_repair_is_not_advised_where_it_cannot_help(
     (root / "meta/info.json").write_text("{")
     assert run(monkeypatch, "validate", root) == 1
     told = capsys.readouterr().err
-    assert "meta/info.json is no JSON object" in told and "repair" not in told
+    assert "meta/info.json is no JSON object" in told and "astra-data repair" not in told
     assert run(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
 
 
