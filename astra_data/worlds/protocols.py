@@ -133,4 +133,4 @@ class RememberingSimulator(Protocol):
     """A simulator whose next steps depend on more than its states."""
 
     memory: Tensor
-    """The memory that they depend on besides states, (B, M); `reset_to` and `settle` reset it."""
+    """The memory that they, and corrections, depend on besides states, (B, M); `reset_to` resets it."""

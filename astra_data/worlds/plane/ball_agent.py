@@ -16,6 +16,8 @@ _LEAVES_M_S = 0.5
 """Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
 _NOTHING_M_S = 0.05
 """Corrections to less than this set no ball rolling: scatter alone is as fast."""
+_FADES = 0.75
+"""Share of what was said of a hit that counts in the next step: a foot meets the ball within four steps."""
 
 
 class BallAgent(PlanarStates):
@@ -29,7 +31,12 @@ class BallAgent(PlanarStates):
     Corrections move only balls that rolled or were touched in the step. Those that rolled go on as corrected,
     or lie again if that is slow. Whether one that lay starts to roll is drawn, such that the speed expected
     after the step is the corrected one: an expected correction mixes balls that are hit with others that are
-    missed into one that creeps, or never moves.
+    missed into one that creeps, or never moves. It is drawn once for as long as the ball lies: what makes a
+    kick miss stays while nothing moves, and policies that kick from too far would else wait until it works.
+
+    Attributes:
+        memory: of each ball, how much of a hit has to be said before it rolls, in [0, 1), and how much
+            corrections have said of late, (B, 2).
     """
 
     state_size = 8
@@ -73,8 +80,20 @@ class BallAgent(PlanarStates):
             "kick_m_s": kick_m_s,
         }
         self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+        self.memory = self._undecided(num_envs)
         self._deceleration_m_s2: Tensor | float = ROLLING_M_S2
         self._contact_turn_rad: Tensor | float = 0.0
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, X); given `rows` are drawn for anew."""
+        super().reset_to(state, rows)
+        if rows is not None:
+            self.memory = self.memory.index_copy(0, rows, self._undecided(len(rows)))
+
+    def _undecided(self, count: int) -> Tensor:
+        """Return the memory (n, 2) of so many balls of which nothing has been said."""
+        device = self.state.device
+        return torch.cat([torch.rand(count, 1, device=device), torch.zeros(count, 1, device=device)], dim=-1)
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use the parameters of a `BallVariation` by name, (B, 1) each, from the next step on."""
@@ -107,9 +126,14 @@ class BallAgent(PlanarStates):
         leaving = moved[:, 6:] / speed.clamp_min(1e-9) * _LEAVES_M_S
         hit = torch.cat(roll(before[:, 4:6], leaving, self.period_s, self._deceleration_m_s2), dim=-1)
         left = hit[:, 2:].norm(dim=-1, keepdim=True)
-        is_hit = (speed > _NOTHING_M_S) & (torch.rand_like(speed) * left < speed)
+        says = self._rolls & lay & (speed > _NOTHING_M_S)
+        needed, said = self.memory.split(1, dim=-1)
+        said = _FADES * said + says * speed / left
+        is_hit = says & (said > needed)
         still = torch.cat([before[:, 4:6], torch.zeros_like(leaving)], dim=-1)
-        rolls = self._rolls & torch.where(lay, is_hit, speed > _LIES_M_S)
+        rolls = torch.where(lay, is_hit, self._rolls & (speed > _LIES_M_S))
+        undecided = self._undecided(self.num_envs)
+        self.memory = torch.where(rolls, undecided, torch.cat([needed, said], dim=-1))
         ball = torch.where(lay & (speed < left), hit, moved[:, 4:])
         self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, ball, still)], dim=-1))
         return self.state
