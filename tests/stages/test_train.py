@@ -190,7 +190,10 @@ def test_a_checkpoint_of_another_version_is_told(
         make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN)
 
 
-def test_what_was_begun_with_other_settings_is_left_alone(task: str, paired: Path, tmp_path: Path) -> None:
+def test_what_was_begun_with_other_settings_is_left_alone(
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
         make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
@@ -201,8 +204,14 @@ def test_what_was_begun_with_other_settings_is_left_alone(task: str, paired: Pat
 
 
 def test_what_was_begun_with_another_grounding_is_refused(
-    task: str, paired: Path, grounded: Path, grounded_anew: Path, tmp_path: Path
+    task: str,
+    paired: Path,
+    grounded: Path,
+    grounded_anew: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
         make(task, "nas", paired, grounded, tmp_path / "out", TRAIN, stop)
     with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):

@@ -171,7 +171,7 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
     state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
     goal = torch.tensor([[1.5, 0.0]]).expand(3, 2)
-    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+    one.load_state_dict(one.state_dict() | {"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
     latent = one.simulator.latent
     assert latent is not None
     action = torch.zeros(3, 3)

@@ -17,7 +17,7 @@ _LEAVES_M_S = 0.5
 _NOTHING_M_S = 0.05
 """Corrections to less than this set no ball rolling: scatter alone is as fast."""
 _FADES = 0.75
-"""Share of what was said of a hit that counts in the next step: a foot meets the ball within four steps."""
+"""Share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps."""
 
 
 class BallAgent(PlanarStates):
@@ -35,8 +35,8 @@ class BallAgent(PlanarStates):
     kick miss stays while nothing moves, and policies that kick from too far would else wait until it works.
 
     Attributes:
-        memory: of each ball, how much of a hit has to be said before it rolls, in [0, 1), and how much
-            corrections have said of late, (B, 2).
+        memory: of each ball, the evidence of a hit that it takes to roll, in [0, 1), and what corrections have
+            given of it of late, (B, 2).
     """
 
     state_size = 8
@@ -91,7 +91,7 @@ class BallAgent(PlanarStates):
             self.memory = self.memory.index_copy(0, rows, self._undecided(len(rows)))
 
     def _undecided(self, count: int) -> Tensor:
-        """Return the memory (n, 2) of so many balls of which nothing has been said."""
+        """Return the memory (n, 2) of so many balls of which there is no evidence."""
         device = self.state.device
         return torch.cat([torch.rand(count, 1, device=device), torch.zeros(count, 1, device=device)], dim=-1)
 
@@ -126,14 +126,14 @@ class BallAgent(PlanarStates):
         leaving = moved[:, 6:] / speed.clamp_min(1e-9) * _LEAVES_M_S
         hit = torch.cat(roll(before[:, 4:6], leaving, self.period_s, self._deceleration_m_s2), dim=-1)
         left = hit[:, 2:].norm(dim=-1, keepdim=True)
-        says = self._rolls & lay & (speed > _NOTHING_M_S)
-        needed, said = self.memory.split(1, dim=-1)
-        said = _FADES * said + says * speed / left
-        is_hit = says & (said > needed)
+        touched = self._rolls & lay & (speed > _NOTHING_M_S)
+        needed, evidence = self.memory.split(1, dim=-1)
+        evidence = _FADES * evidence + touched * speed / left
+        is_hit = touched & (evidence > needed)
         still = torch.cat([before[:, 4:6], torch.zeros_like(leaving)], dim=-1)
         rolls = torch.where(lay, is_hit, self._rolls & (speed > _LIES_M_S))
         undecided = self._undecided(self.num_envs)
-        self.memory = torch.where(rolls, undecided, torch.cat([needed, said], dim=-1))
+        self.memory = torch.where(rolls, undecided, torch.cat([needed, evidence], dim=-1))
         ball = torch.where(lay & (speed < left), hit, moved[:, 4:])
         self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, ball, still)], dim=-1))
         return self.state
