@@ -35,8 +35,8 @@ class BallAgent(PlanarStates):
     kick miss stays while nothing moves, and policies that kick from too far would else wait until it works.
 
     Attributes:
-        memory: of each ball, the evidence of a hit that it takes to roll, in [0, 1), and what corrections have
-            given of it of late, (B, 2).
+        memory: of each ball, the evidence of a hit that it takes to roll, in [0, 1), and what there was of
+            late, (B, 2).
     """
 
     state_size = 8
