@@ -7,7 +7,7 @@ own reward. Of a task without a target, there are the simulators alone.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -173,15 +173,15 @@ class _Row:
     begin: Begin
     robots: dict[EncoderKind, Begin]
     headline: EncoderKind
-    simulators: dict[str, SimulatorEnv]
-    shown_abstract: bool
-    is_policy: bool
-    facts: dict[str, Any]
+    simulators: dict[str, SimulatorEnv] = field(default_factory=dict)
+    shown_abstract: bool = True
+    is_policy: bool = False
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 def _follower(task: Task) -> _Row:
     robot: Begin = partial(_careful_in_target, task)
-    return _Row(partial(careful, task), {"source": robot}, "source", {}, True, False, {})
+    return _Row(partial(careful, task), {"source": robot}, "source")
 
 
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
@@ -207,9 +207,9 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
         robots,
         headline,
         simulators,
-        trained.observed == "abstract",
-        True,
-        facts,
+        shown_abstract=trained.observed == "abstract",
+        is_policy=True,
+        facts=facts,
     )
 
 

@@ -188,7 +188,8 @@ def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
         pass
     with finished_folder(out, config="1"):
         pass
-    assert (out / "config.json").read_text() == "1"
+    made = sorted((path.name, path.read_text()) for path in out.iterdir())
+    assert made == [("checkpoint", ""), ("config.json", "1")]
 
 
 @pytest.mark.parametrize("config", [None, "1"])
