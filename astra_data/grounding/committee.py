@@ -124,7 +124,7 @@ class Committee:
                 soon, memories[number] = model.step(before, command, landed, memories[number])
                 hazards.append(model.hazard(soon))
             state, previous = simulator.settle(before, predictions.mean(0)), command
-            ended = objective.reached(state, goal) | objective.missed(state, goal)
+            ended = objective.decided(state, goal)
             if objective.ends_at_walls:
                 ended = ended | simulator.blocked
             reached = reached * ~ended

@@ -226,7 +226,7 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     before, after, goal = (
         values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal)
     )
-    decided = objective.reached(after, goal) | objective.missed(after, goal)
+    decided = objective.decided(after, goal)
     own = objective.reward(before, after, goal, torch.zeros_like(decided))
     going_on, failing = windows.reward.unbind(-1)
     own, decided = own.reshape(going_on.shape), decided.reshape(going_on.shape)

@@ -92,6 +92,10 @@ class Objective(ABC):
         """Return in which states (B, X) the goals (B, G) are out of reach, (B,) bool: by default none."""
         return torch.zeros(len(state), dtype=torch.bool, device=state.device)
 
+    def decided(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return in which states (B, X) the goals (B, G) are reached or out of reach, (B,) bool."""
+        return self.reached(state, goal) | self.missed(state, goal)
+
     @abstractmethod
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states (B, X), a failure where `failed` (B,)."""

@@ -115,13 +115,16 @@ class Relocation:
             goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
             columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
             before, after = (np.asarray(world.abstraction(columns[name])) for name in (STATE, NEXT_STATE))
-            if world.ball_index is None or not _is_decided(world.objective, before[0], goal):
+            if world.ball_index is None or not self._begins_decided(before[0], goal):
                 judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
                 length = len(judged[DONE])
                 return Copy(
                     {name: values[:length] for name, values in columns.items()} | judged, change, steps
                 )
         return None
+
+    def _begins_decided(self, state: Array, goal: Array) -> bool:
+        return bool(self.task.objective.decided(torch.from_numpy(state[None]), torch.from_numpy(goal[None])))
 
     def _is_free(self, points: Array) -> Array:
         return self.task.maze.clearance(points) > self.margin_m
@@ -142,12 +145,6 @@ class Relocation:
         room = self.task.maze.half_extent
         low, high = -room - path.min(axis=0), room - path.max(axis=0)
         return rng.uniform(low, np.maximum(low, high), (_SHIFTS, 2))
-
-
-def _is_decided(objective: Objective, state: Array, goal: Array) -> bool:
-    """Return whether the goal (2,) is reached, or out of reach, in an abstract state (X,)."""
-    states, goals = torch.from_numpy(state[None]), torch.from_numpy(goal[None])
-    return bool(objective.reached(states, goals) | objective.missed(states, goals))
 
 
 def outcomes(
