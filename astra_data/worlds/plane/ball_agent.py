@@ -4,8 +4,10 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from astra_data.worlds.plane.ball import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
+from astra_data.worlds.plane.geometry import turned
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.states import PlanarStates
 
@@ -16,6 +18,8 @@ _LEAVES_M_S = 0.5
 """Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
 _NOTHING_M_S = 0.05
 """Corrections to less than this set no ball rolling: scatter alone is as fast."""
+_TURN_RAD = 0.5
+"""Deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO."""
 _FADES = 0.75
 """Share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps."""
 
@@ -28,11 +32,13 @@ class BallAgent(PlanarStates):
     the line between the centres, one that the mass walks into at another. Left out: the legs, the positions
     and timing of the feet, and the robot's heading.
 
-    Corrections move only balls that rolled or were touched in the step. Those that rolled go on as corrected,
-    or lie again if that is slow. Whether one that lay starts to roll is drawn, such that the speed expected
-    after the step is the corrected one: an expected correction mixes balls that are hit with others that are
-    missed into one that creeps, or never moves. It is drawn once for as long as the ball lies: what makes a
-    kick miss stays while nothing moves, and policies that kick from too far would else wait until it works.
+    Corrections move only balls that rolled or were touched in the step, and say how fast they are, not where
+    they go: recorded balls keep to the way that they rolled, and leave along the line between the centres,
+    scattered, more than they keep to what is expected of them. Those that rolled go on, or lie again if that
+    is slow. Whether one that lay starts to roll is drawn, such that the speed expected after the step is the
+    corrected one: an expected correction mixes balls that are hit with others that are missed into one that
+    creeps, or never moves. It is drawn once for as long as the ball lies: what makes a kick miss stays while
+    nothing moves, and policies that kick from too far would else wait until it works.
 
     Attributes:
         memory: of each ball, the evidence of a hit that it takes to roll, in [0, 1), and what there was of
@@ -120,20 +126,22 @@ class BallAgent(PlanarStates):
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Slide masses to `landed` (B, 8); move the balls, or draw whether they move: see the class."""
+        own = self.state[:, 6:]
         moved = super().settle(before, landed)
+        ball, velocity = before[:, 4:6], before[:, 6:]
         speed = moved[:, 6:].norm(dim=-1, keepdim=True)
-        lay = before[:, 6:].norm(dim=-1, keepdim=True) <= _LIES_M_S
-        leaving = moved[:, 6:] / speed.clamp_min(1e-9) * _LEAVES_M_S
-        hit = torch.cat(roll(before[:, 4:6], leaving, self.period_s, self._deceleration_m_s2), dim=-1)
-        left = hit[:, 2:].norm(dim=-1, keepdim=True)
+        lay = velocity.norm(dim=-1, keepdim=True) <= _LIES_M_S
+        turn_rad = _TURN_RAD * torch.randn(self.num_envs, device=ball.device)
+        direction = normalize(torch.where(lay, turned(own, turn_rad), velocity))
+        slowed_m_s = self._deceleration_m_s2 * self.period_s
+        leaving = (speed + slowed_m_s).clamp_min(_LEAVES_M_S * lay)
+        rolled = torch.cat(roll(ball, direction * leaving, self.period_s, self._deceleration_m_s2), dim=-1)
         touched = self._rolls & lay & (speed > _NOTHING_M_S)
         needed, evidence = self.memory.split(1, dim=-1)
-        evidence = _FADES * evidence + touched * speed / left
-        is_hit = touched & (evidence > needed)
-        still = torch.cat([before[:, 4:6], torch.zeros_like(leaving)], dim=-1)
-        rolls = torch.where(lay, is_hit, self._rolls & (speed > _LIES_M_S))
+        evidence = _FADES * evidence + touched * speed / (leaving - slowed_m_s)
+        rolls = torch.where(lay, touched & (evidence > needed), self._rolls & (speed > _LIES_M_S))
         undecided = self._undecided(self.num_envs)
         self.memory = torch.where(rolls, undecided, torch.cat([needed, evidence], dim=-1))
-        ball = torch.where(lay & (speed < left), hit, moved[:, 4:])
-        self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, ball, still)], dim=-1))
+        still = torch.cat([ball, torch.zeros_like(ball)], dim=-1)
+        self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, rolled, still)], dim=-1))
         return self.state
