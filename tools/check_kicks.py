@@ -28,6 +28,7 @@ from astra_data.reports.formatting import table
 from astra_data.training.own_world import in_simulator
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.plane.ball import asks_to_kick
+from astra_data.worlds.plane.geometry import wrapped
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -49,7 +50,7 @@ def main(
     windows = PairedEpisodes.load(run / "pair" / place(seed)).windows
     moments, distance = kicks(windows)
     later = moments.after(STEPS)
-    way = {"data": (windows.state[moments.episode, later, 4:6] - moments.state[:, 4:6]).norm(dim=-1)}
+    way = {"data": windows.state[moments.episode, later, 4:6] - moments.state[:, 4:6]}
     reached = []
     for name in row or ("nas", "astra"):
         made = load_grounding(run / "ground" / name / place(seed) / GROUNDING)
@@ -58,11 +59,12 @@ def main(
         simulator = SimulatorEnv(task.objective, made.simulator(task, EPISODES))
         outcome, _ = in_simulator(simulator, partial(careful, task), task.objective.horizon, 0)
         reached.append([name, f"{fmean(outcome.success):.2f}"])
-    columns = [f"{what}, {name}" for name in way for what in ("move it", "m")]
+    columns = [f"{what}, {name}" for name in way for what in ("move it", "m", "turn")]
     lines = []
     for low, high in pairwise(EDGES_M):
         there = (distance >= low) & (distance < high)
-        cells = [cell for ways in way.values() for cell in share_and_way(ways[..., there])]
+        ahead = moments.state[there, 4:6] - moments.state[there, :2]
+        cells = [cell for ways in way.values() for cell in told(ways[..., there, :], ahead)]
         lines.append([f"{low:.2f} to {high:.2f}", f"{int(there.sum())}", *cells])
     print(table(["distance of the ball in m", "kicks", *columns], lines), "\n")
     print(table(["grounding", "careful kicker"], reached))
@@ -81,7 +83,7 @@ def kicks(windows: PairedWindows) -> tuple[Moments, Tensor]:
 
 @torch.no_grad()
 def replayed(task: Task, made: HistoryGrounding, moments: Moments) -> Tensor:
-    """Return how far the ball is after `STEPS` simulated ones from where it lay, (REPLAYS, N), in m."""
+    """Return the way of the ball in `STEPS` simulated ones, (REPLAYS, N, 2), in m."""
     hidden = made.hidden_before(moments.windows)[moments.episode, moments.first]
     simulator = made.corrected(task.simulator(len(moments)), None)
     ways = []
@@ -89,15 +91,27 @@ def replayed(task: Task, made: HistoryGrounding, moments: Moments) -> Tensor:
         moments.start(simulator, hidden)
         for count in range(STEPS):
             state = simulator.step(moments.windows.action[moments.episode, moments.after(count)])
-        ways.append((state[:, 4:6] - moments.state[:, 4:6]).norm(dim=-1))
+        ways.append(state[:, 4:6] - moments.state[:, 4:6])
     return torch.stack(ways)
 
 
-def share_and_way(way: Tensor) -> tuple[str, str]:
-    """Return which share of kicks moves the ball, and how far those do on average, in m."""
-    moved = way > MOVED_M
+def told(way: Tensor, ahead: Tensor) -> tuple[str, str, str]:
+    """Tell which share of kicks moves the ball, how far those do, and how much their ways scatter.
+
+    Args:
+        way: of balls, (..., N, 2) in m.
+        ahead: from robots to their balls, (N, 2), which the ways are compared with.
+
+    Returns:
+        the share; their mean in m; the root mean square of the angles between way and `ahead`, in degrees.
+    """
+    moved = way.norm(dim=-1) > MOVED_M
+    turn = wrapped(torch.atan2(way[..., 1], way[..., 0]) - torch.atan2(ahead[:, 1], ahead[:, 0]))
     share = f"{moved.float().mean():.2f}" if moved.numel() else "-"
-    return share, f"{way[moved].mean():.2f}" if moved.any() else "-"
+    if not moved.any():
+        return share, "-", "-"
+    far, turned = way.norm(dim=-1)[moved].mean(), turn[moved].square().mean().sqrt().rad2deg()
+    return share, f"{far:.2f}", f"{turned:.0f}°"
 
 
 if __name__ == "__main__":

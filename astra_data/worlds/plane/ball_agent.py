@@ -18,7 +18,7 @@ _LEAVES_M_S = 0.5
 """Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
 _NOTHING_M_S = 0.05
 """Corrections to less than this set no ball rolling: scatter alone is as fast."""
-_TURN_RAD = 0.5
+_TURN_RAD = 0.4
 """Deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO."""
 _FADES = 0.75
 """Share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps."""
