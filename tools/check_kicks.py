@@ -90,7 +90,7 @@ def replayed(task: Task, made: HistoryGrounding, moments: Moments) -> Tensor:
     for _ in range(REPLAYS):
         moments.start(simulator, hidden)
         for count in range(STEPS):
-            state = simulator.step(moments.windows.action[moments.episode, moments.after(count)])
+            state = simulator.step(moments.action(count))
         ways.append(state[:, 4:6] - moments.state[:, 4:6])
     return torch.stack(ways)
 

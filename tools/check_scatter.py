@@ -58,8 +58,7 @@ def replayed(task: Task, grounding: HistoryGrounding, moments: Moments, steps: i
     moments.start(simulator, hidden[moments.episode, moments.first])
     places = [moments.state[:, :2]]
     for step in range(steps):
-        action = moments.windows.action[moments.episode, moments.after(step)]
-        places.append(simulator.step(action)[:, :2])
+        places.append(simulator.step(moments.action(step))[:, :2])
     return torch.stack(places, dim=1)
 
 

@@ -154,8 +154,7 @@ def replayed_inputs(
     memory = failures.initial_memory(state, moments.previous_action)
     replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
     for count in range(_REPLAYED):
-        now = moments.after(count)
-        action = windows.action[moments.episode, now]
+        now, action = moments.after(count), moments.action(count)
         simulator.step(action)
         inputs, memory = failures.inputs(state, action, simulator.landed, memory)
         state = simulator.state

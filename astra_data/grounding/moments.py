@@ -47,6 +47,10 @@ class Moments:
             previous_action=self.previous_action,
         )
 
+    def action(self, count: int) -> Tensor:
+        """Return the commands (N, A) of the steps that come `count` later."""
+        return self.windows.action[self.episode, self.after(count)]
+
     def after(self, count: int) -> Tensor:
         """Return the steps (N,) that come `count` later; the last of T where there is none."""
         return (self.first + count).clamp_max(self.windows.mask.shape[1] - 1)

@@ -70,7 +70,7 @@ def _replayed(
     moments.start(simulator, None)
     states, risks, apart = [moments.state], [], []
     for step in range(windows.mask.shape[1]):
-        states.append(simulator.step(windows.action[episode, step]))
+        states.append(simulator.step(moments.action(step)))
         if (risk := simulator.topple_risk()) is not None:
             risks.append(risk)
         apart.append(simulator.disagreement)

@@ -33,6 +33,8 @@ def test_they_are_real_steps_of_whole_episodes() -> None:
     assert torch.equal(made.previous_action[2], made.windows.action[0, 5])
     assert made.previous_action[3].tolist() == [0.0, 0.0]
     assert made.after(2).tolist() == [2, 5, 6, 2]
+    episodes = [0, 0, 0, 1]
+    assert torch.equal(made.action(2), made.windows.action[episodes, [2, 5, 6, 2]])
 
 
 def test_a_row_of_the_simulator_starts_at_each() -> None:
