@@ -35,10 +35,23 @@ def outputs(content: Notebook) -> list[list[tuple[str, str]]]:
     return [[*map(shown, cell["outputs"])] for cell in content["cells"] if cell["cell_type"] == "code"]
 
 
+def shortened(content: Notebook) -> Notebook:
+    """Return the notebook with trainings too short to learn anything: what it prints differs in figures."""
+
+    def cell(kept: dict[str, Any]) -> dict[str, Any]:
+        source = "".join(kept["source"])
+        for name, least in (("updates", 4), ("total_steps", 4096), ("episodes", 20)):
+            source = re.sub(rf"\b{name}=[\d_]+", f"{name}={least}", source)
+        return kept | {"source": source.splitlines(keepends=True)}
+
+    return content | {"cells": [cell(kept) for kept in content["cells"]]}
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
 def test_a_notebook_runs_and_shows_what_it_prints(path: Path) -> None:
     kept = read_notebook(path)
-    assert outputs(executed(kept)) == outputs(kept), "run tools/run_notebooks.py and commit what it writes"
+    made = executed(shortened(kept))
+    assert outputs(made) == outputs(kept), "run tools/run_notebooks.py and commit what it writes"
 
 
 def test_there_are_notebooks_that_jupyter_can_open() -> None:
