@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset.declared import declared_columns
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object
 
@@ -38,4 +39,11 @@ def explained(root: Path) -> Iterator[None]:
 
 def can_be_repaired(root: Path) -> bool:
     """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
-    return not isinstance(read_object(root / INFO_PATH), str)
+    info = read_object(root / INFO_PATH)
+    if isinstance(info, str):
+        return False
+    try:
+        declared_columns(root, info)
+    except CorruptDatasetError:
+        return False
+    return True

@@ -36,14 +36,26 @@ def test_validate_and_repair(
     assert run(monkeypatch, "validate", tmp_path / "saved") == 0
 
 
+@pytest.mark.parametrize(
+    ("content", "fault"),
+    [
+        ("{", "meta/info.json is no JSON object"),
+        ("{}", "fps is None"),
+        ('{"fps": 10, "features": {}}', "data_path is None"),
+    ],
+)
 def test_repair_is_not_advised_where_it_cannot_help(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    content: str,
+    fault: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     root = write_fake(tmp_path / "set").root
-    (root / "meta/info.json").write_text("{")
+    (root / "meta/info.json").write_text(content)
     assert run(monkeypatch, "validate", root) == 1
     told = capsys.readouterr().err
-    assert "meta/info.json is no JSON object" in told and "astra-data repair" not in told
+    assert fault in told and "astra-data repair" not in told
     assert run(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
 
 
