@@ -14,6 +14,8 @@ from astra_data.worlds.registry import task_named
 
 BEYOND = 0.05
 """Share of the recorded range by which bounds may be wider without a word."""
+TIMES = 20
+"""How many times as wide as the bounds the recorded range may be without a word."""
 
 
 def data_condition(recipe: Recipe) -> Condition | None:
@@ -35,21 +37,24 @@ def data_condition(recipe: Recipe) -> Condition | None:
         )
     task = task_named(recipe.task)
     check_fits(source, task)
-    return Condition("finished", "; ".join(unrecorded(task.limits, source)))
+    return Condition("finished", "; ".join(differing_bounds(task.limits, source)))
 
 
-def unrecorded(limits: Commands, source: Dataset) -> list[str]:
-    """Return a line for each axis whose bounds go beyond the commands in `source`.
+def differing_bounds(limits: Commands, source: Dataset) -> list[str]:
+    """Return a line for each axis whose bounds go beyond the commands in `source`, or are of another size.
 
-    A policy will ask for them, and neither a correction nor a predicted reward knows what follows.
+    A policy will ask for the former, and neither a correction nor a predicted reward knows what follows; the
+    latter are in other units.
     """
     statistics = source.statistics()
     if isinstance(statistics, str):
         return []
     least, largest = (np.asarray(statistics[ACTION][end], float) for end in ("min", "max"))
-    return [
-        f"{name} may be {low:.4g} to {high:.4g}, recorded is {lowest:.4g} to {highest:.4g}: "
-        "narrow the bounds of the commands, or record more"
-        for (name, (low, high)), lowest, highest in zip(limits.items(), least, largest, strict=True)
-        if max(lowest - low, high - highest) > BEYOND * (highest - lowest)
-    ]
+    lines = []
+    for (name, (low, high)), lowest, highest in zip(limits.items(), least, largest, strict=True):
+        known = f"{name} may be {low:.4g} to {high:.4g}, recorded is {lowest:.4g} to {highest:.4g}: "
+        if highest - lowest > TIMES * (high - low):
+            lines.append(known + "are both in the same unit?")
+        elif max(lowest - low, high - highest) > BEYOND * (highest - lowest):
+            lines.append(known + "narrow the bounds of the commands, or record more")
+    return lines

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from astra_data.core.durable import make_folder
 from astra_data.core.errors import BadInputError
@@ -21,12 +22,15 @@ from astra_data.dataset.columns import (
     TERMINATED,
     TRUNCATED,
     Array,
+    Column,
     Episode,
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.sharing.pull import pull
+from astra_data.worlds.expecting import expect
+from astra_data.worlds.own_code import explained
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -101,20 +105,26 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     What it has of them is kept.
     """
     given = episode.columns
-    before, after = (
-        torch.from_numpy(np.ascontiguousarray(task.abstraction(as_rows(given[key])), dtype=np.float32))
-        for key in (STATE, NEXT_STATE)
-    )
+    with explained("abstraction (φ) of the recorded states"):
+        before, after = (
+            torch.from_numpy(np.ascontiguousarray(task.abstraction(as_rows(given[key])), dtype=np.float32))
+            for key in (STATE, NEXT_STATE)
+        )
     goal = _goals(task, episode, seed)
     over = torch.zeros(len(episode), dtype=torch.bool)
     if TERMINATED in given:
         over = torch.from_numpy(given[TERMINATED])
-    missed = task.objective.missed(after, goal)
+    missed = _judged(task, "missed", after, goal)
     reached = (
-        torch.from_numpy(given[SUCCESS]) if SUCCESS in given else task.objective.reached(after, goal) & ~over
+        torch.from_numpy(given[SUCCESS])
+        if SUCCESS in given
+        else _judged(task, "reached", after, goal) & ~over
     )
     failed = (over | missed) & ~reached
-    reward = task.objective.reward(before, after, goal, failed).numpy()
+    what = "objective.reward(before, after, goal, failed)"
+    with explained(what):
+        paid = task.objective.reward(before, after, goal, failed)
+    reward = expect(what, paid, (len(episode),)).numpy()
     terminated = (reached | failed).numpy()
     length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
     truncated = np.zeros(len(episode), bool)
@@ -140,6 +150,14 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     )
 
 
+def _judged(task: Task, name: str, state: Tensor, goal: Tensor) -> Tensor:
+    """Return which states (T, X) the objective calls "reached" or "missed", (T,) bool."""
+    what = f"objective.{name}(state, goal)"
+    with explained(what):
+        found = getattr(task.objective, name)(state, goal)
+    return expect(what, found, (len(state),), torch.bool)
+
+
 def _opened(data: str | Path) -> Dataset:
     """Open a dataset here, or pull it."""
     return pull(str(data)) if is_address(data) else open_dataset(data)
@@ -152,10 +170,11 @@ def is_address(data: str | Path) -> bool:
     return "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))
 
 
-def _goals(task: Task, episode: Episode, seed: int) -> torch.Tensor:
+def _goals(task: Task, episode: Episode, seed: int) -> Tensor:
     if GOAL in episode.columns:
         return torch.from_numpy(as_rows(episode.columns[GOAL]))
-    drawn = task.objective.draw_goals(generator(seed, f"goal of episode {episode.uid}"), 1)
+    with explained("objective.draw_goals(rng, 1)"):
+        drawn = task.objective.draw_goals(generator(seed, f"goal of episode {episode.uid}"), 1)
     return torch.from_numpy(drawn).float().expand(len(episode), -1).contiguous()
 
 
@@ -163,7 +182,7 @@ def check_fits(source: Dataset, task: Task) -> None:
     """Check that a dataset has the states and actions of a task.
 
     Raises:
-        BadInputError: it lacks some, or theirs are of another size.
+        BadInputError: it lacks some, or theirs are of another size, in another order or in other units.
     """
     faults = []
     for expected in (task.state, task.action):
@@ -173,7 +192,23 @@ def check_fits(source: Dataset, task: Task) -> None:
             faults.append(
                 f"{expected.name} has {found} values, expected those of {task.name}: {expected.size}"
             )
+        else:
+            recorded = Column.from_feature(expected.name, source.features[expected.name])
+            faults += _contradictions(recorded, expected)
     if NEXT_STATE not in source.features:
         faults.append(f"has no column {NEXT_STATE}")
     if faults:
         raise BadInputError(f"{source.reference} {'; '.join(faults)}")
+
+
+def _contradictions(recorded: Column, expected: Column) -> list[str]:
+    """List where two columns of one size have the same names in another order, or values in other units."""
+    faults, names = [], recorded.names or ()
+    if any(name in names and names.index(name) != place for place, name in enumerate(expected.names or ())):
+        order = ", ".join(expected.labels)
+        faults.append(f"has the values {', '.join(names)} in {expected.name}, expected the order {order}")
+    units = ((column.astra or {}).get("unit", [""] * column.size) for column in (recorded, expected))
+    for name, own, other in zip(recorded.labels, *units, strict=True):
+        if own and other and own != other:
+            faults.append(f"has {name} of {expected.name} in {own}, expected {other}: scale it on import")
+    return faults

@@ -15,6 +15,7 @@ from astra_data.dataset.columns import Column
 from astra_data.worlds.batched import Step
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.objective import Objective
+from astra_data.worlds.own_code import explained
 
 State = NDArray[np.floating[Any]] | Sequence[float]
 
@@ -110,7 +111,9 @@ class RobotEnv:
             self._episodes += 1
             options: dict[str, Any] = {"seed": derive(self._seed, episode)} if self._takes_seed else {}
             options |= {} if self._starts is None else {"start": self._starts[row]}
-            self._state[row] = self._checked(self._robots[row].reset(**options), "reset")
+            with explained("reset of the robot"):
+                found = self._robots[row].reset(**options)
+            self._state[row] = self._checked(found, "reset")
             goal = self._objective.draw_goals(generator(self._seed, f"goal of {episode}"), 1)
             self.goal[row] = torch.from_numpy(goal[0]).float()
             self._fell[row] = self.failed[row] = False
@@ -122,8 +125,11 @@ class RobotEnv:
         commands = self._commands.in_units(action).double().numpy()
         rows = range(self.num_envs) if active is None else active.nonzero().squeeze(1).tolist()
         for row in rows:
-            state, has_failed = self._robots[row].step(commands[row])
-            self._state[row], self._fell[row] = self._checked(state, "step"), bool(has_failed)
+            with explained("step of the robot"):
+                found = self._robots[row].step(commands[row])
+            if not isinstance(found, tuple) or len(found) != 2:
+                raise BadInputError(f"step of the robot: expected (state, whether it failed), got {found!r}")
+            self._state[row], self._fell[row] = self._checked(found[0], "step"), bool(found[1])
         after = self._abstract()
         success = self._objective.reached(after, self.goal) & ~self._fell
         self.failed = (self._fell | self._objective.missed(after, self.goal)) & ~success
@@ -157,7 +163,8 @@ class RobotEnv:
         return self._objective.observe(self._abstract(), self.goal)
 
     def _checked(self, state: State, call: str) -> Tensor:
-        found = torch.as_tensor(np.asarray(state, dtype=np.float32))
+        with explained(f"{call} of the robot: to read its state as numbers"):
+            found = torch.as_tensor(np.asarray(state, dtype=np.float32))
         if found.shape != (self._column.size,) or not found.isfinite().all():
             raise BadInputError(
                 f"{call} of the robot: expected a finite state of {self._column.size} numbers, got {state!r}"

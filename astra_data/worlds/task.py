@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -88,6 +88,7 @@ class Task:
         photograph: renders target states (K, S) as pictures (K, height, width, 3); None where reports show
             none.
         target_id: name of a target that several tasks share, so that episodes of one serve all.
+        derived: the defaults that were filled in, by field: `dataclasses.replace` fills them in anew.
 
     Example:
         >>> from astra_data import TASKS
@@ -119,6 +120,7 @@ class Task:
     plane: Plane | None = None
     photograph: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
     target_id: str | None = None
+    derived: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Fill in the defaults.
@@ -126,6 +128,9 @@ class Task:
         Raises:
             BadInputError: the fields contradict each other, or a simulator has no φ; lists every fault.
         """
+        for one in fields(self):
+            if one.name in self.derived and getattr(self, one.name) is self.derived[one.name]:
+                object.__setattr__(self, one.name, one.default)
         faults = [
             f"make_simulator: {_named(self.make_simulator)} has no {name}; give the task one, or the class"
             for name in ("abstraction", "abstract_state")
@@ -149,18 +154,19 @@ class Task:
         names = abstract.labels
         size = self.objective.goal_size
         usual = {
-            "state": replace(self.state, name=STATE),
-            "commands": commands,
-            "instruction": self.instruction or self.name,
-            "action": self.action or Column(ACTION, size=len(commands), names=tuple(commands)),
-            "goal": self.goal or (Column(GOAL, size=size) if size else None),
+            "instruction": self.name,
+            "action": Column(ACTION, size=len(commands), names=tuple(commands)),
+            "goal": Column(GOAL, size=size) if size else None,
+            "abstraction": getattr(self.make_simulator, "abstraction", None),
             "abstract_state": replace(abstract, name=ABSTRACT_STATE),
-            "quantities": self.quantities or {name: (index,) for index, name in enumerate(names)},
-            "simulator_id": self.simulator_id or _named(self.make_simulator),
+            "quantities": {name: (index,) for index, name in enumerate(names)},
+            "simulator_id": _named(self.make_simulator),
         }
-        if self.abstraction is None:
-            usual["abstraction"] = self.make_simulator.abstraction
-        for name, value in usual.items():
+        derived = {name: value for name, value in usual.items() if not getattr(self, name)}
+        known = {"state": replace(self.state, name=STATE), "commands": commands}
+        if self.abstract_state:
+            known["abstract_state"] = usual["abstract_state"]
+        for name, value in {**known, **derived, "derived": derived}.items():
             object.__setattr__(self, name, value)
 
     @property

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
+from astra_data.worlds.expecting import expect, first
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import Task
@@ -44,35 +45,10 @@ def check_task(task: Task) -> list[str]:
     return faults
 
 
-def _expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype | None = None) -> Tensor:
-    """Return `found`, a finite tensor of `shape`, where -1 stands for any length.
-
-    Raises:
-        BadInputError: it is something else.
-    """
-    if not isinstance(found, Tensor):
-        raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
-    fits = found.dim() == len(shape) and all(
-        size in (-1, length) for size, length in zip(shape, found.shape, strict=True)
-    )
-    if not fits:
-        expected = str(shape).replace("-1", "any")
-        raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
-    if dtype is not None and found.dtype != dtype:
-        raise BadInputError(f"{what}: expected {dtype}, got {found.dtype}")
-    if not found.isfinite().all():
-        raise BadInputError(f"{what}: expected finite numbers, got {_first(found[~found.isfinite()])}")
-    return found
-
-
-def _first(values: Tensor) -> float:
-    return float(values.flatten()[0])
-
-
 def _of_numpy(what: str, found: object, shape: tuple[int, ...]) -> Tensor:
     if not isinstance(found, np.ndarray):
         raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
-    return _expect(what, torch.from_numpy(np.ascontiguousarray(found)), shape).float()
+    return expect(what, torch.from_numpy(np.ascontiguousarray(found)), shape).float()
 
 
 def _starts(task: Task) -> Tensor:
@@ -101,7 +77,7 @@ def _abstraction(task: Task) -> None:
                 f"{what}: expected a {type(given).__name__} of shape {wanted}, got a {type(found).__name__} "
                 f"of {shape}; abstract_state has {wanted[1]} values"
             )
-        _expect(what, torch.as_tensor(found), wanted)
+        expect(what, torch.as_tensor(found), wanted)
 
 
 def _robot(task: Task) -> None:
@@ -111,7 +87,7 @@ def _robot(task: Task) -> None:
         env = task.target(1, seed=0)
         env.reset()
         abstract = task.abstraction(env.state)
-    _expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
+    expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
 
 
 def _simulator(task: Task) -> AbstractSimulator:
@@ -119,7 +95,7 @@ def _simulator(task: Task) -> AbstractSimulator:
     with explained(what):
         simulator = task.own_simulator(_COUNT)
         state = simulator.state
-    _expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size))
+    expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size))
     return simulator
 
 
@@ -148,7 +124,7 @@ def _step(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
             before = batch.state
             kept = before.clone()
             landed = batch.step(command[rows].clone())
-        _expect(f"{what} of shape {tuple(command[rows].shape)}", landed, (count, starts.shape[1]))
+        expect(f"{what} of shape {tuple(command[rows].shape)}", landed, (count, starts.shape[1]))
         if not torch.equal(before, kept):
             raise BadInputError(f"{what} changes the states handed out before: expected a new tensor")
         return landed.clone()
@@ -162,13 +138,13 @@ def _step(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
 
 
 def _same(what: str, shown: Tensor, expected: Tensor, where: str = "") -> None:
-    _expect(what, shown, tuple(expected.shape))
+    expect(what, shown, tuple(expected.shape))
     if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
         row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
         raise BadInputError(
             f"{what} {where}".rstrip()
-            + f": expected {_first(expected[row, entry]):g} in row {row}, entry {entry}, got "
-            f"{_first(shown[row, entry]):g}"
+            + f": expected {first(expected[row, entry]):g} in row {row}, entry {entry}, got "
+            f"{first(shown[row, entry]):g}"
         )
 
 
@@ -176,7 +152,7 @@ def _observation(task: Task, state: Tensor, goal: Tensor) -> None:
     what = "objective.observe(state, goal)"
     with explained(what):
         found = task.objective.observe(state, goal)
-    _expect(what, found, (_COUNT, -1))
+    expect(what, found, (_COUNT, -1))
 
 
 def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:
@@ -184,7 +160,7 @@ def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:
         what = f"objective.{name}(state, goal)"
         with explained(what):
             found = getattr(task.objective, name)(state, goal)
-        _expect(what, found, (_COUNT,), torch.bool)
+        expect(what, found, (_COUNT,), torch.bool)
     return True
 
 
@@ -193,4 +169,4 @@ def _reward(task: Task, before: Tensor, after: Tensor, goal: Tensor) -> None:
     for failed in (False, True):
         with explained(what):
             found = task.objective.reward(before, after, goal, torch.full((_COUNT,), failed))
-        _expect(what, found, (_COUNT,))
+        expect(what, found, (_COUNT,))

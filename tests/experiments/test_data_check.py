@@ -40,6 +40,9 @@ def recipe(tmp_path: Path) -> Path:
         (-1.5, 4.5, ""),
         (-0.5, 4.0, "v may be -1 to 4, recorded is -0.5 to 4: narrow the bounds of the commands, or rec"),
         (-1.0, 3.0, "v may be -1 to 4, recorded is -1 to 3"),
+        (-40.0, 59.0, ""),
+        (-250.0, 900.0, "v may be -1 to 4, recorded is -250 to 900: are both in the same unit?"),
+        (0.0, 900.0, "v may be -1 to 4, recorded is 0 to 900: are both in the same unit?"),
     ],
 )
 def test_bounds_beyond_what_was_recorded_are_told(

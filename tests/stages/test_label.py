@@ -1,9 +1,12 @@
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -23,7 +26,8 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.sharing.push import push
-from astra_data.stages.label import label
+from astra_data.stages.label import check_fits, label, labels
+from astra_data.worlds.registry import task_named
 
 CART = f"{Path(__file__).parents[1] / 'small_cart.py'}:LOGS_ALONE"
 COLUMNS = (
@@ -113,6 +117,76 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="has goals and outcomes already: there is nothing to label"):
         label(CART, data=labelled)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "units", "fault"),
+    [
+        (("x", "speed"), ["m", "m/s"], None),
+        (("x", "speed"), ["m", ""], None),
+        (("x", "v"), None, None),
+        (None, None, None),
+        (
+            ("speed", "x"),
+            ["", ""],
+            "has the values speed, x in observation.state, expected the order x, speed",
+        ),
+        (("speed", "v"), None, "has the values speed, v in observation.state, expected the order x, speed"),
+        (("x", "speed"), ["mm", "m/s"], "has x of observation.state in mm, expected m: scale it on import"),
+        (("x", "speed"), ["m", "km/h"], "has speed of observation.state in km/h, expected m/s"),
+    ],
+)
+def test_states_in_another_order_or_other_units_are_refused(
+    names: tuple[str, ...] | None, units: list[str] | None, fault: str | None, tmp_path: Path
+) -> None:
+    task = task_named(CART)
+    task = replace(task, state=replace(task.state, astra={"unit": ["m", "m/s"]}))
+    astra = None if units is None else {"unit": units}
+    columns = [Column(name, size=2, names=names, astra=astra) for name in (STATE, NEXT_STATE)]
+    with DatasetWriter(
+        tmp_path / "logs",
+        [*columns, COLUMNS[1]],
+        fps=10,
+        task="drive",
+        description={"name": "logs", "stage": "import"},
+    ) as writer:
+        writer.add(Episode(0, drive(0.1, 3), {}))
+    logs = Dataset.open(tmp_path / "logs")
+    if fault is None:
+        check_fits(logs, task)
+    else:
+        with pytest.raises(BadInputError, match=fault):
+            check_fits(logs, task)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("reward", "objective.reward(before, after, goal, failed)"),
+        ("reached", "objective.reached(state, goal)"),
+        ("missed", "objective.missed(state, goal)"),
+        ("draw_goals", "objective.draw_goals(rng, 1)"),
+    ],
+)
+def test_an_objective_that_fails_is_told_in_one_line(
+    name: str, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, episode = task_named(CART), Episode(0, drive(0.1, 3), {})
+
+    def fail(*_given: object) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(type(task.objective), name, fail)
+    with pytest.raises(BadInputError, match=rf"{re.escape(call)} fails with ZeroDivisionError: division by"):
+        labels(task, episode, 0)
+
+
+@pytest.mark.parametrize("name", ["reward", "reached", "missed"])
+def test_what_an_objective_returns_has_a_value_per_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    task, episode = task_named(CART), Episode(0, drive(0.1, 3), {})
+    monkeypatch.setattr(type(task.objective), name, lambda *_given: torch.zeros(3, 1))
+    with pytest.raises(BadInputError, match=rf"objective.{name}\(.*\): expected shape \(3,\), got \(3, 1\)"):
+        labels(task, episode, 0)
 
 
 def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(tmp_path: Path, home: Path) -> None:

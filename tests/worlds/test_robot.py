@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -114,6 +115,31 @@ def test_a_state_of_another_kind_is_refused(state: Any) -> None:  # noqa: ANN401
     env.reset()
     with pytest.raises(BadInputError, match="step of the robot: expected a finite state of 2 numbers, got"):
         env.step(torch.zeros(1, 1))
+
+
+@pytest.mark.parametrize("found", [[0.0, 1.0], np.zeros(2), None, ([0.0, 1.0], False, {})])
+def test_a_step_that_does_not_say_whether_it_failed_is_refused(
+    found: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = TASK.target(1, seed=0)
+    monkeypatch.setattr(Cart, "step", lambda _cart, _command: found)
+    with pytest.raises(
+        BadInputError, match=r"step of the robot: expected \(state, whether it failed\), got "
+    ):
+        env.step(torch.zeros(1, 1))
+
+
+@pytest.mark.parametrize("call", ["reset", "step"])
+def test_a_robot_that_breaks_is_told_in_one_line(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = TASK.target(1, seed=0)
+    broken: list[Callable[[], object]] = [env.reset, lambda: env.step(torch.zeros(1, 1))]
+
+    def fail(*_given: object) -> None:
+        raise RuntimeError("motor")
+
+    monkeypatch.setattr(Cart, call, fail)
+    with pytest.raises(BadInputError, match=f"{call} of the robot fails with RuntimeError: motor"):
+        broken[call == "step"]()
 
 
 def test_a_robot_is_not_put_anywhere() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from fake_dataset import COLUMNS, write_fake
-from small_cart import GIVEN, LOGS_ALONE, TASK
+from small_cart import GIVEN, LOGS_ALONE, TASK, Rail
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
@@ -98,6 +98,42 @@ def test_six_fields_make_a_task() -> None:
     assert task.abstraction(state).tolist() == [[3.0]] and torch.equal(task.beyond(state), state)
     assert not task.has_target and TASK.has_target and ANT.has_target
     assert replace(task, name="other").commands == task.commands
+
+
+class HalfRail(Rail):
+    """Another simulator, with names and φ of its own."""
+
+    abstract_state = Column("abstract.state", size=1, names=("half",))
+
+    @staticmethod
+    def abstraction(state: Any) -> Any:  # noqa: ANN401
+        return 0.5 * state[..., :1]
+
+
+def test_what_was_filled_in_is_filled_in_anew_where_a_field_is_replaced() -> None:
+    other = replace(TASK, make_simulator=HalfRail, commands={"push": (0.0, 1.0)}, name="half")
+    state = torch.tensor([[4.0, 1.0]])
+    assert other.abstraction(state).tolist() == [[2.0]] and TASK.abstraction(state).tolist() == [[4.0]]
+    assert (other.simulator_id, other.action.names, other.instruction) == ("HalfRail", ("push",), "half")
+    assert other.abstract_state.names == ("half",) and list(other.quantities) == ["half"]
+    back = replace(other, make_simulator=Rail)
+    assert back.simulator_id == "Rail" and back.abstraction is Rail.abstraction
+
+
+def test_what_was_given_stays_where_a_field_is_replaced() -> None:
+    given: dict[str, Any] = {
+        "abstraction": lambda state: state[..., 1:],
+        "abstract_state": Column("any", size=1, names=("speed",)),
+        "action": Column("action", size=1, names=("push",)),
+        "instruction": "go",
+        "quantities": {"speed_m_s": (0,)},
+        "simulator_id": "mine",
+    }
+    for task in (Task(**GIVEN | given), replace(TASK, **given)):
+        other = replace(task, make_simulator=HalfRail, commands={"v": (0.0, 1.0)}, name="half")
+        for name in given.keys() - {"abstract_state"}:
+            assert getattr(other, name) is given[name]
+        assert other.abstract_state == replace(given["abstract_state"], name="abstract.state")
 
 
 def test_simulators_of_a_task_take_actions_and_commands() -> None:

@@ -1,0 +1,32 @@
+"""Errors of one line about tensors that are not as expected."""
+
+import torch
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+
+
+def expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype | None = None) -> Tensor:
+    """Return `found`, a finite tensor of `shape`, where -1 stands for any length.
+
+    Raises:
+        BadInputError: it is something else.
+    """
+    if not isinstance(found, Tensor):
+        raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
+    fits = found.dim() == len(shape) and all(
+        size in (-1, length) for size, length in zip(shape, found.shape, strict=True)
+    )
+    if not fits:
+        expected = str(shape).replace("-1", "any")
+        raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
+    if dtype is not None and found.dtype != dtype:
+        raise BadInputError(f"{what}: expected {dtype}, got {found.dtype}")
+    if not found.isfinite().all():
+        raise BadInputError(f"{what}: expected finite numbers, got {first(found[~found.isfinite()])}")
+    return found
+
+
+def first(values: Tensor) -> float:
+    """Return the first of `values`, of any shape."""
+    return float(values.flatten()[0])
