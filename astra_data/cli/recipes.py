@@ -53,7 +53,7 @@ def run(
     with resumable():
         folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
         show_errors(folder, until)
-        typer.echo(f"finished: {folder}")
+        typer.echo(f"finished: {folder}{pages(folder, until)}")
 
 
 def check(
@@ -193,6 +193,20 @@ def show_errors(folder: Path, until: str | None) -> None:
     if until == "ground" and (folder / PAGE).is_file():
         typer.echo((folder / PAGE).read_text())
         typer.echo(f"written: {folder / PAGE}")
+
+
+def pages(folder: Path, until: str | None) -> str:
+    """Return which pages of a run that went on `until` a stage there are to look at, in brackets."""
+    from astra_data.experiments.plan import stages_until
+    from astra_data.reports.held_out import PAGE
+    from astra_data.reports.html_page import HTML
+
+    made = stages_until(until)
+    written = [
+        folder / page for stage, page in (("ground", PAGE), ("report", f"report/{HTML}")) if stage in made
+    ]
+    there = ", ".join(str(page) for page in written if page.is_file())
+    return f" (look at {there})" if there else ""
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:

@@ -96,9 +96,9 @@ def locate(dataset: str | Path) -> Path:
     Raises:
         BadInputError: there is no such folder and no such name at home.
     """
-    if _is_folder(Path(dataset)):
-        return Path(dataset)
-    reference = _REFERENCE.fullmatch(str(dataset))
+    reference, folder = _REFERENCE.fullmatch(str(dataset)), Path(dataset)
+    if _is_folder(folder) and not (reference and _is_another(folder) and versions_at_home(reference["name"])):
+        return folder
     if not reference:
         raise BadInputError(
             f"{str(dataset)[:300]}: no such folder; expected a folder, name or name@data-1.2.0"
@@ -111,6 +111,11 @@ def locate(dataset: str | Path) -> Path:
         known = ", ".join(f"data-{known}" for known in versions)
         raise BadInputError(f"{name} has no version data-{version} in {home()}; it has {known}")
     return place({"name": name, "version": version or versions[-1]})
+
+
+def _is_another(folder: Path) -> bool:
+    """Return whether a folder holds neither a dataset nor versions of one: that of `new`, for example."""
+    return not (folder / "meta").is_dir() and not any(folder.glob("data-*.*.*"))
 
 
 def _is_folder(path: Path) -> bool:

@@ -26,10 +26,10 @@ from astra_data.exchange.conversion import Converter, Mask
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block
 
-REASONS = ("file", "source", "field", "end", "gap", "jump", "rejected")
+REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
 """Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
-changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, a jump, rows that
-were rejected."""
+changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, time that goes
+back, a jump, rows that were rejected."""
 
 RATE_TOLERANCE = 0.1
 """Largest relative difference between fps and the rate measured from the times."""
@@ -50,6 +50,7 @@ class Tally:
         last_terminated: those of them that were terminated.
         last_successes: those of them that succeeded without being terminated.
         last_reward: the sum of their rewards.
+        back_rows: those at which time goes back, within a file. back_first: where the first of them is.
         short_rows: rows of episodes that were too short.
         rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
         endings: how the episodes end.
@@ -63,6 +64,8 @@ class Tally:
     last_terminated: int = 0
     last_successes: int = 0
     last_reward: float = 0.0
+    back_rows: int = 0
+    back_first: str = ""
     short_rows: int = 0
     rows_after_end: int = 0
     endings: Endings = field(default_factory=Endings)
@@ -86,7 +89,7 @@ class Cutter:
         self._pieces: list[dict[str, Array]] = []
         self._metadata: dict[str, Scalar] = {}
         self._ended = False
-        self._seconds, self._steps = 0.0, 0
+        self._seconds, self._usual_seconds, self._steps = 0.0, 0.0, 0
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -111,16 +114,17 @@ class Cutter:
             first = row + int(np.argmax(rejected))
             self.tally.rejected_first = self.tally.rejected_first or f"{block.origin} row {first}"
             self.tally.rejected_rows += int(rejected.sum())
-        counters = self._count(block, columns, rejected, is_apart=is_apart)
+        counters = self._count(block, row, columns, rejected, is_apart=is_apart)
         if not finite.any():
             return
         kept = {name: values[finite] for name, values in columns.items()}
-        begins = self._begins(counters[:, finite], kept)
+        begins, is_new = self._begins(counters[:, finite], kept)
         rows = row + np.flatnonzero(finite)
         edges = [0, *np.flatnonzero(begins).tolist(), len(begins)]
         for first, last in pairwise(edges):
             if begins[first] and first < last:
                 yield from self.finish()
+                self._ended &= not is_new[first]
                 self._metadata = {"source": block.origin, "source_row": int(rows[first])}
             if first < last:
                 self._pieces.append({name: values[first:last] for name, values in kept.items()})
@@ -165,21 +169,26 @@ class Cutter:
         return kept | {NEXT_STATE: state[1:]}
 
     def check_rate(self) -> None:
-        """Compare fps to the rate measured from the times.
+        """Compare fps to the rates measured from the times: the mean one, and the usual one without pauses.
 
         Raises:
-            BadInputError: they differ by more than `RATE_TOLERANCE`.
+            BadInputError: both differ by more than `RATE_TOLERANCE`.
         """
-        if self._steps and self._seconds > 0:
-            rate, fps = self._steps / self._seconds, self._mapping.fps
-            if abs(rate / fps - 1) > RATE_TOLERANCE:
-                raise BadInputError(
-                    f"'{self._mapping.time}' gives {rate:.4g} rows per second, but fps is {fps}: "
-                    "correct fps or time_scale, or resample the recording"
+        fps, spent = self._mapping.fps, [time for time in (self._seconds, self._usual_seconds) if time > 0]
+        rates = [self._steps / time for time in spent]
+        if rates and all(abs(rate / fps - 1) > RATE_TOLERANCE for rate in rates):
+            cure = "correct fps or time_scale, or resample the recording"
+            if self.tally.back_rows:
+                cure += (
+                    f"; time goes back in {self.tally.back_rows} rows, first in {self.tally.back_first}: "
+                    "sort them if they belong together"
                 )
+            raise BadInputError(
+                f"'{self._mapping.time}' gives {rates[0]:.4g} rows per second, but fps is {fps}: {cure}"
+            )
 
     def _count(
-        self, block: Block, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
+        self, block: Block, row: int, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
     ) -> NDArray[np.int64]:
         """Return how often each reason, except jumps, has applied up to each row, (reasons, n)."""
         split, n = self._mapping.split, len(block)
@@ -198,7 +207,12 @@ class Cutter:
                 masks[key] = (series[:-1] != values).any(axis=1)
             elif key == "gap":
                 times = _held(series)
-                masks[key] = self._gaps(np.diff(times[:, 0]))
+                steps_s = np.diff(times[:, 0])
+                masks["back"], masks[key] = steps_s < 0, self._gaps(steps_s)
+                if masks["back"].any():
+                    first = f"{block.origin} row {row + int(np.argmax(masks['back']))}"
+                    self.tally.back_first = self.tally.back_first or first
+                    self.tally.back_rows += int(masks["back"].sum())
                 now[key] = times[1:]
             else:
                 masks["end"] |= (series[:-1] != 0).any(axis=1)
@@ -211,16 +225,21 @@ class Cutter:
         return counters
 
     def _gaps(self, steps_s: Array) -> Mask:
-        gaps: Mask = steps_s < 0
-        if self._mapping.split.gap_s is not None:
-            gaps |= steps_s > self._mapping.split.gap_s
+        """Return which steps in time are longer than `gap_s`, and measure the others that go on."""
+        longest = self._mapping.split.gap_s
+        gaps = np.zeros(len(steps_s), bool) if longest is None else steps_s > longest
         regular = steps_s[~gaps & (steps_s > 0)]
-        self._seconds += float(regular.sum())
-        self._steps += len(regular)
+        if len(regular):
+            self._seconds += float(regular.sum())
+            self._usual_seconds += float(np.median(regular)) * len(regular)
+            self._steps += len(regular)
         return gaps
 
-    def _begins(self, counters: NDArray[np.int64], kept: dict[str, Array]) -> Mask:
-        """Return which of the kept rows begin an episode, and count the reasons."""
+    def _begins(self, counters: NDArray[np.int64], kept: dict[str, Array]) -> tuple[Mask, Mask]:
+        """Return which of the kept rows begin an episode, and which a file, a source or a field's value.
+
+        The reasons are counted.
+        """
         jump = self._mapping.split.jump
         where = kept[jump.column].reshape(counters.shape[1], -1)[:, list(jump.values)] if jump else None
         if self._kept_before is None:
@@ -241,7 +260,7 @@ class Cutter:
             self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
         begins[0] |= self._kept_before is None
         self._kept_before = counters[:, -1:], None if where is None else where[-1:]
-        return begins
+        return begins, reasons[: REASONS.index("end")].any(axis=0)
 
 
 def _held(times: Array) -> Array:

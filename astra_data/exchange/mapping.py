@@ -63,6 +63,8 @@ class ColumnMapping(Config):
         unknown = sorted(set(self.role) - set(ROLES))
         if unknown:
             raise ValueError(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
+        if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
+            raise ValueError(f"names has {', '.join(doubled)} more than once")
         if self.clip is not None and self.clip[0] >= self.clip[1]:
             raise ValueError(f"clip {list(self.clip)}, expected the lower bound first")
         return self
@@ -91,8 +93,8 @@ class Split(Config):
     """Fields of the source that are true in the last row of an episode, besides those of next.terminated and
     next.truncated."""
     gap_s: Positive | None = None
-    """A step in `time` that is longer, or backwards; of MCAP, the longest time for which a topic's last value
-    is held."""
+    """A step in `time` that is longer; of MCAP, the longest time for which a topic's last value is held. Time
+    that goes back within a file begins a new episode in any case."""
     jump: Jump | None = None
     """A jump between rows."""
 

@@ -34,7 +34,8 @@ def load_gap_recipe(recipe_path: Path) -> GapRecipe:
     """
     if {"methods", "based_on"} & load_tables(recipe_path).keys() and not is_gap_recipe(recipe_path):
         raise RecipeError(
-            f"{recipe_path}: expected a recipe for `astra-data gap`, got one for `astra-data run`"
+            f"{recipe_path}: expected a recipe for `astra-data gap`, got one for `astra-data run`, whose "
+            f"gaps `astra-data run {recipe_path} --until ground` writes to gap.md"
         )
     recipe = load_recipe(recipe_path, GapRecipe)
     mapping = recipe_path.parent / recipe.mapping

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
-from astra_data.cli.recipes import refuse
+from astra_data.cli.recipes import pages, refuse
 from astra_data.core.errors import AstraDataError, BadInputError
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
@@ -29,6 +29,16 @@ def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) 
     assert "  finished  collect/seed_0\n  to do     pair/seed_0\n" in call("check", str(recipe))
     with pytest.raises(AstraDataError, match="unknown stage 'x'"):
         call("run", str(recipe), "--until", "x")
+
+
+def test_a_run_ends_with_the_pages_to_look_at(tmp_path: Path) -> None:
+    assert pages(tmp_path, None) == ""
+    (tmp_path / "gap.md").touch()
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report/results.html").touch()
+    assert pages(tmp_path, None) == f" (look at {tmp_path}/gap.md, {tmp_path}/report/results.html)"
+    assert pages(tmp_path, "align") == f" (look at {tmp_path}/gap.md)"
+    assert pages(tmp_path, "pair") == ""
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,18 @@ def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None
         locate(name)
 
 
+def test_a_folder_without_a_dataset_hides_none_of_the_same_name(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    at_home = write_fake(home / "fake/data-1.0.0").root
+    (tmp_path / "fake").mkdir()
+    assert locate("fake") == at_home
+    assert locate(tmp_path / "fake") == tmp_path / "fake"
+    (tmp_path / "fake/meta").mkdir()
+    assert locate("fake") == Path("fake")
+
+
 def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:
     source = write_fake(tmp_path / "first")
     description, folder = successor(source, "episodes", stage="subset", config={"count": 2})

@@ -167,3 +167,31 @@ def test_large_integers_need_a_dtype_that_holds_them(tmp_path: Path) -> None:
     mapping = MAPPING.replace('fields = ["gait"]\ndtype = "int64"', 'fields = ["stamp"]')
     with pytest.raises(BadInputError, match=r"gait: integers beyond 2\^53 do not fit float32; set dtype"):
         imported(tmp_path, write_table(tmp_path / "log.npz", fields), mapping)
+
+
+def test_whole_numbers_are_exact_to_their_bounds() -> None:
+    values, finite = convert({"dtype": "int64"}, np.array([200, 2**63 - 1], np.uint64))  # type: ignore[arg-type]
+    assert (values.tolist(), finite) == ([200, 2**63 - 1], [True, True])
+    with pytest.raises(BadInputError, match=r"c: expected whole numbers below 2\^63"):
+        convert({"dtype": "int64"}, np.array([1, 2**63], np.uint64))  # type: ignore[arg-type]
+    for number in (2.0**53, -(2.0**53)):  # which 2^53 + 1 is rounded to
+        with pytest.raises(BadInputError, match=r"c: numbers of 2\^53 or more came as floats"):
+            convert({"dtype": "int64"}, [0.0, number])
+    assert convert({"dtype": "int64"}, [2.0**53 - 1])[0].tolist() == [2**53 - 1]
+    assert convert({}, [2**53, -(2**53)])[0].tolist() == [2**53, -(2**53)]
+
+
+def test_a_next_state_that_was_recorded_keeps_its_own_description() -> None:
+    columns = {STATE: {"fields": ("f",)}, NEXT_STATE: {"fields": ("f",), "meaning": "seen", "unit": ("m",)}}
+    made = converter(columns)
+    made.convert(Block({"f": np.zeros(2)}, "log"))
+    found = {column.name: column for column in made.columns}[NEXT_STATE]
+    assert (found.meaning, found.astra) == ("seen", {"unit": ["m"]})
+
+
+@pytest.mark.parametrize(("flag", "terminal"), [("g", "stand_still"), (TERMINATED, "drop")])
+def test_only_next_states_that_are_made_up_are_called_so(flag: str, terminal: str) -> None:
+    made = converter({STATE: {"fields": ("f",)}, flag: {"fields": ("f",)}}, terminal=terminal)
+    made.convert(Block({"f": np.zeros(2)}, "log"))
+    meanings = {column.name: column.meaning for column in made.columns}
+    assert meanings[NEXT_STATE] == "the state, one step later"

@@ -143,7 +143,7 @@ def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
     cutting = cutter(time="t", split={"gap_s": 0.5})
     episodes = cut(cutting, block_rows, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])
     assert rows(episodes) == [[0, 1], [3], [5, 6]]
-    assert cutting.tally.split_points == {"gap": 2}
+    assert cutting.tally.split_points == {"gap": 1, "back": 1}
     cutting.check_rate()
 
 
@@ -285,3 +285,56 @@ def test_fields_that_change_in_size_are_told() -> None:
     list(cutting.feed(Block({"x": np.zeros(2), "a": np.zeros(2)}, "1"), 0, is_apart=True))
     with pytest.raises(BadInputError, match="2 values, before there were 1"):
         list(cutting.feed(Block({"x": np.zeros((2, 2)), "a": np.zeros(2)}, "2"), 0, is_apart=True))
+
+
+@pytest.mark.parametrize("rate", [8.0, 12.5])
+def test_a_log_that_is_slower_than_fps_is_told_as_one_that_is_faster(rate: float) -> None:
+    cutting = cutter(time="t")
+    cut(cutting, x=np.zeros(50), t=np.arange(50) / rate)
+    with pytest.raises(BadInputError, match=f"'t' gives {rate:g} rows per second, but fps is 10"):
+        cutting.check_rate()
+
+
+@BLOCKS
+def test_a_field_of_several_values_begins_an_episode_where_one_of_them_changes(block_rows: int) -> None:
+    trial = [[0, 0], [0, 0], [0, 1], [0, 1], [1, 1], [1, 1]]
+    cutting = cutter(split={"field": "k"})
+    assert rows(cut(cutting, block_rows, x=np.zeros(6), k=trial)) == [[0], [2], [4]]
+    assert cutting.tally.split_points == {"field": 2}
+
+
+@BLOCKS
+def test_a_terminated_row_of_another_trial_is_no_log_that_went_on(block_rows: int) -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
+    cutting = cutter(columns=columns, terminal="stand_still", split={"field": "k"})
+    trials = {"over": [0, 1, 1, 1, 1, 0, 1], "k": [0, 0, 0, 1, 1, 2, 2]}
+    assert rows(cut(cutting, block_rows, x=np.arange(7.0), **trials)) == [[0, 1], [3], [5, 6]]
+    assert cutting.tally.rows_after_end == 2
+
+
+@BLOCKS
+def test_a_recording_that_begins_with_a_terminated_row_keeps_it(block_rows: int) -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
+    cutting = cutter(columns=columns, terminal="stand_still")
+    assert rows(cut(cutting, block_rows, x=np.arange(4.0), over=[1, 0, 0, 1])) == [[0], [1, 2, 3]]
+    assert cutting.tally.rows_after_end == 0
+
+
+def test_the_order_of_the_columns_makes_no_episode_of_a_terminated_row_alone() -> None:
+    columns = {TERMINATED: {"fields": ("over",)}, STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    cutting = cutter(columns=columns, split={"field": "k"})
+    episodes = cut(cutting, x=np.arange(6.0), over=[0, 0, 0, 1, 0, 0], k=[0, 0, 0, 1, 2, 2])
+    assert [{len(values) for values in episode.values()} for episode in episodes] == [{2}, {1}]
+    assert rows(episodes) == [[0, 1], [4]]
+
+
+def test_only_dropped_rows_that_succeeded_are_counted_as_successes() -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, SUCCESS: {"fields": ("there",)}}
+    cutting = cutter(columns=columns, split={"field": "k"})
+    cut(cutting, x=np.arange(9.0), there=[0, 1, 0, 0, 1, 1, 0, 1, 0], k=[0, 0, 0, 1, 1, 1, 2, 2, 2])
+    assert (cutting.tally.last_rows, cutting.tally.last_successes) == (3, 1)
+
+
+def test_a_jump_is_longer_than_its_bound_not_as_long() -> None:
+    cutting = cutter(split={"jump": {"column": STATE, "values": (0,), "above": 0.5}})
+    assert rows(cut(cutting, x=[0.0, 0.5, 1.0, 1.75, 2.0])) == [[0, 1], [3]]

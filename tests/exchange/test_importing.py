@@ -2,6 +2,7 @@ import os
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
-from astra_data.exchange.cutting import Cutter
+from astra_data.exchange.cutting import Cutter, Tally
 from astra_data.exchange.importing import import_dataset
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
@@ -72,6 +73,40 @@ def test_a_rate_that_is_not_fps_refuses_the_import(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="gives 30 rows per second, but fps is 10"):
         imported(tmp_path, path, 'time = "unused"\n' + MAPPING)
     assert list(tmp_path.glob("*out*")) == []
+
+
+def with_times(tmp_path: Path, seconds: np.ndarray[Any, Any]) -> Tally:
+    path = write_table(tmp_path / "log.npz", rows() | {"unused": seconds, "fell": np.zeros(20, bool)})
+    _, report = imported(tmp_path, path, 'time = "unused"\n' + PER_FILE)
+    return report.tally
+
+
+def test_a_pause_changes_no_rate(tmp_path: Path) -> None:
+    seconds = np.arange(20) / 10
+    seconds[7:] += 3.0
+    assert not with_times(tmp_path, seconds).split_points
+
+
+def test_times_that_come_in_bursts_have_a_mean_rate(tmp_path: Path) -> None:
+    seconds = np.arange(20) // 4 * 0.45 + np.arange(20) % 4 * 0.01
+    assert not with_times(tmp_path, seconds).split_points
+
+
+def test_time_that_goes_back_begins_an_episode_and_is_told(tmp_path: Path) -> None:
+    tally = with_times(tmp_path, np.arange(20) % 8 / 10)
+    assert tally.split_points == {"back": 2}
+    assert (tally.back_rows, tally.back_first) == (2, "log.npz row 8")
+
+
+def test_times_in_no_order_are_told_with_their_place(tmp_path: Path) -> None:
+    seconds = np.random.default_rng(0).permutation(20) / 10
+    first = int((np.diff(seconds) < 0).argmax()) + 1
+    back = int((np.diff(seconds) < 0).sum())
+    with pytest.raises(
+        BadInputError,
+        match=rf"fps is 10: .*time goes back in {back} rows, first in log.npz row {first}: sort",
+    ):
+        with_times(tmp_path, seconds)
 
 
 def test_recordings_that_do_not_fit_are_all_told(tmp_path: Path) -> None:
@@ -156,3 +191,29 @@ def test_a_refused_import_leaves_no_folder_of_its_name(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="not finite"):
         import_dataset([log], tmp_path / "mapping.toml", out=tmp_path / "home/walks/data-1.0.0")
     assert not (tmp_path / "home/walks").exists()
+
+
+def test_what_an_archive_unpacks_to_is_bounded_over_all_its_blocks(tmp_path: Path) -> None:
+    text = write_table(tmp_path / "log.csv", rows()).read_text()
+    head, _, body = text.partition("\n")
+    (tmp_path / "log.csv").write_text(head + "\n" + body * 10)
+    (tmp_path / "mapping.toml").write_text(MAPPING)
+    # Seven fields of 200 rows, eight bytes each.
+    with pytest.raises(BadInputError, match=r"log.csv holds values of 11200 bytes or more, .* --max-bytes"):
+        import_dataset(
+            [tmp_path / "log.csv"], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=11_199
+        )
+    assert not (tmp_path / "out").exists()
+    import_dataset([tmp_path / "log.csv"], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=11_200)
+
+
+def test_a_recording_of_rejected_rows_alone_is_refused_for_them(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.npz", rows() | {"x": np.full(20, np.nan)})
+    with pytest.raises(BadInputError, match=r"20 of 20 rows have values that are not finite.*log\.npz row 0"):
+        imported(tmp_path, path)
+
+
+def test_what_is_given_beside_a_mapping_overrides_it(tmp_path: Path) -> None:
+    log = write_table(tmp_path / "log.npz", rows())
+    dataset, _ = imported(tmp_path, log, name="strolls", fps=25, task="stroll")
+    assert (dataset.description["name"], dataset.info["fps"], dataset.task) == ("strolls", 25, "stroll")

@@ -16,6 +16,7 @@ from astra_data.exchange.mapping import ColumnMapping, ImportMapping, Jump, Spli
         (("fps = 10", "fps = 0"), "fps: expected"),
         (("clip", "clop"), "clop: unknown key"),
         (("clip = [-1, 1]", "clip = [1, -1]"), "expected the lower bound first"),
+        (('names = ["x", "y"]', 'names = ["x", "x"]'), "names has x more than once"),
         (('role = ["position"]', 'role = ["place"]'), "unknown role place, expected position"),
         (("columns.gait", "columns.index"), "column index is filled in"),
         (('columns."next.terminated"', 'columns."next.done"'), "column next.done is filled in"),
@@ -26,6 +27,12 @@ from astra_data.exchange.mapping import ColumnMapping, ImportMapping, Jump, Spli
             ('fields = ["fell"]', 'fields = ["fell"]\ndtype = "int64"'),
             "terminated has dtype int64, expected bool",
         ),
+        (
+            ("[columns.action]", '[columns.action]\ndtype = "int64"'),
+            "column action has dtype int64, expected float32",
+        ),
+        (('"next.terminated"', '"next.terminate"'), "column next.terminate: did you mean 'next.terminated'"),
+        (("columns.gait", 'columns.""'), "column '': expected a name without '/'"),
         (('"int64"', '"float64"'), "gait.dtype: expected 'float32', 'int64' or 'bool'"),
     ],
 )
@@ -58,3 +65,9 @@ def test_a_slip_in_a_columns_name_is_told(tmp_path: Path) -> None:
     path.write_text(MAPPING.replace("[columns.action]", "[columns.actions]"))
     with pytest.raises(RecipeError, match="column actions: did you mean 'action'"):
         load_recipe(path, ImportMapping)
+
+
+def test_a_name_like_that_of_a_column_beside_it_is_no_slip(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace("columns.gait", "columns.actions"))
+    assert "actions" in load_recipe(path, ImportMapping).columns

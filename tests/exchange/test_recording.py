@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.recording import find_sources
+from astra_data.exchange.recording import MOST_UNPACKED, SMALL_BYTES, Source, bounded, find_sources
 
 
 def archive(path: Path, *members: tarfile.TarInfo, content: bytes = b"{}") -> Path:
@@ -100,3 +100,15 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     for path in (tmp_path / "log.csv", Path("/dev/zero")):
         with pytest.raises(BadInputError, match="is a device or a pipe, expected a file or a folder"):
             find_sources(path, [".csv"])
+
+
+def test_small_recordings_may_unpack_to_what_is_small_and_others_to_a_multiple(tmp_path: Path) -> None:
+    for name, size in (("small.npz", 10), ("large.npz", SMALL_BYTES)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(size)
+    sources = [Source(tmp_path / name, None, tmp_path) for name in ("small.npz", "large.npz")]
+    assert [source.most_bytes for source in bounded(sources[:1], None)] == [SMALL_BYTES]
+    assert [source.most_bytes for source in bounded(sources, None)] == [
+        MOST_UNPACKED * (10 + SMALL_BYTES)
+    ] * 2
+    assert [source.most_bytes for source in bounded(sources, 7)] == [7, 7]

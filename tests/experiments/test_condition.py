@@ -12,8 +12,10 @@ from astra_data.cli import app as cli
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
 from astra_data.core.manifest import MANIFEST
 from astra_data.core.progress import silent
+from astra_data.experiments.condition import LOADERS
 from astra_data.experiments.execution import Item
 from astra_data.experiments.run import check, run, run_stage
+from astra_data.stages.registry import STAGES
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 COLLECT = "collect/seed_0"
@@ -225,3 +227,7 @@ def test_a_choice_is_asked_for_by_its_table_which_changes_nothing_else(tmp_path:
     recipe.write_text(rows + "[select]\nsteps = 3\n")
     with pytest.raises(AstraDataError, match=f"select changed in the recipe.* remove {folder}/select$"):
         run(recipe, root=tmp_path, jobs=1)
+
+
+def test_the_result_of_every_stage_is_read_as_others_read_it() -> None:
+    assert LOADERS.keys() == {stage.name for stage in STAGES.values() if stage.result}

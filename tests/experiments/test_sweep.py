@@ -10,7 +10,7 @@ from fake_runs import bare_results, write_json
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.points import RunPoint
+from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.sweep import sweep
 from astra_data.reports.sizes import SizesResults
 
@@ -178,3 +178,16 @@ def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: p
     assert (began["project"], began["name"], ended) == ("ants", "r follower 50 1", "finished")
     assert began["config"]["dataset_hash"] == "hash1"
     assert logged["success"] == 1.0
+
+
+@pytest.mark.parametrize(("until", "made", "pages"), [("subset", "subset", 0), ("ground", "ground", 1)])
+def test_a_sweep_ends_after_the_stage_that_is_named(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: str, made: str, pages: int
+) -> None:
+    told: list[tuple[object, ...]] = []
+    monkeypatch.setattr("astra_data.experiments.sweep.write_errors", lambda *given: told.append(given))
+    folder = sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1, until=until)
+    stages = {path.name for path in folder.iterdir() if path.is_dir()}
+    assert made in stages and not stages & {"train", "evaluate", "report"}
+    assert ("ground" in stages) == (until == "ground")
+    assert [given[1] for given in told] == [Selection(("nas",), (1,), (50,))] * pages

@@ -39,7 +39,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             values: dict[str, Array] = {}
             for field in mapping.all_fields:
                 if field in mapping.fields:
-                    values[field] = _numbers(batch.column(field), f"{source} row {row}: field '{field}'")
+                    values[field] = _numbers(batch.column(field), source, field, row)
                 else:
                     values[field] = np.array(batch.column(field).to_pylist(), dtype=str)
             row += len(batch)
@@ -66,16 +66,29 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
     return mapping.all_fields
 
 
-def _numbers(texts: pa.StringArray, where: str) -> Array:
+def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Array:
+    """Return the numbers of a field's `texts`, the first of which is in `row`."""
     whole = [] if texts.null_count else [pa.int64()]  # An empty cell has no integer value.
     for kind in (*whole, pa.float64(), pa.bool_()):
         try:
             numbers = pc.cast(texts, kind)
-        except pa.ArrowInvalid as error:
-            if kind == pa.float64():
-                not_a_number = str(error)
+        except pa.ArrowInvalid:
             continue
         if kind == pa.int64():
             return np.from_dlpack(numbers)
         return np.from_dlpack(numbers.cast(pa.float64()).fill_null(np.nan))
-    raise BadInputError(f"{where} and below: expected numbers, or true and false ({not_a_number})")
+    cells = list(enumerate(texts.to_pylist()))
+    odd = [cell for cell in cells if not any(_is(cell[1], kind) for kind in (pa.float64(), pa.bool_()))]
+    number, text = (odd or [cell for cell in cells if not _is(cell[1], pa.float64())])[0]
+    raise BadInputError(
+        f"{source} row {row + number}: field '{field}': expected numbers, or true and false, got '{text}'"
+    )
+
+
+def _is(text: str | None, kind: pa.DataType) -> bool:
+    """Return whether a cell is empty or of a kind."""
+    try:
+        pc.cast(pa.array([text], pa.string()), kind)
+    except pa.ArrowInvalid:
+        return False
+    return True

@@ -61,6 +61,10 @@ def pull(
     asked = Version.parse(version.removeprefix("data-")) if version else named
     if named and asked != named:
         raise BadInputError(f"{source} names {named.tag}, but the version asked for is {version}.")
+    if isinstance(where, Hub) and Path(source).is_dir():
+        raise BadInputError(
+            f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub"
+        )
     store: Store = HubStore(where.repo) if isinstance(where, Hub) else UrlStore(where.url)
     known = store.versions()
     if not known:

@@ -52,13 +52,13 @@ def push(
         >>> push("walks", "./shared").rpartition("/shared/")[2]
         'walks@data-1.0.0'
     """
+    place = parse_place(destination)
     local = open_dataset(dataset)
     if local.recorded is not None:
         raise BadInputError(
             f"{local.root} was recorded by LeRobot: make a dataset of it first, with `astra-data subset "
             f"{local.root} --percent 100`"
         )
-    place = parse_place(destination)
     written = load_recipe(notes, Notes) if notes else Notes()
     if private and isinstance(place, Url):
         raise BadInputError(

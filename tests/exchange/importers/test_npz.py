@@ -5,9 +5,10 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from recordings import imported, rows, write_table
+from recordings import STEPS, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import STATE
 from astra_data.exchange.importers import npz
 from astra_data.exchange.importing import import_dataset
 from astra_data.exchange.mapping import ImportMapping
@@ -100,3 +101,13 @@ def test_a_claimed_shape_costs_no_memory(tmp_path: Path) -> None:
     (tmp_path / "mapping.toml").write_text(BOMB_MAPPING)
     ended = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
     assert "BadInputError: log.npz cannot be read as npz" in ended.stderr.splitlines()[-1]
+
+
+def test_arrays_with_a_header_of_the_second_version_are_read(tmp_path: Path) -> None:
+    with ZipFile(tmp_path / "log.npz", "w") as archive:
+        for name, values in rows().items():
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array(file, values, version=(2, 0))  # type: ignore[no-untyped-call]
+    dataset, _ = imported(tmp_path, tmp_path / "log.npz")
+    assert dataset.lengths.tolist() == list(STEPS)
+    assert dataset.columns([STATE])[STATE][0, 0] == np.float32(rows()["x"][0] * 0.001)

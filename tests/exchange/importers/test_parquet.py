@@ -111,3 +111,15 @@ def test_a_mapping_is_asked_for(tmp_path: Path) -> None:
     pq.write_table(pa.table({"a": [1.0]}), tmp_path / "log.parquet")
     with pytest.raises(BadInputError, match="parquet has no standard fields; pass --mapping"):
         import_dataset([tmp_path / "log.parquet"], out=tmp_path / "out")
+
+
+def test_the_values_of_lists_count_and_those_of_other_columns_do_not(tmp_path: Path) -> None:
+    lists = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(3000)), 3)
+    path = tmp_path / "log.parquet"
+    pq.write_table(pa.table({"x": lists, "xy": np.zeros(1000)}), path)
+    mapping = ImportMapping.model_validate(
+        {"name": "n", "task": "t", "fps": 1, "columns": {"x": {"fields": ("x",)}}}
+    )
+    with pytest.raises(BadInputError, match="holds values of 24000 bytes or more"):
+        next(parquet.read(Source(path, None, path, most_bytes=23_999), mapping))
+    assert len(next(parquet.read(Source(path, None, path, most_bytes=24_000), mapping)))

@@ -13,6 +13,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.exchange.importers import torch as importer
 from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.recording import Source
 
 PACE = Path(__file__).parents[3] / "recipes/imports/pace_anymal.toml"
 
@@ -126,3 +127,29 @@ def test_what_unpacks_to_far_more_than_its_size_is_refused(
     torch.save({name: torch.zeros(1, 2).expand(10**9, 2) for name in log}, tmp_path / "claims.pt")
     with pytest.raises(BadInputError, match="--max-bytes"):
         import_dataset([tmp_path / "claims.pt"], PACE, out=tmp_path / "out")
+
+
+def test_two_rows_of_a_log_of_pace_tell_its_rate(tmp_path: Path) -> None:
+    log = {
+        "time": torch.tensor([0.0, 0.0025]),
+        "dof_pos": torch.zeros(2, 1),
+        "des_dof_pos": torch.zeros(2, 1),
+    }
+    path = tmp_path / "log.pt"
+    torch.save(log, path)
+    assert importer.layout(Source(path, None, path))["fps"] == 400
+    torch.save({name: values[:1] for name, values in log.items()}, path)
+    with pytest.raises(BadInputError, match="expected times that rise"):
+        importer.layout(Source(path, None, path))
+
+
+def test_a_log_of_pace_is_cut_where_its_clock_steps_back(tmp_path: Path) -> None:
+    clock = torch.arange(40) / 100.0
+    log = {
+        "time": torch.cat([clock, clock + 0.2]),
+        "dof_pos": torch.zeros(80, 1),
+        "des_dof_pos": torch.zeros(80, 1),
+    }
+    torch.save(log, tmp_path / "log.pt")
+    report = import_dataset([tmp_path / "log.pt"], name="log", out=tmp_path / "out")
+    assert (report.episodes, report.frames, report.tally.split_points) == (2, 78, {"back": 1})

@@ -93,6 +93,15 @@ def test_killed_at_any_moment_a_pull_leaves_nothing_unreadable(
     assert told.stdout.splitlines()[-1] == "whole"
 
 
+def test_a_folder_here_is_not_looked_for_on_the_hub(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine/fake").mkdir(parents=True)
+    with pytest.raises(BadInputError, match=r"mine/fake is a folder here: pull ./mine/fake, or hf://"):
+        pull("mine/fake")
+
+
 def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_path: Path) -> None:
     first = pull(source(shared), out=tmp_path / "out")
     (shared / DATA).unlink()

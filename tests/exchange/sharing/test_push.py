@@ -53,6 +53,11 @@ def test_private_is_refused_where_the_storage_decides(fake: Dataset, tmp_path: P
     assert not (tmp_path / "shared").exists()
 
 
+def test_a_place_that_is_none_is_told_before_the_dataset_is_opened(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="shared: expected user/name or "):
+        push(tmp_path / "none", "shared")
+
+
 def test_altered_values_are_not_pushed(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "mine")
     description = json.loads((dataset.root / "meta/astra/dataset.json").read_text())

@@ -227,3 +227,33 @@ def test_a_topple_of_a_robot_without_a_ball_is_copied() -> None:
     assert copied is not None and copied.steps == slice(0, 20)
     assert copied.columns[TERMINATED].tolist() == last.tolist()
     assert copied.columns[REWARD][-1] == pytest.approx(-10.0, abs=0.1)
+
+
+def test_the_shortest_stretch_has_as_many_steps_as_asked_for() -> None:
+    path = straight((-4.0, 4.0), (4.0, 4.0), 20)
+    assert relocation(min_steps=20).stretches(path) == [(0, 20)]
+    assert relocation(min_steps=21).stretches(path) == []
+
+
+def test_stretches_are_drawn_as_often_as_they_are_long() -> None:
+    path = straight((-4.0, 4.0), (4.0, 4.0), 100)
+    path.columns[STATE][69:75, 1] = 2.5
+    drawn = [
+        steps.start
+        for _, steps in relocation(rotations="none", tries=400).placements(path, np.random.default_rng(0))
+    ]
+    # 69 steps, and the 25 behind them.
+    assert set(drawn) == {0, 75}
+    assert np.mean(np.array(drawn) == 0) == pytest.approx(69 / 94, abs=0.07)
+
+
+def test_positions_are_those_of_the_abstract_state_wherever_they_stand() -> None:
+    def turned_round(states: Any) -> Any:  # noqa: ANN401
+        return states[..., [7, 1, 0]]
+
+    role = replace(
+        TASK.abstract_state, size=3, names=None, astra={"role": ["invariant", "position", "position"]}
+    )
+    task = replace(TASK, abstraction=turned_round, abstract_state=role)
+    states: Array = np.arange(58, dtype=np.float32).reshape(2, 29)
+    assert positions(task, states).tolist() == [[1, 0], [30, 29]]
