@@ -260,7 +260,8 @@ class Cutter:
             self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
         begins[0] |= self._kept_before is None
         self._kept_before = counters[:, -1:], None if where is None else where[-1:]
-        return begins, reasons[: REASONS.index("end")].any(axis=0)
+        is_new: Mask = np.asarray(reasons[: REASONS.index("end")].any(axis=0))
+        return begins, is_new
 
 
 def _held(times: Array) -> Array:

@@ -64,7 +64,7 @@ _TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
 _ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
 LENGTH = re.compile(
-    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?[xyz]"
+    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
 )
 _FULL_TURNS = 4 * math.pi
 """An angle beyond it is taken for degrees."""

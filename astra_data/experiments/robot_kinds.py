@@ -110,14 +110,18 @@ class Direct:
 
     @classmethod
     def of(cls, logs: Logs) -> Self:
-        """Return how it fits: commands move the states of their names, or else the first ones."""
+        """Return how it fits: commands move the states of their names, or else the first that may be."""
         left = {field.short: field for field in logs.of("state")}
         moved: list[Field | None] = []
         for command in logs.of("command"):
             names = (command.short, _SPEED.sub("", command.short), command.short.lstrip("u"))
             moved.append(next((left.pop(name) for name in names if name in left), None))
-        rest = iter([field for short, field in left.items() if not _SPEED.match(short)])
-        filled = [field or next(rest, None) for field in moved]
+        rest = [field for short, field in left.items() if not _SPEED.match(short)]
+        filled = []
+        for command, named in zip(logs.of("command"), moved, strict=True):
+            field = named or next((one for one in rest if _may_move(command, one)), None)
+            rest = [one for one in rest if one is not field]
+            filled.append(field)
         found = tuple(field for field in filled[: _length(filled)] if field)
         if not found:
             raise BadInputError(
@@ -165,6 +169,11 @@ class Direct:
             "command": _numbers(np.ones(actions)),
             "after": _numbers(landed),
         }
+
+
+def _may_move(command: Field, state: Field) -> bool:
+    """Return whether the units, where both are known, are the same but for a time."""
+    return "1" in (command.unit, state.unit) or command.unit.removesuffix("/s") == state.unit
 
 
 def _length(filled: list[Field | None]) -> int:

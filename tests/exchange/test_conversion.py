@@ -182,8 +182,8 @@ def test_whole_numbers_are_exact_to_their_bounds() -> None:
 
 
 def test_a_next_state_that_was_recorded_keeps_its_own_description() -> None:
-    columns = {STATE: {"fields": ("f",)}, NEXT_STATE: {"fields": ("f",), "meaning": "seen", "unit": ("m",)}}
-    made = converter(columns)
+    seen = {"fields": ("f",), "meaning": "seen", "unit": ("m",)}
+    made = converter({STATE: {"fields": ("f",)}, NEXT_STATE: seen})
     made.convert(Block({"f": np.zeros(2)}, "log"))
     found = {column.name: column for column in made.columns}[NEXT_STATE]
     assert (found.meaning, found.astra) == ("seen", {"unit": ["m"]})

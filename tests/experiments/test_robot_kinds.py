@@ -71,6 +71,19 @@ def test_commands_move_the_states_of_their_names_or_the_first(tmp_path: Path) ->
     )
 
 
+def test_no_command_moves_a_state_of_another_unit(tmp_path: Path) -> None:
+    columns = {"x_m": T, "y_m": T % 9, "tilt_rad": T % 3 / 9, "cmd_w_rad_s": T % 2, "cmd_v_m_s": T % 3}
+    kind = Direct.of(logs(tmp_path, **columns))
+    assert [field.short for field in kind.moved] == ["tilt", "x"]
+    with pytest.raises(BadInputError, match="found no state that a command could move"):
+        Direct.of(logs(tmp_path, x_m=T, cmd_w_rad_s=T % 2))
+
+
+def test_positions_may_be_called_px_and_py(tmp_path: Path) -> None:
+    kind = Planar.of(logs(tmp_path, px=T, py=T % 9, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
+    assert kind is not None and [field.short for field in kind.position] == ["px", "py"]
+
+
 def test_commands_may_be_where_to_be(tmp_path: Path) -> None:
     q = np.concatenate([[0.0], T[:-1] % 5])
     kind = Direct.of(logs(tmp_path, q1=q, cmd_q1=T % 5, cmd_q2=T % 3))
