@@ -29,7 +29,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.sharing.pull import pull
-from astra_data.worlds.expecting import expect
+from astra_data.worlds.expecting import judged, paid
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
@@ -114,17 +114,14 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     over = torch.zeros(len(episode), dtype=torch.bool)
     if TERMINATED in given:
         over = torch.from_numpy(given[TERMINATED])
-    missed = _judged(task, "missed", after, goal)
+    missed = judged(task.objective, "missed", after, goal)
     reached = (
         torch.from_numpy(given[SUCCESS])
         if SUCCESS in given
-        else _judged(task, "reached", after, goal) & ~over
+        else judged(task.objective, "reached", after, goal) & ~over
     )
     failed = (over | missed) & ~reached
-    what = "objective.reward(before, after, goal, failed)"
-    with explained(what):
-        paid = task.objective.reward(before, after, goal, failed)
-    reward = expect(what, paid, (len(episode),)).numpy()
+    reward = paid(task.objective, before, after, goal, failed).numpy()
     terminated = (reached | failed).numpy()
     length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
     truncated = np.zeros(len(episode), bool)
@@ -148,14 +145,6 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
         {key: values[:length] for key, values in columns.items()},
         metadata | dict(episode.metadata),
     )
-
-
-def _judged(task: Task, name: str, state: Tensor, goal: Tensor) -> Tensor:
-    """Return which states (T, X) the objective calls "reached" or "missed", (T,) bool."""
-    what = f"objective.{name}(state, goal)"
-    with explained(what):
-        found = getattr(task.objective, name)(state, goal)
-    return expect(what, found, (len(state),), torch.bool)
 
 
 def _opened(data: str | Path) -> Dataset:

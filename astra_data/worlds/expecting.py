@@ -1,9 +1,11 @@
-"""Errors of one line about tensors that are not as expected."""
+"""Errors of one line about tensors that are not as expected, and about objectives that return them."""
 
 import torch
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.worlds.objective import Objective
+from astra_data.worlds.own_code import explained
 
 
 def expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype | None = None) -> Tensor:
@@ -30,3 +32,27 @@ def expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype 
 def first(values: Tensor) -> float:
     """Return the first of `values`, of any shape."""
     return float(values.flatten()[0])
+
+
+def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tensor:
+    """Return which states (B, X) are "reached" or "missed", as `name` says, (B,) bool.
+
+    Raises:
+        BadInputError: the objective fails, or returns something else.
+    """
+    what = f"objective.{name}(state, goal)"
+    with explained(what):
+        found = getattr(objective, name)(state, goal)
+    return expect(what, found, (len(state),), torch.bool)
+
+
+def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+    """Return the rewards (B,) of steps between states (B, X).
+
+    Raises:
+        BadInputError: the objective fails, or returns something else.
+    """
+    what = "objective.reward(before, after, goal, failed)"
+    with explained(what):
+        found = objective.reward(before, after, goal, failed)
+    return expect(what, found, (len(after),))

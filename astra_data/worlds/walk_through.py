@@ -8,7 +8,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
-from astra_data.worlds.expecting import expect, first
+from astra_data.worlds.expecting import expect, first, judged, paid
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import Task
@@ -157,16 +157,10 @@ def _observation(task: Task, state: Tensor, goal: Tensor) -> None:
 
 def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:
     for name in ("reached", "missed"):
-        what = f"objective.{name}(state, goal)"
-        with explained(what):
-            found = getattr(task.objective, name)(state, goal)
-        expect(what, found, (_COUNT,), torch.bool)
+        judged(task.objective, name, state, goal)
     return True
 
 
 def _reward(task: Task, before: Tensor, after: Tensor, goal: Tensor) -> None:
-    what = "objective.reward(before, after, goal, failed)"
     for failed in (False, True):
-        with explained(what):
-            found = task.objective.reward(before, after, goal, torch.full((_COUNT,), failed))
-        expect(what, found, (_COUNT,))
+        paid(task.objective, before, after, goal, torch.full((_COUNT,), failed))
