@@ -52,8 +52,7 @@ def run(
 
     with resumable():
         folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
-        show_errors(folder, until)
-        typer.echo(f"finished: {folder}{pages(folder, until)}")
+        show_made(folder, until)
 
 
 def check(
@@ -186,27 +185,23 @@ def run_stage(
         typer.echo(f"finished: {folder}")
 
 
-def show_errors(folder: Path, until: str | None) -> None:
-    """Print the page of held-out errors of a run that ends with its groundings."""
-    from astra_data.reports.held_out import PAGE
+def show_made(folder: Path, until: str | None, *others: Path) -> None:
+    """Print what a run that went on `until` a stage has written: its pages and `others` to look at.
 
-    if until == "ground" and (folder / PAGE).is_file():
-        typer.echo((folder / PAGE).read_text())
-        typer.echo(f"written: {folder / PAGE}")
-
-
-def pages(folder: Path, until: str | None) -> str:
-    """Return which pages of a run that went on `until` a stage there are to look at, in brackets."""
+    Where it ends with its groundings, print the page of their held-out errors.
+    """
     from astra_data.experiments.plan import stages_until
     from astra_data.reports.held_out import PAGE
     from astra_data.reports.html_page import HTML
 
     made = stages_until(until)
-    written = [
+    pages = [
         folder / page for stage, page in (("ground", PAGE), ("report", f"report/{HTML}")) if stage in made
     ]
-    there = ", ".join(str(page) for page in written if page.is_file())
-    return f" (look at {there})" if there else ""
+    written = [str(file) for file in (*pages, *others) if file.is_file()]
+    if until == "ground" and pages[0].is_file():
+        typer.echo(pages[0].read_text())
+    typer.echo(f"finished: {folder}" + (f" (look at {', '.join(written)})" if written else ""))
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:

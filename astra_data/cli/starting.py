@@ -25,11 +25,13 @@ def new(
     from astra_data.experiments.new_robot import write_robot
 
     folder = out or Path(name)
-    found = write_robot(name, folder, logs or ())
+    kind = write_robot(name, folder, logs or ())
+    found = kind.logs
     table = Table("field", "taken for", "unit", "factor", "why")
     for field in found.fields:
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
     Console().print(table)
+    typer.echo(f"abstract simulator: {kind.simulator}")
     if not found.of("time"):
         typer.echo(f"none of them is a time: {found.rate} rows a second were taken; set fps and TIMESTEP_S")
     for name, count in found.left_out.items():

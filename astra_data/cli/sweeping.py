@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.recipes import RUNS, Device, Jobs, RecipePath, Root, Seeds, Until, resumable, show_errors
+from astra_data.cli.recipes import RUNS, Device, Jobs, RecipePath, Root, Seeds, Until, resumable, show_made
 from astra_data.core.errors import BadInputError
 
 
@@ -71,5 +71,4 @@ def sweep(
             trackio=trackio,
             until=until,
         )
-        show_errors(folder, until)
-        typer.echo(f"finished: {folder} (points: {folder / 'sweep.csv'})")
+        show_made(folder, until, folder / "sweep.csv")

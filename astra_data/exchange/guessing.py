@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -24,10 +25,7 @@ _NAMES: tuple[tuple[Role, str], ...] = (
     ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
     ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
     ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
-    (
-        "failure",
-        r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|collision|collided|fault|terminated",
-    ),
+    ("failure", r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|colli(sion|ded)|fault|terminated"),
     ("success", r"success|succeeded|reached|delivered|solved"),
     ("reward", r"reward"),
     (
@@ -223,35 +221,38 @@ def _field(name: str, values: Floats) -> Field:
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     if not plain:
         return Field(name, "left out", plain, "1", 1.0, "no letter a to z and no digit in its name")
+    left_out = partial(Field, name, "left out", plain, "1", 1.0)
     body, ending = _without_unit(plain, _TIMES)
     if re.fullmatch(_NAMES[0][1], body):
         _check_finite(name, "time", values)
         if (np.diff(values) > 0).mean() <= 0.9:
-            return Field(name, "left out", plain, "1", 1.0, "a time that does not rise")
+            return left_out("a time that does not rise")
         step = float(np.median(np.diff(values)))
         unit = ending or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
         why = "its ending" if ending else f"steps of {step:g}"
         return Field(name, "time", "time", unit, _TIMES[unit], why)
     if re.fullmatch(_UNCLEAR, plain):
-        return Field(name, "left out", plain, "1", 1.0, "an end, but which? name it success or failed")
+        return left_out("an end, but which? name it success or failed")
     body, ending = _without_unit(plain, [end for end, _, _ in _UNITS])
     if ending in ("n", "v", "a") and re.fullmatch(f"{_COMMANDED}|u", body):
         body, ending = plain, None  # an axis, as in cmd_v
+    is_flag = bool(np.isin(values, (0, 1)).all())
     for role, pattern in _NAMES[1:]:
         if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
-            if role in ("failure", "success") and not np.isin(values, (0, 1)).all():
+            if role in ("failure", "success") and not is_flag:
                 continue
             if role != "command":
                 return Field(name, role, role, "1", 1.0, "its name")
             _check_finite(name, "command", values)
             if np.ptp(values) == 0:
-                return Field(name, "left out", plain, "1", 1.0, "never changes")
+                return left_out("never changes")
             short = _COMMAND.sub("_", body).strip("_") or "command"
             return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
     finite = np.isfinite(values)
     if finite.mean() <= _MOSTLY or np.ptp(values[finite]) == 0:
-        why = "never changes" if finite.all() else f"no number in {(~finite).sum()} rows"
-        return Field(name, "left out", plain, "1", 1.0, why)
+        return left_out("never changes" if finite.all() else f"no number in {(~finite).sum()} rows")
+    if is_flag:
+        return left_out("0 or 1: name it success or failed if it is an end")
     return _with_unit(name, "state", f"s{body}" if body[0].isdigit() else body, ending, values)
 
 

@@ -29,8 +29,8 @@ _TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "
 """Names whose file would be found in place of a module, or is that of the mapping."""
 
 
-def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Logs:
-    """Write the new folder `out` of the robot `name`; return what its logs hold.
+def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Direct:
+    """Write the new folder `out` of the robot `name`; return the simulator that it begins with, and its logs.
 
     Args:
         name: of the task: a-z, digits and _, and no module's.
@@ -51,6 +51,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Logs:
         found = guess(places or [folder / "logs"])
         kind = Planar.of(found) or Direct.of(found)
         values = _common(name, found) | kind.values()
+        values["simulator"] = kind.simulator
         values["logs"] = " ".join(map(str, places)) or "logs"
         for template, written in {
             kind.template: f"{name}.py",
@@ -61,7 +62,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Logs:
         }.items():
             text = (files("astra_data.experiments") / f"robot_files/{template}.template").read_text()
             (folder / written).write_text(Template(text).substitute(values))
-    return found
+    return kind
 
 
 def _common(name: str, logs: Logs) -> dict[str, str]:

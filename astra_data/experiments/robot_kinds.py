@@ -31,6 +31,15 @@ class Planar:
 
     template = "unicycle.py"
 
+    @property
+    def simulator(self) -> str:
+        """What it is and what moves it, in a few words."""
+        moved, told = (
+            ", ".join(field.short for field in fields)
+            for fields in ((*self.position, *self.heading), self.logs.of("command"))
+        )
+        return f"a unicycle: {moved}, driven by {told}"
+
     @classmethod
     def of(cls, logs: Logs) -> Self | None:
         """Return how it fits; None if it does not."""
@@ -107,6 +116,13 @@ class Direct:
     is_rate: bool
 
     template = "direct.py"
+
+    @property
+    def simulator(self) -> str:
+        """What it is and what moves it, in a few words."""
+        pairs = zip(self.moved, self.logs.of("command"), strict=False)
+        listed = ", ".join(f"{state.short} by {command.short}" for state, command in pairs)
+        return f"values that {'change' if self.is_rate else 'are where they are put'} as commanded: {listed}"
 
     @classmethod
     def of(cls, logs: Logs) -> Self:

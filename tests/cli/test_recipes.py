@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
-from astra_data.cli.recipes import pages, refuse
+from astra_data.cli.recipes import refuse, show_made
 from astra_data.core.errors import AstraDataError, BadInputError
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
@@ -31,14 +31,28 @@ def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) 
         call("run", str(recipe), "--until", "x")
 
 
-def test_a_run_ends_with_the_pages_to_look_at(tmp_path: Path) -> None:
-    assert pages(tmp_path, None) == ""
-    (tmp_path / "gap.md").touch()
+@pytest.mark.parametrize(
+    ("until", "looked_at", "shown"),
+    [
+        (None, ["gap.md", "report/results.html", "more"], ""),
+        ("ground", ["gap.md", "more"], "held-out errors\n"),
+        ("align", ["gap.md", "more"], ""),
+        ("pair", ["more"], ""),
+    ],
+)
+def test_a_run_ends_with_the_pages_to_look_at(
+    tmp_path: Path, until: str | None, looked_at: list[str], shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    others = tmp_path / "more", tmp_path / "none"
+    show_made(tmp_path, until, *others)
+    assert capsys.readouterr().out == f"finished: {tmp_path}\n"
+    (tmp_path / "gap.md").write_text("held-out errors")
     (tmp_path / "report").mkdir()
-    (tmp_path / "report/results.html").touch()
-    assert pages(tmp_path, None) == f" (look at {tmp_path}/gap.md, {tmp_path}/report/results.html)"
-    assert pages(tmp_path, "align") == f" (look at {tmp_path}/gap.md)"
-    assert pages(tmp_path, "pair") == ""
+    for page in (tmp_path / "report/results.html", others[0]):
+        page.touch()
+    show_made(tmp_path, until, *others)
+    listed = ", ".join(str(tmp_path / page) for page in looked_at)
+    assert capsys.readouterr().out == f"{shown}finished: {tmp_path} (look at {listed})\n"
 
 
 @pytest.mark.parametrize(

@@ -22,12 +22,15 @@ def asked_of(recipe: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> di
 
     def sweep(path: Path, **given: object) -> Path:
         asked.append(given)
-        return path.parent / "r"
+        folder = path.parent / "r"
+        folder.mkdir()
+        (folder / "sweep.csv").touch()
+        return folder
 
     monkeypatch.setattr("astra_data.experiments.sweep.sweep", sweep)
     result = CliRunner().invoke(cli.app, ["sweep", str(recipe), *options])
     folder = recipe.parent / "r"
-    assert result.output == f"finished: {folder} (points: {folder / 'sweep.csv'})\n"
+    assert result.output == f"finished: {folder} (look at {folder / 'sweep.csv'})\n"
     return asked[0]
 
 

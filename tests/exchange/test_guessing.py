@@ -99,6 +99,13 @@ def test_names_of_ros_are_read(tmp_path: Path) -> None:
     assert logs.fields[-1].why == "an end, but which? name it success or failed"
 
 
+def test_a_flag_is_no_state_and_its_end_is_to_be_named(tmp_path: Path) -> None:
+    columns = {"x": RAMP, "cmd": RAMP, "arrived": RAMP > 4, "gear": 1 + (RAMP > 4), "failed": RAMP > 4}
+    fields = guess([write(tmp_path / "log.csv", columns)]).fields
+    assert [field.role for field in fields] == ["state", "command", "left out", "state", "failure"]
+    assert fields[2].why == "0 or 1: name it success or failed if it is an end"
+
+
 def test_a_time_that_does_not_rise_is_left_out(tmp_path: Path) -> None:
     logs = guess([write(tmp_path / "log.csv", {"stamp": RAMP // 4, "x": RAMP, "cmd": RAMP})])
     assert (logs.fields[0].role, logs.fields[0].why) == ("left out", "a time that does not rise")

@@ -111,7 +111,10 @@ def test_a_twist_of_six_fields_is_a_unicycle(tmp_path: Path) -> None:
     )
     table = np.column_stack([rows / 20, *pose, *twist])
     np.savetxt("log.csv", table, "%.4f", ",", header=header, comments="")
-    command("new rover --from log.csv")
+    driven = "a unicycle: pose_x, pose_y, pose_yaw, driven by vel_linear_x, vel_angular_z"
+    shown = CliRunner().invoke(app, ["new", "rover", "--from", "log.csv"])
+    assert f"abstract simulator: {driven}\n" in shown.output
+    assert driven in Path("rover/README.md").read_text()
     command("import log.csv --mapping rover/logs.toml")
     assert "class Unicycle" in Path("rover/rover.py").read_text()
     task = task_named("rover/rover.py:TASK")
