@@ -159,7 +159,7 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
             "t: expected a number in each row of a time, got none in 1 of 3: leave",
         ),
         ("x,cmd\n0,0\n1,nan\n2,inf\n", "cmd: expected a number in each row of a command, got none in 2 of 3"),
-        ("x_mm,x_cm,cmd\n0,0,0\n1,1,1\n", "x_mm and x_cm are both taken for state x: rename one"),
+        ("x_mm,x_cm,cmd\n0,0,0\n1,1,1\n2,2,2\n", "x_mm and x_cm are both taken for state x: rename one"),
         ("x,cmd_v,u_v\n0,0,0\n1,1,1\n", "cmd_v and u_v are both taken for command v: rename one"),
         (
             "x;cmd\n0;1\n1;2\n",
