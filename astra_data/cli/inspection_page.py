@@ -26,7 +26,7 @@ def inspection_page(inspection: Inspection, checkup: Checkup) -> RenderableType:
     parts += [Text(line) for line in checkup.summary]
     parts += [Text(str(finding), style=_STYLES[finding.severity]) for finding in checkup.findings]
     if not checkup.findings:
-        parts.append(Text("no findings"))
+        parts.append(Text("no findings in the values; `astra-data validate` reads all files"))
     return Group(*parts)
 
 
