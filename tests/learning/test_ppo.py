@@ -198,8 +198,9 @@ def test_an_epoch_learns_from_every_row_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
-    with_memory = train(ppo(Recall(64), 60, horizon=100, memory=8, learning_rate=5e-3))
-    without = train(ppo(Recall(64), 60, horizon=100, learning_rate=5e-3))
+    settings: dict[str, Any] = {"horizon": 100, "learning_rate": 1e-2, "minibatches": 2}
+    with_memory = train(ppo(Recall(32), 25, memory=8, **settings))
+    without = train(ppo(Recall(32), 25, **settings))
     # An episode of three steps is worth at most 1.
     assert 3 * fmean(point["reward"] for point in with_memory[-5:]) > 0.7
     assert 3 * fmean(point["reward"] for point in without[-5:]) < 0.2

@@ -53,11 +53,11 @@ def distance_after(policy: SoftActor, steps: int) -> float:
 
 @pytest.mark.parametrize("memory", [0, 8])
 def test_learns_to_go_to_a_target(memory: int) -> None:
-    learner = sac(GoToZero(16), 150, horizon=20, memory=memory, window=8, burn_in=2, batch_size=128)
+    learner = sac(GoToZero(16), 100, horizon=20, memory=memory, window=8, burn_in=2, batch_size=128)
     assert distance_after(learner.policy, 10) > 0.5
     metrics = train(learner)
     assert distance_after(learner.policy, 10) < 0.15
-    assert learner.steps == 150 * 16
+    assert learner.steps == 100 * 16
     assert metrics[-1]["reward"] > metrics[0]["reward"]
 
 
@@ -115,8 +115,9 @@ def test_recorded_actions_are_imitated_where_rewards_leave_the_choice(memory: in
         "window": 6,
         "burn_in": 2,
         "imitation_weight": 1.0,
+        "learning_rate": 3e-3,
     }
-    learner = sac(ConstantReward(16, math.inf), 200, recorded=recorded, **settings)
+    learner = sac(ConstantReward(16, math.inf), 100, recorded=recorded, **settings)
     train(learner)
     with torch.no_grad():
         hidden = learner.policy.initial_hidden(1)
@@ -138,14 +139,14 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(
     horizon = 10 if terminates_after > 10 else 1000
     env = ConstantReward(16, terminates_after)
     learner = sac(
-        *(env, 400),
+        *(env, 100),
         horizon=horizon,
         memory=memory,
         window=4,
         burn_in=1,
-        target_rate=0.05,
+        target_rate=0.2,
         initial_temperature=1e-6,
-        learning_rate=3e-3,
+        learning_rate=5e-3,
     )
     train(learner)
     begun = torch.ones(1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1)
@@ -314,9 +315,9 @@ def test_it_learns_so_often_after_each_step_that_a_window_is_kept(monkeypatch: p
 
 
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
-    settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 192}
-    with_memory = train(sac(Recall(32), 300, memory=8, **settings))
-    without = train(sac(Recall(32), 300, **settings))
+    settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 96}
+    with_memory = train(sac(Recall(32), 120, memory=8, learning_rate=3e-3, **settings))
+    without = train(sac(Recall(32), 120, learning_rate=3e-3, **settings))
     # An episode of three steps is worth at most 1.
     assert 3 * with_memory[-1]["reward"] > 0.7
     assert 3 * without[-1]["reward"] < 0.3

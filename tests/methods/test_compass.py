@@ -91,7 +91,7 @@ def test_planted_joints_are_found(tmp_path: Path) -> None:
     planted = {"friction": 1.15, "action_scale": 0.03, "timestep_scale": 1.3}
     wide = task.varied.wide.model_copy(update={"action_noise": (0.0, 0.0)})
     settings = CompassConfig(
-        **wide.model_dump(), contexts=64, windows=60, window=15, updates=1500, iterations=4
+        **wide.model_dump(), contexts=32, windows=30, window=10, updates=600, iterations=3
     )
     grounding, metrics = identify(fitting(tmp_path, settings, task=task, planted=planted))
     point = metrics["point"]
