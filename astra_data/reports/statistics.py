@@ -120,31 +120,39 @@ def correlation(
     Returns:
         None where there are fewer than three seeds in all, or one side does not vary.
     """
+    counts, rng = [len(scores) for scores in first], np.random.default_rng(0)
+    begins = np.cumsum([0, *counts[:-1]])
+    one, other = (np.concatenate(scores) for scores in (first, second))
+
+    def resample() -> NDArray[np.intp]:
+        rows = rng.integers(len(counts), size=len(counts))
+        return np.concatenate([begins[row] + rng.integers(counts[row], size=counts[row]) for row in rows])
+
+    value = float(_coefficients(one[None], other[None], ranks=ranks)[0])
+    if len(one) < 3 or np.isnan(value):
+        return None
+    # Where rows differ in their number of seeds, so do resamples.
+    by_size: dict[int, list[NDArray[np.intp]]] = {}
+    for drawn in (resample() for _ in range(replicates)):
+        by_size.setdefault(len(drawn), []).append(drawn)
+    replicated = [
+        _coefficients(one[np.array(drawn)], other[np.array(drawn)], ranks=ranks) for drawn in by_size.values()
+    ]
+    low, high = np.nanquantile(np.concatenate(replicated), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Correlation(value, float(low), float(high))
+
+
+def _coefficients(one: Floats, other: Floats, *, ranks: bool) -> Floats:
+    """Correlate each row of `one` (R, N) with that of `other`: (R,), not a number where one does not vary."""
     from scipy.stats import rankdata
 
-    rng = np.random.default_rng(0)
-
-    def of(rows: NDArray[np.intp], seeds: Sequence[NDArray[np.intp]]) -> float:
-        pairs = [
-            np.concatenate([scores[row][drawn] for row, drawn in zip(rows, seeds, strict=True)])
-            for scores in (first, second)
-        ]
-        # A resample in which one side does not vary has no correlation.
-        if not all(map(np.ptp, pairs)):
-            return np.nan
-        one, other = map(rankdata, pairs) if ranks else pairs
-        return float(np.corrcoef(one, other)[0, 1])
-
-    def resampled() -> float:
-        rows = rng.integers(len(first), size=len(first))
-        return of(rows, [rng.integers(len(first[row]), size=len(first[row])) for row in rows])
-
-    value = of(np.arange(len(first)), [np.arange(len(scores)) for scores in first])
-    if sum(map(len, first)) < 3 or np.isnan(value):
-        return None
-    replicated = [resampled() for _ in range(replicates)]
-    low, high = np.nanquantile(replicated, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Correlation(value, float(low), float(high))
+    varies = (np.ptp(one, axis=1) > 0) & (np.ptp(other, axis=1) > 0)
+    pair = [rankdata(side, axis=1) if ranks else side for side in (one, other)]
+    one, other = (side - side.mean(axis=1, keepdims=True) for side in pair)
+    products = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
+    found = np.full(len(one), np.nan)
+    np.divide((one * other).sum(axis=1), products, out=found, where=varies)
+    return found
 
 
 def mean_interval(shares: Sequence[float]) -> tuple[float, float]:
