@@ -23,6 +23,12 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
+def quick_failures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit failure models in a few updates, where what they foresee does not matter."""
+    importlib.import_module("rail_run").fit_failures_quickly(monkeypatch)
+
+
+@pytest.fixture
 def forgotten_methods() -> Iterator[None]:
     """Forget afterwards the methods of one's own that a test adds to this process."""
     methods, policies = (

@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from astra_data.core.progress import silent
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.plan import plan, stage_of
+from astra_data.learning.descent import DescentConfig
 
 ROOT = Path(__file__).parents[1]
 SMALL = """
@@ -48,8 +51,15 @@ def make_rail_run(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", m
     path = write_recipe(place, seeds=seeds, methods=methods, more=more)
     experiment = load_experiment(path, place / "runs")
     made = ("collect", "pair", "subset", "ground", "train", "align")
-    for item in plan(experiment.recipe, path, experiment.folder):
-        if stage_of(item) in made:
-            item.call(progress=silent)
+    with pytest.MonkeyPatch.context() as patch:
+        fit_failures_quickly(patch)
+        for item in plan(experiment.recipe, path, experiment.folder):
+            if stage_of(item) in made:
+                item.call(progress=silent)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     return experiment.folder
+
+
+def fit_failures_quickly(patch: pytest.MonkeyPatch) -> None:
+    """Make failure models of a few updates, which foresee nothing."""
+    patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=3))

@@ -11,6 +11,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.experiments.selecting import select
 from astra_data.training.judging import Judge
 
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:

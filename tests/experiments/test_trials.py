@@ -20,6 +20,8 @@ from astra_data.reports.trials import TrialsFile
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
 
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:

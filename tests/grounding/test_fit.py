@@ -206,6 +206,7 @@ def test_no_failure_model_is_fitted_to_failures_that_abstract_states_show(
     assert grounding.failures is None and set(metrics["failures"]) == {"topple_head"}
 
 
+@pytest.mark.usefixtures("quick_failures")
 def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: Path) -> None:
     config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8)
     training, held_out = episodes(0), episodes(1, 3)
@@ -231,6 +232,7 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
     assert "failure_steps" not in config.model_dump() and asked.model_dump()["failure_steps"] == 3
 
 
+@pytest.mark.usefixtures("quick_failures")
 @pytest.mark.parametrize("reward", ["whole", "correction"])
 def test_what_is_told_of_a_fit_is_measured_on_held_out_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reward: str

@@ -175,6 +175,7 @@ def test_a_fit_has_it_if_it_is_asked_to(tmp_path: Path, used: bool) -> None:
 
 
 @pytest.mark.parametrize("foresees", [False, True])
+@pytest.mark.usefixtures("quick_failures")
 def test_rpred_learns_failures_only_where_no_failure_model_replaces_it(
     tmp_path: Path, foresees: bool
 ) -> None:

@@ -15,6 +15,8 @@ from astra_data.reports.runs import Reported
 from astra_data.stages.select import SelectConfig, benches, judge_of, select
 from astra_data.training.judging import Judge
 
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
 ROWS, SEEDS = ("direct_transfer", "nas"), (0, 1, 2)
 
 

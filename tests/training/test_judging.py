@@ -22,6 +22,8 @@ from astra_data.training.policy_file import PolicyFile, deploy
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.protocols import PlacedSimulator
 
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
