@@ -142,6 +142,16 @@ def test_episodes_can_begin_where_the_task_does(task: str, tmp_path: Path) -> No
     assert np.abs(position - maze.cell_centre(*maze.start)).max() < 0.7
 
 
+@pytest.fixture
+def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    sac = suboptimal._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
+    small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TRIALS": 2}
+    for name, value in small.items():
+        monkeypatch.setattr(suboptimal, name, value)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+
+
+@pytest.mark.usefixtures("small_training")
 def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"behavior": "suboptimal_ppo", "ppo_steps": 1, "max_steps": 3})
     hashes = []
@@ -152,9 +162,10 @@ def test_a_policy_stopped_early_acts(task: str, tmp_path: Path) -> None:
     assert hashes[0] == hashes[1]
     dataset = Dataset.open(out)
     assert dataset.reference == f"{TASK}-suboptimal-ppo-seed0@data-1.0.0"
-    assert dataset.description["behavior"]["trained_steps"] == 64 * 128  # an iteration
+    assert dataset.description["behavior"]["trained_steps"] == 64 * 4  # an iteration
 
 
+@pytest.mark.usefixtures("small_training")
 def test_a_part_of_a_policys_episodes_may_have_random_commands(task: str, tmp_path: Path) -> None:
     datasets = {}
     kinds = (("policy", "suboptimal_ppo", 0.0), ("random", "random", 0.0), ("mixed", "suboptimal_ppo", 0.5))
@@ -240,15 +251,6 @@ class Stopped(Exception):  # noqa: N818 - stands for a kill
     pass
 
 
-@pytest.fixture
-def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    sac = suboptimal._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
-    small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TRIALS": 2}
-    for name, value in small.items():
-        monkeypatch.setattr(suboptimal, name, value)
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
-
-
 @pytest.mark.usefixtures("small_training")
 @pytest.mark.parametrize("learner", ["ppo", "sac"])
 def test_after_interruptions_the_policy_is_not_trained_again(
@@ -319,15 +321,16 @@ def lasting() -> Iterator[str]:
     del TASKS[name]
 
 
+@pytest.mark.usefixtures("small_training")
 @pytest.mark.parametrize(("episode_steps", "iterations"), [(20, 1), (71, 2)])
 def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
     lasting: str, tmp_path: Path, episode_steps: int, iterations: int
 ) -> None:
-    """Episodes of this task last 70 steps at most; an iteration has 64 of each of 32 targets, too few for
-    many a training episode to end: what stops it are trials."""
+    """Episodes of this task last 70 steps at most; an iteration has 8 of each of 4 targets, too few for a
+    training episode to end: what stops it are trials."""
     config = CollectConfig(
         behavior="suboptimal_sac",
-        sac_steps=2 * 64 * 32,
+        sac_steps=2 * 8 * 4,
         sac_episode_steps=episode_steps,
         start="task",
         episodes=3,
@@ -336,7 +339,7 @@ def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
     collect(lasting, config, seed=0, out=tmp_path / "out", progress=silent)
     dataset = Dataset.open(tmp_path / "out")
     assert dataset.reference == f"{lasting}-suboptimal-sac-seed0@data-1.0.0"
-    assert dataset.description["behavior"]["trained_steps"] == iterations * 64 * 32
+    assert dataset.description["behavior"]["trained_steps"] == iterations * 8 * 4
 
 
 def test_where_good_episodes_are_short_sac_is_not_stopped_by_their_length(task: str, tmp_path: Path) -> None:
