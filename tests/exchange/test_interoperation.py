@@ -1,13 +1,12 @@
 """The other side runs on our datasets: lerobot's command lines, its training, HF datasets.
 
-lerobot takes seconds to start, so all its commands run once, some of them side by side, before the tests.
+lerobot takes seconds to load, so all its commands run once before the tests, in forks of one process.
 """
 
 import json
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,8 +19,13 @@ from astra_data.dataset.columns import GOAL, STATE, Column, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 
-BIN = Path(sys.executable).parent
+WARM = Path(__file__).parents[1] / "warm_commands.py"
+LOADED = [f"lerobot.scripts.lerobot_{name}" for name in ("train", "edit_dataset", "dataset_viz")]
 TRAINING_STEPS = 2
+READING = """import sys, datasets
+rows = datasets.load_dataset("parquet", data_files=sys.argv[1])["train"]
+print(len(rows), rows[9]["observation.state"], rows[9]["episode_uid"])
+"""
 
 
 class Runs(NamedTuple):
@@ -47,6 +51,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder = tmp_path_factory.mktemp("lerobot")
     dataset = write_with_goal(folder / "set")
     at = [f"--root={dataset.root}"]
+    reading = folder / "reading.py"
+    reading.write_text(READING)
     edit = ["lerobot-edit-dataset", "--repo_id=a/b", *at]
     commands = {
         "info": [*edit, "--operation.type=info"],
@@ -82,12 +88,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
             *["--save_checkpoint=false", f"--output_dir={folder / 'training'}"],
         ],
         "validate": ["astra-data", "validate", str(dataset.root), "--with-lerobot"],
-        "datasets": [
-            *["python", "-c"],
-            "import sys, datasets; rows = datasets.load_dataset('parquet', data_files=sys.argv[1])['train']; "
-            "print(len(rows), rows[9]['observation.state'], rows[9]['episode_uid'])",
-            str(dataset.root / "data/*/*.parquet"),
-        ],
+        "datasets": [str(reading), str(dataset.root / "data/*/*.parquet")],
     }
     settings = {
         "HF_HUB_OFFLINE": "1",
@@ -96,20 +97,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
         "OMP_NUM_THREADS": "1",
         "PYTHONWARNINGS": "ignore",
     }
-
-    def run(command: list[str]) -> tuple[int, str]:
-        name, *arguments = command
-        done = subprocess.run(
-            [str(BIN / name), *arguments],
-            env=os.environ | settings,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        return done.returncode, done.stdout + done.stderr
-
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        results = dict(zip(commands, pool.map(run, commands.values()), strict=True))
+    done = subprocess.run(
+        [sys.executable, WARM],
+        input=json.dumps({"modules": LOADED, "commands": commands}),
+        env=os.environ | settings,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    results = {name: (code, shown) for name, (code, shown) in json.loads(done.stdout).items()}
     return Runs(dataset, folder, results)
 
 
