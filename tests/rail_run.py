@@ -6,7 +6,7 @@ import pytest
 
 from astra_data.core.progress import silent
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.plan import plan, stage_of
+from astra_data.experiments.plan import plan, stage_of, stages_until
 from astra_data.learning.descent import DescentConfig
 
 ROOT = Path(__file__).parents[1]
@@ -49,14 +49,22 @@ def write_recipe(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", mo
 def make_rail_run(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", more: str = "") -> Path:
     """Make such a run up to its policies; return its folder."""
     path = write_recipe(place, seeds=seeds, methods=methods, more=more)
-    experiment = load_experiment(path, place / "runs")
-    made = ("collect", "pair", "subset", "ground", "train", "align")
     with pytest.MonkeyPatch.context() as patch:
         fit_failures_quickly(patch)
-        for item in plan(experiment.recipe, path, experiment.folder):
-            if stage_of(item) in made:
-                item.call(progress=silent)
+        return run_here(path, until="align")
+
+
+def run_here(path: Path, until: str | None = None) -> Path:
+    """Run a recipe in this process, to `runs` beside it; return its folder.
+
+    A process of its own takes seconds to load what this one has loaded.
+    """
+    experiment, stages = load_experiment(path, path.parent / "runs"), stages_until(until)
+    experiment.folder.mkdir(parents=True)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    for item in plan(experiment.recipe, path, experiment.folder):
+        if stage_of(item) in stages:
+            item.call(progress=silent)
     return experiment.folder
 
 

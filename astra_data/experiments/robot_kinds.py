@@ -34,11 +34,11 @@ class Planar:
     @property
     def simulator(self) -> str:
         """What it is and what moves it, in a few words."""
-        moved, told = (
+        moved, commands = (
             ", ".join(field.short for field in fields)
             for fields in ((*self.position, *self.heading), self.logs.of("command"))
         )
-        return f"a unicycle: {moved}, driven by {told}"
+        return f"a unicycle: {moved}, driven by {commands}"
 
     @classmethod
     def of(cls, logs: Logs) -> Self | None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rliable import metrics  # type: ignore[import-untyped]
 from scipy import stats
 from scipy.stats import pearsonr, rankdata, spearmanr, trim_mean
 
@@ -140,6 +141,15 @@ def test_the_probability_of_improvement_has_a_95_percent_interval() -> None:
     back = probability_of_improvement(others, scores, replicates=2000)
     mirrored = 1 - np.array([found.probability, expected[1], expected[0]])
     assert [back.probability, back.low, back.high] == pytest.approx(mirrored, abs=0.03)
+
+
+@pytest.mark.parametrize("seeds", [1, 5, 8])
+def test_figures_are_those_of_rliable(seeds: int) -> None:
+    rng = np.random.default_rng(seeds)
+    scores, others = (rng.integers(0, 5, (count, 3)) / 4 for count in (seeds, 6))  # with ties
+    assert summarise(scores, replicates=10).iqm == metrics.aggregate_iqm(scores)
+    found = probability_of_improvement(scores, others, replicates=10).probability
+    assert found == pytest.approx(metrics.probability_of_improvement(scores, others), abs=1e-12)
 
 
 @pytest.mark.parametrize("in_one_row", [False, True])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from humanoid_recipe import RECIPE
+from rail_run import run_here
 from safetensors.torch import load_file
 from torch.nn import functional
 
@@ -17,7 +18,6 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import GOAL, SUCCESS
-from astra_data.experiments.run import run
 from astra_data.grounding.files import load_history_model
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.stages.augment import AugmentConfig, augment
@@ -113,7 +113,7 @@ def test_phi_and_what_is_beyond_it_lose_only_the_place(
 
 def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(RECIPE)
-    folder = run(tmp_path / "toy.toml", root=tmp_path / "runs", jobs=1)
+    folder = run_here(tmp_path / "toy.toml")
     results = json.loads((folder / "report" / "results.json").read_text())
     assert set(results["methods"]) == {"direct_transfer", "nas", "astra"}
     assert not (folder / "report" / "trajectories.png").exists()
@@ -136,7 +136,7 @@ def test_a_recipe_runs_whole(tmp_path: Path) -> None:
 
 def test_a_recipe_with_sac_runs_whole(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(SAC_RECIPE)
-    folder = run(tmp_path / "toy.toml", root=tmp_path / "runs", jobs=1)
+    folder = run_here(tmp_path / "toy.toml")
     for method, remembers, observed, steps in (
         ("direct_transfer", True, "abstract", 512),
         ("domain_randomization", True, "abstract", 512),

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 from humanoid_recipe import RECIPE
+from rail_run import run_here
 
 from astra_data.core.progress import Progress, silent
-from astra_data.experiments.run import run
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.rma import RmaConfig
@@ -55,7 +55,7 @@ def test_the_ranges_are_those_printed_in_the_paper() -> None:
 
 def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(HEAD + RECIPE[RECIPE.index("[collect]") :])
-    folder = run(tmp_path / "toy.toml", root=tmp_path / "runs", jobs=1)
+    folder = run_here(tmp_path / "toy.toml")
     results = json.loads((folder / "report" / "results.json").read_text())
     assert list(results["methods"]) == ["domain_randomization", "compass_uniform", "compass"]
     drawn = {
