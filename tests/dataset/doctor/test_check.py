@@ -1,3 +1,4 @@
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +14,32 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.findings import MOST
+from astra_data.dataset.format import POLICY_PATH
 
 
 def change_statistics(root: Path) -> None:
     stats = json.loads((root / "meta/stats.json").read_text())
     stats["action"]["q99"][1] += 0.1
     (root / "meta/stats.json").write_text(json.dumps(stats))
+
+
+def declare(name: str, **changes: object) -> Callable[[Path], object]:
+    """Change how meta/info.json describes a column."""
+
+    def damage(root: Path) -> None:
+        features = json.loads((root / "meta/info.json").read_text())["features"]
+        features[name] |= changes
+        edit("meta/info.json", features=features)(root)
+
+    return damage
+
+
+def drop_last_row(name: str) -> Callable[[Path], None]:
+    def damage(root: Path) -> None:
+        table = pq.read_table(root / name)
+        pq.write_table(table.slice(0, len(table) - 1), root / name)
+
+    return damage
 
 
 def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
@@ -59,6 +80,7 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
         (alter(DATA, "action", 10, [0, 0]), ["mean of action in episode 2 is", "the content hash is"]),
         (alter(EPISODES, "length", 1, 2), ["length of episode 1 is 2, expected 1"]),
         (alter(EPISODES, "dataset_to_index", 1, 9), ["dataset_to_index of episode 1 is 9, expected 8"]),
+        (alter(EPISODES, "dataset_from_index", 1, 9), ["dataset_from_index of episode 1 is 9, expected 7"]),
         (
             alter(EPISODES, "data/file_index", 1, 4),
             ["the file of episode 1 is data/chunk-000/file-004.parquet, expected file-000.parquet"],
@@ -81,6 +103,7 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
         (truncate("meta/info.json"), ["meta/info.json is no JSON object"]),
         (write("data/chunk-000/left.tmp", b""), ["data/chunk-000/left.tmp does not belong to it"]),
         (edit("meta/astra/subsets.json", uids=[13, 4]), ["not in the order of their seed"]),
+        (edit("meta/astra/subsets.json", seed=7), ["not in the order of their seed"]),
         (edit("meta/astra/dataset.json", content_hash="0"), ["meta/astra/dataset.json was altered"]),
         (
             edit("meta/info.json", total_frames=1, total_episodes=2, total_tasks=3, codebase_version="v2.1"),
@@ -101,8 +124,14 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
         (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
         (edit("meta/info.json", data_path="{file_index:99999999d}"), ["expected a path inside the folder"]),
         (edit("meta/info.json", fps="20"), ["fps is '20', expected a positive number"]),
+        (edit("meta/info.json", fps=True), ["fps is True, expected a positive number"]),
+        (edit("meta/info.json", fps=0), ["fps is 0, expected a positive number"]),
+        (edit("meta/info.json", fps=2**31), ["expected a positive number below 2^31"]),
         (edit("meta/info.json", features=[]), ["features is [], expected an object"]),
+        (declare("action", names=["x"]), ["action: 1 names for 2 values"]),
+        (declare("index", shape=[2]), ["index: expected in features as one int64 per step"]),
         (alter("meta/astra/episodes.parquet", "length", 3, 4), ["(6, 4) as uid and length of episode 3"]),
+        (drop_last_row("meta/astra/episodes.parquet"), ["None as uid and length of episode 4"]),
     ],
 )
 def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
@@ -144,6 +173,22 @@ def test_a_dataset_of_version_0_1_is_whole_too(tmp_path: Path) -> None:
     report = check(root)
     assert report.faults == []
     assert report.notes == ["it was written without digests, which tell what values were altered"]
+
+
+def test_the_policy_that_acted_is_compared_with_what_was_recorded_of_it(tmp_path: Path) -> None:
+    root, acted = tmp_path / "set", tmp_path / "policy"
+    acted.write_bytes(b"weights")
+    expected = hashlib.sha256(b"weights").hexdigest()
+    with writer(root) as open_writer:
+        open_writer.add(Episode(0, fake_columns(3, seed=0)))
+        open_writer.policy, open_writer.made = acted, {"behavior": {"policy_sha256": expected}}
+    assert check(root).faults == []
+    for damage, found in (
+        (write(POLICY_PATH, b"others"), hashlib.sha256(b"others").hexdigest()),
+        (drop(POLICY_PATH), "not there"),
+    ):
+        damage(root)
+        assert f"{POLICY_PATH} is {found}, expected the sha256 {expected}" in check(root).faults
 
 
 def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:

@@ -60,6 +60,17 @@ def test_pages_of_narrow_values_are_not_taken_for_those_of_a_wide_column(tmp_pat
         assert file.read().equals(table)
 
 
+def test_a_row_group_that_lacks_its_last_byte_is_not_whole(tmp_path: Path) -> None:
+    table = pa.table({"x": np.arange(30.0)})
+    path = tmp_path / "cut.parquet"
+    pq.write_table(table, path, row_group_size=10, compression="snappy")
+    whole = path.read_bytes()
+    end = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+    for kept, groups in ((end, 3), (end - 1, 2)):
+        path.write_bytes(whole[:kept])
+        assert rebuilt_metadata(path, table.schema).num_row_groups == groups
+
+
 @pytest.mark.parametrize("byte", [b"\x1c", b"\xff"])
 def test_a_header_without_end_is_no_page(tmp_path: Path, byte: bytes) -> None:
     path = tmp_path / "endless.parquet"

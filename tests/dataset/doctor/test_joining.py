@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fake_dataset import COLUMNS, fake_columns, write_fake, writer
 
@@ -41,11 +42,21 @@ def test_sources_of_copies_follow_their_new_uids(tmp_path: Path, other: Dataset)
     assert joined[-2].uid != 4
 
 
-def test_the_same_episode_twice_has_two_uids_the_same_in_every_run(tmp_path: Path) -> None:
+def test_an_episode_of_two_datasets_has_the_metadata_of_the_first(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        with writer(tmp_path / name) as open_writer:
+            open_writer.add(Episode(4, fake_columns(3, seed=50), {"floor": name}))
+    first, second = (Dataset.open(tmp_path / name) for name in ("first", "second"))
+    [joined] = join(stored(second), COLUMNS, [first, second])
+    assert joined.metadata == {"floor": "first"}
+
+
+def test_the_same_episode_again_has_another_uid_the_same_in_every_run(tmp_path: Path) -> None:
     fake = write_fake(tmp_path / "set")
-    first, again = (join(stored(fake, fake), COLUMNS, [fake]) for _ in range(2))
+    first, again = (join(stored(fake, fake, fake), COLUMNS, [fake]) for _ in range(2))
     uids = [episode.uid for episode in first]
-    assert len(set(uids)) == 2 * len(fake)
+    assert len(set(uids)) == 3 * len(fake)
+    assert min(uids) >= 0 and max(uids) < 2**63
     assert uids == [episode.uid for episode in again]
 
 
@@ -54,5 +65,9 @@ def test_other_values_are_another_episode(tmp_path: Path) -> None:
     altered = [(uid, columns | {"action": columns["action"] + 1}) for uid, columns in stored(fake)]
     joined = join(altered, COLUMNS, [fake])
     assert [(episode.metadata, episode.is_known) for episode in joined] == [({}, False)] * len(fake)
+    doubles = [
+        (uid, columns | {"action": columns["action"].astype(np.float64)}) for uid, columns in stored(fake)
+    ]
+    assert all(episode.is_known for episode in join(doubles, COLUMNS, [fake]))
     wider = [*COLUMNS, replace(COLUMNS[0], name="more")]
     assert all(episode.is_known for episode in join(stored(fake), wider, [fake]))

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES, alter_rows, as_in_0_1, edit
-from fake_dataset import fake_episodes, write_fake
+from fake_dataset import DESCRIPTION, LENGTHS, fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
@@ -127,6 +127,14 @@ def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
     repaired = repair(root, out=tmp_path / "saved")
     assert "left out episode 2: its uid 4 is taken or negative" in repaired.notes
     assert Dataset.open(tmp_path / "saved").uids.tolist() == [13, 4, 6, 0]
+    repair(root, out=tmp_path / "all", new_uids=True)
+    every = Dataset.open(tmp_path / "all")
+    assert every.lengths.tolist() == list(LENGTHS)
+    assert every.metadata["merged_uid"] == [None, None, 4, None, None]
+    alter_rows(root / DATA, REWARD, {7: float("nan")})  # the first is lost: the second may have its uid
+    repair(root, out=tmp_path / "others")
+    others = Dataset.open(tmp_path / "others")
+    assert (others.uids.tolist(), others.lengths.tolist()) == ([13, 4, 6, 0], [7, 12, 30, 5])
 
 
 def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path: Path) -> None:
@@ -185,7 +193,7 @@ def test_an_episode_that_may_have_been_cut_is_left_out(tmp_path: Path) -> None:
 
 
 def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
-    original = write_fake(tmp_path / "original")
+    original = write_fake(tmp_path / "original", subset_seed=7)
     edited = tmp_path / "edited"
     shutil.copytree(original.root, edited)
     shutil.rmtree(edited / "meta/astra")
@@ -193,10 +201,14 @@ def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
     assert Dataset.open(tmp_path / "alone").metadata == {}
     repair(edited, out=tmp_path / "joined", like=original)
     joined = Dataset.open(tmp_path / "joined")
-    assert joined.metadata == original.metadata
+    assert (joined.metadata, joined.order) == (original.metadata, original.order)
     assert joined.description["environment"] == {"id": "Fake-v0"}
     assert joined.description["parents"] == [original.identity]
     assert joined.reference == "fake@data-1.1.0"
+    other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
+    repair(edited, out=tmp_path / "merged", like=[original, other])
+    merged = Dataset.open(tmp_path / "merged")
+    assert merged.description["parents"] == [original.identity, other.identity]
 
 
 def test_lists_without_a_size_are_read_as_lerobots_merge_writes_them(tmp_path: Path) -> None:
@@ -277,6 +289,18 @@ def test_an_altered_value_is_told_though_it_cannot_be_found(tmp_path: Path) -> N
     assert Dataset.open(tmp_path / "out").description["repaired"] == result.notes
 
 
+def test_nothing_is_lost_or_altered_where_the_description_alone_is_wrong(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["mode"]["dtype"] = "string"
+    for number, changes in enumerate(({"total_episodes": 2}, {"total_episodes": 5, "features": features})):
+        edit("meta/info.json", **changes)(root)
+        repaired = repair(root, out=tmp_path / f"saved{number}")
+        assert repaired.episodes == 5
+        assert not [note for note in repaired.notes if "are lost" in note or "a value was" in note]
+    assert "left out, because they are not numeric: mode" in repaired.notes
+
+
 def test_episodes_with_other_values_than_were_written_are_left_out(tmp_path: Path) -> None:
     whole = write_fake(tmp_path / "set", subset_seed=7)
     alter_rows(whole.root / DATA, "next.reward", {25: 9.0})
@@ -310,6 +334,23 @@ def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
     ]
     saved = Dataset.open(tmp_path / "saved")
     assert (saved.metadata, saved.subset_seed) == ({}, 0)
+
+
+def test_missing_metadata_is_not_called_altered(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    (root / METADATA_PATH).unlink()
+    [note] = repair(root, out=tmp_path / "saved").notes
+    assert note == f"{METADATA_PATH} is missing: success, return and the like of the episodes are lost"
+
+
+def test_where_it_came_from_is_kept(tmp_path: Path) -> None:
+    description = {**DESCRIPTION, "simulator": {"id": "Rail", "timestep_s": 0.1}}
+    whole = write_fake(tmp_path / "set", description=description)
+    repair(whole.root, out=tmp_path / "saved")
+    saved = Dataset.open(tmp_path / "saved").description
+    for key in ("name", "seeds", "environment", "simulator"):
+        assert saved[key] == description[key]
+    assert saved["parents"] == [whole.identity]
 
 
 def test_values_are_saved_also_without_the_digests(tmp_path: Path) -> None:

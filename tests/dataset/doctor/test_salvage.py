@@ -39,6 +39,7 @@ def test_all_of_a_whole_dataset_is_read(tmp_path: Path) -> None:
         # A wrong value costs its episode, a wrong structure all that follow.
         (alter(DATA, "action", 9, [np.nan, 0]), [0, 1, 3, 4], "left out episode 2: action is nan"),
         (alter(DATA, "next.done", 9, True), [0, 1, 3, 4], "left out episode 2: next.done is True"),
+        (alter(DATA, "episode_uid", 7, -5), [0, 2, 3, 4], "left out episode 1: its uid -5 is taken or neg"),
         (alter(DATA, "index", 9, 70), [0, 1], "stopped before episode 2: index is 70"),
         (alter(DATA, "timestamp", 9, 7.0), [0, 1], "stopped before episode 2: timestamp is 7.0"),
         (alter(EPISODES, "length", 2, 11), [0, 1], "episode 2 has 12 frames, expected 11"),
