@@ -53,6 +53,7 @@ def test_statistics_of_ours_are_compared_exactly_and_others_loosely(root: Path) 
     alter(EPISODES, "stats/mode/std", number, [1.0])(root)  # an estimate of lerobot's: not compared
     _, report = checked(root, is_ours=False)
     assert report.faults == []
+    assert any(f"std of mode in episode {number} is [1.0]" in fault for fault in checked(root)[1].faults)
     assert len(report.notes) == 1
     assert f"max of mode in episode {number} is" in report.notes[0]
 
@@ -91,7 +92,8 @@ def test_rows_and_episodes_without_each_other_are_found(root: Path, tmp_path: Pa
         ([1e-5, 100.0], [0.0, 100.0], EXACT, True),
         ([1e-3, 100.0], [0.0, 100.0], EXACT, False),
         ([[1.0], [2.0]], [1.0, 2.0], EXACT, True),
-        ([1.0], [1.0, 2.0], EXACT, False),
+        ([1.0], [1.0, 1.0], EXACT, False),
+        ([1.0, 2.0, 3.0], [1.0, 2.0], EXACT, False),
         (None, [1.0], EXACT, False),
         (["x"], [1.0], EXACT, False),
         ([10**400], [1.0], EXACT, False),
