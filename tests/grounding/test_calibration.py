@@ -1,5 +1,9 @@
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from astra_data.grounding.calibration import calibration, folds
 
@@ -28,6 +32,21 @@ def test_the_scale_of_few_failures_changes_little_and_never_turns_around() -> No
     assert float(said) == pytest.approx(0.05, rel=1e-3)
     against, _ = calibration(-5.0 * fails[None] + 0.1 * odds, fails, 20)
     assert float(against) > 0
+
+
+@pytest.mark.parametrize("members", [1, 3])
+def test_the_prior_weighs_as_much_as_a_failure_however_many_members_there_are(members: int) -> None:
+    """Minus the log of the posterior, by scipy: the steps of each member, of which 20 count as one."""
+    rng = np.random.default_rng(0)
+    odds, fails = rng.normal(size=400), np.arange(400) < 20
+
+    def surprise(of: Any) -> float:  # noqa: ANN401 - an array
+        said = np.exp(of[0]) * odds + of[1]
+        return float(np.sum(np.logaddexp(0, said) - fails * said) / 20 + 0.5 * of[0] ** 2)
+
+    log_scale, expected = minimize(surprise, [0.0, -3.0]).x
+    scale, shift = calibration(torch.from_numpy(odds).expand(members, -1), torch.from_numpy(fails), 20)
+    assert [float(scale), float(shift)] == pytest.approx([np.exp(log_scale), expected], abs=1e-3)
 
 
 @pytest.mark.parametrize(("failing", "count"), [(1, 0), (2, 2), (4, 4), (13, 5)])

@@ -12,6 +12,7 @@ from astra_data.grounding.committee import Committee
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.networks.failure import FailureModel, FailureShape
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 
 
 def committee(failures: FailureModel | None = None) -> Committee:
@@ -78,6 +79,45 @@ def test_groundings_of_several_seeds_are_one_committee() -> None:
     of = Committee.of(TASK, made)
     np.testing.assert_allclose(follow(of)[1], follow(committee())[1], rtol=1e-5)
     assert of.covariance.item() == pytest.approx(SCATTER_M**2)
+
+
+def test_rollouts_go_as_in_the_corrected_simulator() -> None:
+    """By histories of states, goals and commands; a failure is as probable as the models say on average."""
+    torch.manual_seed(0)
+    made = shifted(0.0)
+    for parameter in made.parameters():
+        parameter.normal_(std=0.3)
+    foreseeing = [
+        FailureModel(FailureShape(state_size=1, action_size=1, timestep_s=0.1, members=1)).eval()
+        for _ in range(2)
+    ]
+    groundings = [HistoryGrounding(made, failures) for failures in foreseeing]
+    start, goal, action = torch.tensor([[0.0], [5.0]]), torch.full((2, 1), 9.0), 2 * torch.rand(12, 2, 1) - 1
+    found = Committee.of(TASK, groundings).follow(start, goal, action)
+    worlds = [one.simulator(TASK, 2) for one in groundings]
+    for world in worlds:
+        world.start(start, torch.arange(2), goal)
+    reached = torch.ones(2)
+    for step, command in enumerate(action):
+        torch.testing.assert_close(found.state[step], worlds[0].state)
+        torch.testing.assert_close(found.reached[step], reached)
+        for world in worlds:
+            world.step(command)
+        risks = [risk for world in worlds if (risk := world.topple_risk()) is not None]
+        reached = reached * (1 - (risks[0] + risks[1]) / 2)
+
+
+def test_the_scatter_and_the_clearance_are_those_of_all_groundings() -> None:
+    factors = torch.tensor([[[0.1, 0.0], [0.3, 0.2]], [[0.2, 0.0], [-0.1, 0.4]]])
+    made = []
+    for factor, clearance_m in zip(factors, (0.3, 0.2), strict=True):
+        model = GroundingModel(GroundingShape(2, 1, 1, latent_size=4)).requires_grad_(False)
+        model.residual_factor.copy_(factor)
+        made.append(HistoryGrounding(model, clearance_m=clearance_m))
+    of = Committee.of(TASK, made)
+    expected = [[(0.01 + 0.04) / 2, (0.03 - 0.02) / 2], [(0.03 - 0.02) / 2, (0.13 + 0.17) / 2]]
+    np.testing.assert_allclose(of.covariance, expected, rtol=1e-6)
+    assert of.clearance_m == 0.2
 
 
 def test_where_touches_are_foreseen_episodes_are_followed_up_to_the_wall() -> None:

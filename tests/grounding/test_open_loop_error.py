@@ -120,6 +120,14 @@ def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     assert again == pytest.approx((mean, low, high))
 
 
+def test_long_episodes_weigh_more_also_where_they_are_resampled() -> None:
+    """Every other episode has three errors of 0, the others one of 1."""
+    episode = torch.arange(400).repeat_interleave(torch.tensor([3, 1]).repeat(200))
+    mean, low, high = _interval((episode % 2).double(), episode, np.random.default_rng(0))
+    assert mean == 0.25
+    assert 0.2 < low < 0.25 < high < 0.3
+
+
 def test_a_grounding_starts_with_the_history_before_each_replay() -> None:
     """Its correction is the action before the last: open loop it depends on the memory at the start."""
     torch.manual_seed(0)

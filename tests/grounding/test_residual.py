@@ -80,6 +80,20 @@ def test_a_reset_empties_the_memory_of_its_rows_alone() -> None:
     assert torch.equal(one.hidden[rows], known)
 
 
+def test_from_what_was_saved_it_goes_on_as_it_went() -> None:
+    first, second = simulator(3), simulator(3)
+    for _ in range(3):
+        first.step(torch.randn(3, 2))
+    saved = {name: values.clone() for name, values in first.state_dict().items()}
+    second.load_state_dict(saved)
+    action = torch.tensor([[0.3, -0.4]]).expand(3, 2)
+    for _ in range(2):
+        assert torch.equal(first.step(action), second.step(action))
+    second.load_state_dict(saved)
+    start(second, torch.tensor([[*HERE, 0.0, 0.0]]), torch.tensor([1]))
+    assert saved["hidden"][1].any()  # a second load finds what the first one did
+
+
 def test_scatter_has_the_asked_covariance() -> None:
     factor = torch.diag(torch.tensor([0.01, 0.02, 0.1, 0.3]))
     one = simulator(20_000, scatter=factor)

@@ -8,6 +8,7 @@ import torch
 from toy_episodes import no_episodes, toy_episodes
 
 from astra_data.core.progress import silent
+from astra_data.grounding import scatter
 from astra_data.grounding.failures import replayed_inputs
 from astra_data.grounding.files import load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
@@ -85,9 +86,19 @@ def test_forms_are_as_wild_as_held_out_steps_where_training_ones_are_not(
     held_out = replace(calm, windows=replace(windows, next_state=wilder))
     scatters, figures = fit_scatter(grounding_model(), training, held_out, seed=0)
     assert float(scatters.forms.std()) == pytest.approx(3.0, abs=0.45)
-    assert figures["gain_nats"] == pytest.approx(
-        fitted[1]["gain_nats"], abs=1e-3
-    )  # a size alone tells nothing
+    # A size alone tells nothing.
+    assert figures["gain_nats"] == pytest.approx(fitted[1]["gain_nats"], abs=1e-3)
+
+
+def test_forms_are_of_all_held_out_episodes_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scatter, "_MOST_FORMS", 200)
+    monkeypatch.setattr(scatter, "_DESCENT", DescentConfig(updates=1))
+    calm = scattered_episodes(1)
+    aside = torch.where(torch.arange(30) < 15, WILD, -WILD)[:, None, None]
+    held_out = replace(calm, windows=replace(calm.windows, next_state=calm.windows.state + aside))
+    scatters, _ = fit_scatter(grounding_model(), scattered_episodes(0), held_out, seed=0)
+    assert len(scatters.forms) == 200
+    assert float((scatters.forms[:, 0] > 0).float().mean()) == pytest.approx(0.5, abs=0.15)
 
 
 def test_the_seed_decides_everything(quick: None) -> None:
@@ -159,6 +170,8 @@ def test_an_open_loop_replay_shows_the_mean_path_and_the_hazards_of_scattered_on
     assert torch.equal(one.state, scattered.state)
     assert one.hazard is not None and scattered.hazard is not None
     assert not torch.allclose(one.hazard, scattered.hazard)
+    again = replay_open_loop(TASK, replace(plain, scatters=even()), episodes, seed=0)
+    assert again.hazard is not None and torch.equal(again.hazard, scattered.hazard)
 
 
 def test_members_disagree_about_the_mean_path() -> None:
