@@ -31,6 +31,7 @@ GIVEN: dict[str, Any] = {"rate_hz": 10, "state": ["x", "speed"], "goal": ["goal_
     ("wrong", "told"),
     [
         ({"rate_hz": 20}, "rate_hz: expected 10, got 20"),
+        ({"rate_hz": 5}, "rate_hz: expected 10, got 5"),
         ({"state": ["speed", "x"]}, r"state: expected the values \['x', 'speed'\], got \['speed', 'x'\]"),
         ({"state": ["x"]}, r"state: expected the values \['x', 'speed'\], got \['x'\]"),
         ({"goal": []}, r"goal: expected the values \['goal_0'\], got \[\]"),

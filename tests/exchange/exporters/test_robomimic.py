@@ -43,8 +43,10 @@ def test_robomimics_masks_share_the_episodes(tmp_path: Path) -> None:
         for uid in range(20):
             columns = fake_columns(2, seed=uid)
             open_writer.add(Episode(uid, columns | {NEXT_STATE: columns[STATE]}))
-    export(Dataset.open(tmp_path / "set"), tmp_path / "set.hdf5", format="robomimic")
+    dataset = Dataset.open(tmp_path / "set")
+    export(dataset, tmp_path / "set.hdf5", format="robomimic")
     with h5py.File(tmp_path / "set.hdf5") as file:
         train, valid = set(file["mask/train"][()]), set(file["mask/valid"][()])
         assert (len(train), len(valid)) == (18, 2)
+        assert valid == {f"demo_{number}".encode() for number in dataset.order[18:]}  # in no smaller subset
         assert train | valid == {name.encode() for name in file["data"]}
