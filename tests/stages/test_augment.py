@@ -1,6 +1,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,19 +18,22 @@ from astra_data.dataset.columns import (
     DONE,
     GOAL,
     NEXT_STATE,
+    OUTCOME_COLUMNS,
     REWARD,
     STATE,
     SUCCESS,
     TERMINATED,
     TRUNCATED,
+    Column,
     Episode,
 )
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.stages.augment import AugmentConfig, augment
+from astra_data.stages.augment import AugmentConfig, _free_uid, _moving, _shares, augment
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.worlds.ant.body import WALL_REACH_M, rotation_matrix, up_cosine
 from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.relocation import Relocation
 from astra_data.worlds.registry import TASKS
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
@@ -198,6 +202,75 @@ def test_the_seed_decides_every_byte(collected: Path, augmented: Path, tmp_path:
     assert uids[1] & uids[2] == uids[0]
 
 
+class Ten:
+    """Ten episodes, by their numbers; of number 3 no stretch can be copied."""
+
+    reference, margin_m = "ten", 0.0
+
+    def __len__(self) -> int:
+        return 10
+
+    def episodes(self, names: object) -> Iterator[int]:
+        yield from range(10)
+
+    def stretches(self, episode: int) -> list[tuple[int, int]]:
+        return [] if episode == 3 else [(0, 9)]
+
+
+def shares(seed: int = 0, **settings: Any) -> tuple[Any, Any]:  # noqa: ANN401
+    """Return who of the ten is held out, and the copies of each."""
+    ten: Any = Ten()
+    held_out, copies = _shares(ten, ten, AugmentConfig(**settings), seed)
+    assert not copies[held_out].any() and copies[3] == 0
+    return held_out, copies
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.01, 1), (0.1, 1), (0.34, 3)])
+def test_a_share_is_held_out_at_least_one_unless_it_is_none(share: float, count: int) -> None:
+    held_out, copies = shares(held_out_share=share)
+    assert held_out.sum() == count
+    usable = ~held_out & (np.arange(10) != 3)
+    assert (copies[usable] == 3).all()
+    assert (shares(held_out_share=share, copies=2)[1][usable] == 2).all()
+    assert (len({tuple(shares(seed, held_out_share=share)[0]) for seed in range(9)}) > 1) == (share > 0)
+
+
+def test_copies_make_up_the_episodes_that_are_asked_for_and_the_odd_ones_are_of_any() -> None:
+    copies = shares(episodes=23, held_out_share=0.2)[1]
+    assert copies.sum() == 13 and np.ptp(copies[copies > 0]) <= 1
+    assert shares(episodes=23, held_out_share=0.2, keep_originals=False)[1].sum() == 21
+    more = [shares(seed, episodes=11, held_out_share=0.2)[1].argmax() for seed in range(20)]
+    assert len(set(more)) > 5
+
+
+def test_copies_without_a_place_are_counted_and_none_at_all_is_an_error(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied, asked = Relocation.copied, iter(range(1000))
+    monkeypatch.setattr(Relocation, "copied", lambda *given: copied(*given) if next(asked) % 3 == 0 else None)
+    given: Any = {"dataset": collected, "seed": 0, "progress": silent}
+    config = AugmentConfig(copies=3, min_steps=5)
+    told = Dataset.open(augment(None, config, out=tmp_path / "some", **given)).description
+    assert told["copies_without_place"] == 2 * told["copies"] > 0
+    assert told["copies"] + told["episodes_not_copied"] == 7  # all of the eight but the one held out
+    monkeypatch.setattr(Relocation, "copied", lambda *given: None)
+    with pytest.raises(BadInputError, match=r"no place was found for any of \d+ copies: lower --margin-m"):
+        augment(None, config, out=tmp_path / "none", **given)
+    assert [path.name for path in tmp_path.iterdir()] == ["some"]
+
+
+def test_whole_numbers_outcomes_and_goals_are_not_moved() -> None:
+    columns = [Column(STATE, size=2), Column("mode", "int64"), Column(GOAL, size=2), *OUTCOME_COLUMNS]
+    source: Any = SimpleNamespace(schema=[*columns, Column("force")])
+    assert [column.name for column in _moving(source)] == [STATE, "force"]
+
+
+def test_a_uid_that_is_taken_is_not_given_again() -> None:
+    taken = {5, 6, 2**63 - 1, 0}
+    assert [_free_uid(uid, taken) for uid in (9, 5, 5, 2**63 - 1)] == [9, 7, 8, 1]
+    assert len(taken) == 8
+
+
 def test_originals_can_be_left_out(collected: Path, tmp_path: Path) -> None:
     config = AugmentConfig(copies=1, keep_originals=False, min_steps=5)
     dataset = Dataset.open(
@@ -218,6 +291,7 @@ def test_mirror_images_are_no_longer_made() -> None:
     ("changes", "told"),
     [
         ({"margin_m": 9.0}, r"none of 7 training episodes keeps 9 m from the walls for 20 steps"),
+        ({"margin_m": 0.0, "min_steps": 99}, r"none of 7 training episodes keeps 0 m from .* for 99 steps"),
         ({"episodes": 7}, r"--episodes 7: expected at least the 8 that are kept"),
     ],
 )
