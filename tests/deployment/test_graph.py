@@ -16,6 +16,7 @@ from astra_data.deployment.graph import (
     ONNX,
     TORCHSCRIPT,
     PolicyGraph,
+    _apart,
     load_onnx,
     load_torchscript,
     write_graphs,
@@ -112,6 +113,12 @@ def test_a_graph_holds_no_paths_of_the_machine_and_is_the_same_twice(tmp_path: P
     assert not re.search(rb"\.py\b|astra_data", written)
     script = (tmp_path / "a" / TORCHSCRIPT).read_bytes()
     assert str(Path(astra_data.__file__).parent).encode() not in script
+
+
+def test_what_is_no_number_is_not_the_policys_command() -> None:
+    graph = PolicyGraph(POLICIES["units, no goal"])
+    with pytest.raises(BadInputError, match=r"in step 0 it gives the command \[nan\], the policy"):
+        _apart(graph, lambda state, goal, hidden: (torch.full((1, 1), torch.nan), hidden), "it")
 
 
 def through_numpy(state: Tensor) -> Tensor:

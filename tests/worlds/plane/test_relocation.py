@@ -213,20 +213,22 @@ def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
     assert kicks(3, kick(5, 0.0, ends=True)) == []
 
 
-def test_a_topple_of_a_robot_without_a_ball_is_copied() -> None:
+@pytest.mark.parametrize("arrived", [False, True])
+def test_a_topple_of_a_robot_without_a_ball_is_copied_and_its_arrival_is_not(arrived: bool) -> None:
     path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
     last = np.arange(20) == 19
     columns = {
         **path.columns,
         GOAL: np.tile(AIM, (20, 1)),
         TERMINATED: last,
-        SUCCESS: np.zeros(20, dtype=bool),
+        SUCCESS: last & arrived,
     }
     moving = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action]
     copied = relocation().copied(Episode(0, columns), moving, np.random.default_rng(0))
     assert copied is not None and copied.steps == slice(0, 20)
-    assert copied.columns[TERMINATED].tolist() == last.tolist()
-    assert copied.columns[REWARD][-1] == pytest.approx(-10.0, abs=0.1)
+    assert copied.columns[TERMINATED].tolist() == (last & (not arrived)).tolist()
+    assert copied.columns[TRUNCATED].tolist() == (last & arrived).tolist()
+    assert copied.columns[REWARD][-1] == pytest.approx(0.0 if arrived else -10.0, abs=0.1)
 
 
 def test_the_shortest_stretch_has_as_many_steps_as_asked_for() -> None:
