@@ -2,13 +2,18 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED
-from astra_data.exchange.exporters import export
+from astra_data.exchange.exporters import d4rl, export
 
 
-def test_d4rl_is_flat(dataset: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize("block_rows", [5, 5000])
+def test_d4rl_is_flat(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int
+) -> None:
+    monkeypatch.setattr(d4rl, "BLOCK_ROWS", block_rows)
     export(dataset, tmp_path / "set.hdf5", format="d4rl")
     names = {
         "observations": STATE,

@@ -2,13 +2,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, fake_columns, writer
+from fake_dataset import COLUMNS, LENGTHS, fake_columns, writer
 from fake_transitions import NEXT, write_transitions
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Episode
 from astra_data.exchange.exporters import export
+from astra_data.exchange.exporters.minari import _attributes
 
 
 @pytest.mark.parametrize("has_goal", [True, False])
@@ -34,13 +35,27 @@ def test_minari_loads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_go
         np.testing.assert_array_equal(found.rewards, values[REWARD])
         np.testing.assert_array_equal(found.terminations, values[TERMINATED])
         np.testing.assert_array_equal(found.truncations, values[TRUNCATED])
-    assert [metadata.get("seed") for metadata in loaded.storage.get_episode_metadata(range(2))] == [None, 3]
+    told = list(loaded.storage.get_episode_metadata(range(5)))
+    assert [metadata["total_steps"] for metadata in told] == list(LENGTHS)
+    assert [metadata.get("seed") for metadata in told[:2]] == [None, 3]
+
+
+def test_a_seed_of_zero_is_one() -> None:
+    assert _attributes(2, Episode(9, {STATE: np.zeros(4, np.float32)}, {"seed": 0})) == {
+        "id": 2,
+        "total_steps": 4,
+        "astra_data/episode_uid": 9,
+        "astra_data/seed": 0,
+        "seed": 0,
+    }
 
 
 def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
     with writer(tmp_path / "set", columns=[*COLUMNS, NEXT]) as open_writer:
         columns = fake_columns(4, seed=1)
-        open_writer.add(Episode(1, columns | {NEXT_STATE: columns[STATE] + 1}))
+        following = np.concatenate([columns[STATE][1:], columns[STATE][:1]])
+        following[-2] += 1
+        open_writer.add(Episode(1, columns | {NEXT_STATE: following}))
     apart = Dataset.open(tmp_path / "set")
     with pytest.raises(BadInputError, match="a next state is not the state of the next step"):
         export(apart, tmp_path / "random-v0", format="minari")

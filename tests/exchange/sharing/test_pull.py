@@ -17,6 +17,7 @@ from astra_data.dataset import Dataset
 from astra_data.exchange.sharing import fetch
 from astra_data.exchange.sharing.pull import pull
 from astra_data.exchange.sharing.push import push
+from astra_data.exchange.sharing.store import RemoteFolder
 
 pytestmark = pytest.mark.usefixtures("quick_figure")
 
@@ -169,6 +170,21 @@ def test_more_bytes_than_asked_for_are_refused_before_anything_is_fetched(
     with pytest.raises(SharingError, match=rf"has {size} bytes, of which at most {size - 1} .*--max-bytes"):
         pull(source(shared), out=tmp_path / "out", max_bytes=size - 1)
     assert not hidden(tmp_path / "out")
+    pull(source(shared), out=tmp_path / "out", max_bytes=size)
+
+
+def test_files_of_sizes_that_nobody_tells_are_bounded_all_together(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resign(shared)  # without sizes, as 0.1 wrote them
+    size = sum(
+        len(content) for path, content in contents(shared).items() if path.startswith(("data", "meta"))
+    )
+    files = RemoteFolder.files
+    monkeypatch.setattr(RemoteFolder, "files", lambda self: {path: {} for path in files(self)})
+    with pytest.raises(SharingError, match="is larger than"):
+        pull(source(shared), out=tmp_path / "out", max_bytes=size - 1)
+    assert not (tmp_path / "out").exists()
     pull(source(shared), out=tmp_path / "out", max_bytes=size)
 
 
