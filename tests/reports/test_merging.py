@@ -93,6 +93,15 @@ def test_what_is_found_anew_replaces_what_is_published(root: Path) -> None:
     assert astra.gap is not None and astra.gap.horizons == [1, 10]
 
 
+def test_of_gaps_over_as_many_seeds_the_newer_one_counts(root: Path) -> None:
+    published = assembled(root)
+    for seed in SEEDS:
+        remove(root, "follower", seed)
+        edit_json(root / f"ground/astra/seed_{seed}/gap.json", horizons=[1], grounded={}, raw={})
+    gap = assembled(root, published=published).methods["astra"].gap
+    assert gap is not None and (gap.horizons, gap.seeds) == ([1], list(SEEDS))
+
+
 def test_results_added_to_themselves_stay_as_they_are(root: Path) -> None:
     found = assembled(root)
     assert content(assembled(root, published=found)) == content(found)

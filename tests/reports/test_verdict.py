@@ -10,7 +10,8 @@ from astra_data.reports.assembly import assemble
 from astra_data.reports.comparing import summarised
 from astra_data.reports.files import read_published
 from astra_data.reports.schema import Choice, Ranked, Results
-from astra_data.reports.verdict import Verdict, verdict_of
+from astra_data.reports.statistics import share_interval
+from astra_data.reports.verdict import Verdict, _ends, verdict_of
 
 PUBLISHED = Path(__file__).parents[2] / "recipes/results"
 
@@ -153,6 +154,11 @@ def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Result
     )
 
 
+def test_the_interval_is_of_whole_episodes(results: Results) -> None:
+    """0.29 times 100 is a little less than 29."""
+    assert _ends(results.model_copy(update={"episodes": 100}), 0.29) == share_interval(29, 100)
+
+
 def test_a_single_seed_has_no_interval(tmp_path: Path) -> None:
     verdict = verdict_of(made(tmp_path, seeds=(1,)))
     assert sentence(verdict).startswith(
@@ -165,9 +171,9 @@ def test_a_single_seed_has_no_interval(tmp_path: Path) -> None:
 def test_ties_and_failures_are_told(results: Results) -> None:
     tied = verdict_of(with_success(results, astra=[1.0, 0.75, 1.0]))
     assert tied.row == "astra" and "As good by the mean: ASTRA+." in tied.remarks
-    row = results.methods["astra_plus"].model_copy(update={"failed": [1.0, 0.5, 0.75]})
+    row = results.methods["astra_plus"].model_copy(update={"failed": [0.75, 0.25, 0.5]})
     failing = results.model_copy(update={"methods": results.methods | {"astra_plus": summarised(row, 100)}})
-    assert verdict_of(failing).remarks[-1].startswith("ASTRA+ fails in 75\N{NO-BREAK SPACE}% of its episodes")
+    assert verdict_of(failing).remarks[-1].startswith("ASTRA+ fails in 50\N{NO-BREAK SPACE}% of its episodes")
 
 
 def test_references_alone_are_not_deployed(results: Results) -> None:

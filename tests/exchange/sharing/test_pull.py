@@ -176,12 +176,14 @@ def test_more_bytes_than_asked_for_are_refused_before_anything_is_fetched(
 def test_files_of_sizes_that_nobody_tells_are_bounded_all_together(
     shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    resign(shared)  # without sizes, as 0.1 wrote them
     size = sum(
         len(content) for path, content in contents(shared).items() if path.startswith(("data", "meta"))
     )
     files = RemoteFolder.files
     monkeypatch.setattr(RemoteFolder, "files", lambda self: {path: {} for path in files(self)})
+    with pytest.raises(SharingError, match=f"has {size} bytes, of which at most {size - 1} are taken"):
+        pull(source(shared), out=tmp_path / "out", max_bytes=size - 1)
+    resign(shared)  # without sizes, as 0.1 wrote them
     with pytest.raises(SharingError, match="is larger than"):
         pull(source(shared), out=tmp_path / "out", max_bytes=size - 1)
     assert not (tmp_path / "out").exists()
