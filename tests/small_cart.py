@@ -50,6 +50,12 @@ class Reach(Objective):
         return after[:, 0] - before[:, 0] + ends
 
 
+class Last(Reach):
+    """To be on the rail until the end is all that is asked."""
+
+    is_lasting = True
+
+
 class Cart:
     """The robot: [x, speed]; a push by more than 3 m/s at once tips it."""
 

@@ -1,12 +1,13 @@
 """A policy in the simulator that it was trained in."""
 
+from dataclasses import replace
 from functools import partial
 from statistics import fmean
 
 import pytest
 import torch
 from constant_policy import Constant
-from small_cart import TASK
+from small_cart import TASK, Last
 
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.build_env import EnvConfig
@@ -68,6 +69,12 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
         int(torch.ceil(goal / (0.1 * SPEED) - 1e-4)) for goal in goals[0][:, 0]
     ]
     assert fmean(outcome.success) == 1.0
+
+
+def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
+    world = own_world(replace(TASK, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, 3)
+    found, _ = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
+    assert found.success == [1.0] * 3 and found.steps == [6] * 3
 
 
 def test_it_starts_where_the_task_does() -> None:

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_cart import TASK, Cart
+from small_cart import TASK, Cart, Last
 from torch import Tensor
 
 from astra_data.training.own_world import Act
@@ -40,6 +40,20 @@ def test_commands_beyond_the_recorded_are_of_robots_that_still_drive() -> None:
     short = min(found.steps)
     assert sum(found.success) == 1.0 and short < TASK.objective.horizon
     assert asked.share == pytest.approx(short / sum(found.steps))
+
+
+def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
+    lasting = replace(TASK, objective=Last(horizon=6))
+    found = in_target(lasting, lambda goal: driving(0.0), 3, seed=3).outcome
+    assert found.success == [1.0] * 3 and found.steps == [6] * 3
+
+
+def test_the_first_robot_is_filmed_until_its_episode_ends() -> None:
+    first = torch.tensor([[1.0], [0.0]])
+    speed = 0.9 * first - 0.5 * (1 - first)
+    found = in_target(TASK, lambda goal: lambda state, goal: (speed - 1.5) / 2.5, 2, seed=3)
+    assert found.outcome.steps[0] < found.outcome.steps[1] == TASK.objective.horizon
+    assert len(found.filmed) == found.outcome.steps[0] + 1
 
 
 def test_goals_are_told_and_each_robot_is_built_and_started_once() -> None:
