@@ -11,6 +11,7 @@ from toy_corrections import OFFSETS_M, shifted
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.committee import Committee, Rollouts
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.training import proposals
 from astra_data.training.proposals import SuggestConfig, chosen, drawn, planned, suggested
 from astra_data.worlds.registry import TASKS
 
@@ -83,6 +84,20 @@ def test_what_a_simulator_draws_is_of_the_seed(monkeypatch: pytest.MonkeyPatch) 
     first = suggested(TASK, committee, CONFIG, seed=1)
     torch.rand(3)
     assert suggested(TASK, committee, CONFIG, seed=1).taken.tolist() == first.taken.tolist()
+
+
+def test_steps_are_compared_every_half_second_in_standard_deviations(monkeypatch: pytest.MonkeyPatch) -> None:
+    committee, given = Committee.of(TASK, [HistoryGrounding(shifted(*OFFSETS_M))]), list[Any]()
+
+    def noted(*them: Any) -> Any:  # noqa: ANN401 - handed on
+        given.extend(them)
+        return chosen(*them)
+
+    monkeypatch.setattr(proposals, "chosen", noted)
+    made = suggested(TASK, committee, CONFIG, seed=1)
+    every = torch.cat([made.rollouts.state, made.proposals.action], dim=-1)
+    expected = every[[0, 5]] / every.flatten(0, 1).std(0)  # of ten steps of 0.1 s
+    torch.testing.assert_close(given[1], expected.transpose(0, 1))
 
 
 def test_a_suggestion_is_what_was_taken_of_the_proposals() -> None:
