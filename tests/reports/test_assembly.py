@@ -3,16 +3,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, edit_json, outcomes, write_elsewhere, write_runs
+from fake_runs import ROWS, SEEDS, edit_json, outcomes, write_choice, write_elsewhere, write_runs
+from safetensors.numpy import load_file, save_file
 
 from astra_data.core.errors import MissingStageError
 from astra_data.reports.assembly import assemble
 from astra_data.reports.page import hand_written, render
 from astra_data.reports.schema import Results
+from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS, Score
 
 
-def assembled(root: Path, methods: tuple[str, ...] = ROWS, seeds: tuple[int, ...] = SEEDS) -> Results:
-    return assemble("antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=10)
+def assembled(
+    root: Path,
+    methods: tuple[str, ...] = ROWS,
+    seeds: tuple[int, ...] = SEEDS,
+    scores: tuple[Score, ...] = (SUCCESS,),
+) -> Results:
+    return assemble(
+        "antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=10, scores=scores
+    )
 
 
 @pytest.fixture
@@ -152,6 +161,38 @@ def test_a_hand_written_row_has_the_success_of_the_grounded_simulator(root: Path
     write_elsewhere(root, "iql")
     edit_json(root / "evaluate/iql/seed_0/evaluation.json", grounded=outcomes([1, 0, 0, 0], 0))
     assert assembled(root, ("iql",), (0,)).methods["iql"].simulated_success is None
+
+
+def test_seeds_tell_their_tries_and_commands_beyond_the_data_and_curves_what_is_scored(root: Path) -> None:
+    for seed in SEEDS:
+        edit_json(root / f"evaluate/astra/seed_{seed}/evaluation.json", beyond_recorded=0.1 * seed)
+        points = [{"steps": 9, "success": None, "episode_steps": lasted} for lasted in (None, 30.0 + seed)]
+        tries = [{"seed": number} for number in range(seed + 1)]
+        edit_json(root / f"train/astra/seed_{seed}/curve.json", points=points, tries=tries)
+    row = assembled(root, ("astra",), scores=(SURVIVED_STEPS, RETURN)).methods["astra"]
+    assert row.tries == [1.0, 2.0, 3.0] and row.beyond_recorded == pytest.approx([0.0, 0.1, 0.2])
+    assert [curve.score for curve in row.learning] == [
+        pytest.approx([np.nan, 30.0 + n], nan_ok=True) for n in SEEDS
+    ]
+
+
+def test_a_choice_is_of_the_seeds_that_are_asked_for_and_measured_in_the_target_alone(root: Path) -> None:
+    write_choice(root)
+    choice = assembled(root, ("astra",), (0, 1)).choice
+    assert choice is not None and [(one.seed, one.target) for one in choice.candidates] == [
+        (0, 0.5),
+        (1, 0.25),
+    ]
+    for seed in SEEDS:
+        folder = root / f"evaluate/astra/seed_{seed}"
+        edit_json(folder / "evaluation.json", tested_in="grounded", target=None)
+        tensors = load_file(folder / "trajectories.safetensors")
+        tensors["grounded.position"] = tensors["target.position"]
+        save_file(tensors, folder / "trajectories.safetensors")
+    for rows in (("astra",), ("astra", "astra_plus")):
+        found = assembled(root, rows)
+        assert found.tested_in == "simulators" and found.choice is not None
+        assert not any(one.target for one in found.choice.candidates)
 
 
 def test_a_row_that_was_in_no_simulator_has_no_success_there(root: Path) -> None:

@@ -98,6 +98,7 @@ def test_steps_are_compared_every_half_second_in_standard_deviations(monkeypatch
     every = torch.cat([made.rollouts.state, made.proposals.action], dim=-1)
     expected = every[[0, 5]] / every.flatten(0, 1).std(0)  # of ten steps of 0.1 s
     torch.testing.assert_close(given[1], expected.transpose(0, 1))
+    assert torch.equal(given[0], made.rollouts.expected.T) and (made.rollouts.reached == 0).any()
 
 
 def test_a_suggestion_is_what_was_taken_of_the_proposals() -> None:
