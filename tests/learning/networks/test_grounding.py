@@ -221,7 +221,7 @@ def test_without_half_of_the_latent_chance_failures_are_not_learned_by_heart() -
         model.shape = replace(model.shape, reward_dropout=dropout)
         set_reward_scales(model, windows)
         optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
-        for _ in range(300):
+        for _ in range(150):
             optimizer.zero_grad()
             model.losses(windows, LossWeights(latent=0.0))[0].backward()
             optimizer.step()
