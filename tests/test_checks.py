@@ -8,7 +8,8 @@ TESTS = "pip install uv && uv run pytest"
 
 
 def commands() -> list[str]:
-    return [line for line in (ROOT / ".ci" / "run").read_text().splitlines() if line.startswith("uv run")]
+    lines = map(str.strip, (ROOT / ".ci" / "run").read_text().splitlines())
+    return [line for line in lines if line.startswith("uv run")]
 
 
 def test_the_tests_are_called_as_the_readme_says() -> None:
