@@ -61,12 +61,12 @@ def said_of(model: FailureModel, episodes: PairedEpisodes) -> Tensor:
 
 @pytest.fixture(scope="module")
 def foreseeing() -> FailureModel:
-    return fit_failures(TASK, HistoryGrounding(grounding_model()), hurried(40, 0), 3, seed=0)
+    return fit_failures(TASK, HistoryGrounding(grounding_model()), hurried(40, 0), 2, seed=0)
 
 
 def test_failures_of_other_episodes_are_foreseen_at_their_rate(foreseeing: FailureModel) -> None:
     fresh = hurried(40, 1)
-    assert len(foreseeing.members) == 3
+    assert len(foreseeing.members) == 2
     found = foresight(said_of(foreseeing, fresh), fresh)
     assert found["failures"] == 20
     assert found["auc"]["1-20"] > 0.95
@@ -138,7 +138,7 @@ def test_a_model_of_fewer_steps_knows_the_moment_and_expects_as_many_failures(
 ) -> None:
     """Robots that hurry fail after 30 steps of it: within 3 steps is told later than within 20."""
     training, fresh = hurried(40, 0), hurried(40, 1)
-    few = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, 0, 3)
+    few = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 2, 0, 3)
     hazards = {}
     for steps, model in ((3, few), (RISK_STEPS, foreseeing)):
         assert model.shape.risk_steps == steps
@@ -255,7 +255,7 @@ def test_what_is_only_learned_by_heart_is_not_believed(monkeypatch: pytest.Monke
     training, fresh = by_chance(0), by_chance(1)
 
     def skill() -> float:
-        model = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, seed=0)
+        model = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 1, seed=0)
         found = foresight(said_of(model, fresh), fresh)
         return float(found["brier_skill"])
 

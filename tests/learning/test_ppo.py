@@ -279,7 +279,7 @@ def test_a_clipped_mean_is_pulled_back_to_its_bound_and_no_farther(
     """Every action is worth the same, so that nothing but the pull moves the mean."""
     monkeypatch.setattr("astra_data.learning.ppo._PULL", pull)
     settings: dict[str, Any] = {"entropy_weight": 0.0, "clip": 1e-6, "learning_rate": 0.02}
-    learner = ppo(ConstantReward(16, 1.0), 60, horizon=10**6, clips=True, **settings)
+    learner = ppo(ConstantReward(8, 1.0), 60, horizon=10**6, clips=True, **settings)
     last = learner.policy.actor[-1]
     assert isinstance(last, torch.nn.Linear)
     with torch.no_grad():

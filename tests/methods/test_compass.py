@@ -29,11 +29,11 @@ QUICK = CompassConfig(
     **WIDE_RANGES.model_dump()
     # No more noise than leaves the planted gap of 3 cm to be seen.
     | {"action_noise": (0.0, 0.0), "position_noise_m": (0.0, 0.002), "velocity_noise_m_s": (0.0, 0.002)},
-    contexts=128,
+    contexts=64,
     windows=60,
     window=15,
     updates=600,
-    iterations=4,
+    iterations=3,
 )
 
 
@@ -127,7 +127,7 @@ def stop(fraction: float, note: str) -> None:
 
 
 def test_after_an_interruption_it_goes_on(tmp_path: Path) -> None:
-    settings = QUICK.model_copy(update={"contexts": 8, "updates": 20})
+    settings = QUICK.model_copy(update={"contexts": 8, "updates": 20, "iterations": 4})
     for name in ("whole", "interrupted"):
         (tmp_path / name).mkdir()
     whole, expected = identify(fitting(tmp_path / "whole", settings))

@@ -134,9 +134,9 @@ def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     check_page(folder)
 
 
-def test_a_recipe_with_sac_runs_whole(tmp_path: Path) -> None:
+def test_a_recipe_with_sac_runs(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(SAC_RECIPE)
-    folder = run_here(tmp_path / "toy.toml")
+    folder = run_here(tmp_path / "toy.toml", until="evaluate")
     for method, remembers, observed, steps in (
         ("direct_transfer", True, "abstract", 512),
         ("domain_randomization", True, "abstract", 512),
