@@ -17,6 +17,7 @@ from astra_data.reports.figures import (
     Curve,
     OpenLoop,
     Panel,
+    Scored,
     SimulatorReturns,
     Strip,
     Visits,
@@ -28,7 +29,7 @@ from astra_data.reports.figures import (
     strips,
     trajectories,
 )
-from astra_data.reports.schema import BandMeans, Results
+from astra_data.reports.schema import BandMeans, MethodResults, Results
 from astra_data.reports.sizes import SizesResults
 from astra_data.reports.tested import where
 from astra_data.worlds.plane.mazes import Maze
@@ -200,8 +201,14 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
     """Draw the headline score over dataset sizes, with coverage maps if a seed has all datasets at `root`."""
     first = found.sizes[0].results
     score = first.headline
-    rows = {method: [size.results.methods[method] for size in found.sizes] for method in first.methods}
-    summaries = {method: [row.summary[score.measure] for row in of] for method, of in rows.items()}
+    rows = {
+        method: {
+            size.percent: size.results.methods[method]
+            for size in found.sizes
+            if method in size.results.methods
+        }
+        for method in found.methods()
+    }
     covered: dict[str, list[Visits]] = {}
     for folder in _subsets(found, root):
         dataset = Dataset.open(folder)
@@ -212,15 +219,19 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
     return data_efficiency(
         score,
         [size.percent for size in found.sizes],
-        {method: [np.array(row.measures()[score.measure]) for row in of] for method, of in rows.items()},
-        # With a single seed, None becomes NaN.
         {
-            method: np.array([(of.iqm, of.low, of.high) for of in sizes], dtype=np.float64).T
-            for method, sizes in summaries.items()
+            method: {percent: _scored(row, score) for percent, row in of.items()}
+            for method, of in rows.items()
         },
         covered,
         where(first),
     )
+
+
+def _scored(row: MethodResults, score: Score) -> Scored:
+    of = row.summary[score.measure]
+    low, high = (np.nan if end is None else end for end in (of.low, of.high))
+    return Scored(np.array(row.measures()[score.measure]), of.iqm, low, high)
 
 
 def _subsets(found: SizesResults, root: Path) -> list[Path]:

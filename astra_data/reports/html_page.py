@@ -14,7 +14,7 @@ from astra_data.reports.formatting import fill_html, inline
 from astra_data.reports.losses import loss_head, losses, remaining_errors, seed_lines
 from astra_data.reports.page import correlation_text, encoder_lines, gap_tables, horizon_titles, score_table
 from astra_data.reports.schema import Origin, Results
-from astra_data.reports.sizes import SizesResults, size_head, size_lines
+from astra_data.reports.sizes import SizesResults, size_head, size_lines, unfinished
 from astra_data.reports.tested import warning, where
 from astra_data.reports.verdict import verdict_of
 from astra_data.worlds.score import Score
@@ -65,6 +65,7 @@ def render_html(found: Found, images: Mapping[str, bytes], foresight: Sequence[S
         verdict=verdict_of(results, percent),
         warning=inline(warning(results)),
         where=where(results),
+        unfinished=unfinished(found) if isinstance(found, SizesResults) else ", ".join(results.unfinished),
         figures=figures,
         pictured=not figures.keys().isdisjoint({"trajectories", "strips", *scores}),
         score_alts={score.measure: _alt(results, score) for score in results.scores},

@@ -1,13 +1,17 @@
 """Results at each dataset size, and their page."""
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Literal
+
+from pydantic import Field
 
 from astra_data.reports.choice_page import named
 from astra_data.reports.cost_and_origin import provenance
 from astra_data.reports.formatting import fill, interval, spread
-from astra_data.reports.schema import Results, Section
+from astra_data.reports.schema import MethodResults, Results, Section
 from astra_data.reports.tested import warning, where
+from astra_data.worlds.score import Score
 
 SHARED = ("collect", "pair", "select")
 """Stages that run once for all sizes."""
@@ -30,7 +34,18 @@ class SizesResults(Section):
     command: str
     """The command that produced these results."""
     sizes: list[SizeResults]
-    """At least one; all have the same rows."""
+    """At least one; each has the rows that are finished there."""
+    unfinished: list[int] = Field(default_factory=list, exclude_if=lambda percents: not percents)
+    """Sizes of the recipe without a finished row."""
+
+    def methods(self) -> list[str]:
+        """Return the rows that are finished at any size, in the order of the size that has most."""
+        rows = sorted((list(size.results.methods) for size in self.sizes), key=len, reverse=True)
+        return list(dict.fromkeys(chain.from_iterable(rows)))
+
+    def seeds(self) -> list[int]:
+        """Return the seeds that any row has finished at any size."""
+        return sorted({seed for size in self.sizes for seed in size.results.seeds})
 
 
 def by_size(found: Results | SizesResults) -> dict[int | None, Results]:
@@ -56,6 +71,8 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         "sizes.md.jinja",
         found=found,
         first=first,
+        seeds=found.seeds(),
+        unfinished=unfinished(found),
         figures=figures,
         warning=warning(first),
         where=where(first),
@@ -68,23 +85,42 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
     )
 
 
+def unfinished(found: SizesResults) -> str:
+    """Return which rows are not finished at which sizes, or nothing."""
+    lacking = [
+        f"{' and '.join(size.results.unfinished)} at {size.percent} %"
+        for size in found.sizes
+        if size.results.unfinished
+    ]
+    return "; ".join([*lacking, *(f"all rows at {percent} %" for percent in found.unfinished)])
+
+
 def size_head(found: SizesResults) -> list[str]:
     """Return the head of the tables whose lines `size_lines` returns."""
     return ["method", *(f"{size.percent} %" for size in found.sizes)]
 
 
 def size_lines(found: SizesResults) -> tuple[list[list[str]], list[list[str]]]:
-    """Return each row's headline score by size: mean and spread, and interquartile mean with its interval."""
-    first = found.sizes[0].results
-    score = first.headline
+    """Return each row's headline score by size: mean and spread, and interquartile mean with its interval.
+
+    "-" where a row is not finished; a mean over fewer seeds than others says of how many.
+    """
+    score, seeds = found.sizes[0].results.headline, len(found.seeds())
     means, intervals = [], []
-    for method, row in first.methods.items():
-        summaries = [size.results.methods[method].summary[score.measure] for size in found.sizes]
-        means.append([row.title, *(spread(summary, score.digits) for summary in summaries)])
+    for method in found.methods():
+        rows = [size.results.methods.get(method) for size in found.sizes]
+        title = next(row.title for row in rows if row)
+        means.append([title, *(_mean(row, score, seeds) if row else "-" for row in rows)])
+        summaries = [row.summary[score.measure] if row else None for row in rows]
         intervals.append(
-            [row.title, *(interval(one.iqm, one.low, one.high, score.digits) for one in summaries)]
+            [title, *(interval(of.iqm, of.low, of.high, score.digits) if of else "-" for of in summaries)]
         )
     return means, intervals
+
+
+def _mean(row: MethodResults, score: Score, seeds: int) -> str:
+    few = "" if len(row.seeds) == seeds else f" ({len(row.seeds)} seed{'s' if len(row.seeds) > 1 else ''})"
+    return f"{spread(row.summary[score.measure], score.digits)}{few}"
 
 
 def _choice(size: SizeResults) -> list[str]:

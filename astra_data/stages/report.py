@@ -1,7 +1,7 @@
 """Report: the results of all rows and seeds of a recipe, as results.json, .md, .html and figures."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +25,7 @@ from astra_data.reports.files import Found, publish_results, published_figures, 
 from astra_data.reports.held_out import failure_rates, foresight_lines
 from astra_data.reports.html_page import HTML, render_html
 from astra_data.reports.page import render
-from astra_data.reports.runs import Reported
+from astra_data.reports.runs import Reported, Runs
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
 from astra_data.reports.statistics import REPLICATES
@@ -89,7 +89,8 @@ def report(
         method_named(row)
     read = _read(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
-    sizes = _with_common_rows(
+    percents = _made(recipe, root, known)
+    sizes = [
         assemble(
             recipe.name,
             task_named(recipe.task).name,
@@ -105,12 +106,22 @@ def report(
             paper_success=config.paper_success,
             published=known.get(percent),
         )
-        for percent in recipe.percents or (None,)
-    )
+        for percent in percents
+    ]
     progress(0.5, f"{len(sizes[0].methods)} rows, {len(sizes[0].seeds)} seeds")
     found: Found
     if recipe.percents:
-        found = _sizes(recipe, command, sizes)
+        found = SizesResults(
+            recipe=recipe.name,
+            task=task_named(recipe.task).name,
+            command=command,
+            sizes=[
+                SizeResults(percent=percent, results=results)
+                for percent, results in zip(percents, sizes, strict=True)
+                if percent is not None
+            ],
+            unfinished=[percent for percent in recipe.percents if percent not in percents],
+        )
         page, figures = partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
     else:
         task = task_named(recipe.task)
@@ -131,12 +142,14 @@ def report(
             )
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
-    foreseen = (root, list(sizes[-1].gaps()), sizes[-1].seeds)
-    rates = failure_rates(*foreseen, max(recipe.percents, default=None))
+    sized = [percent for percent in percents if percent is not None]
+    groundings = dict.fromkeys(grounding for results in sizes for grounding in results.gaps())
+    foreseen = (root, list(groundings), recipe.seeds)
+    rates = failure_rates(*foreseen, max(sized, default=None))
     inlined = images | ({"reliability": png(reliability(rates))} if rates else {})
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
-        write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, recipe.percents)))
+        write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, sized)))
         if isinstance(found, Results) and found.headline == SUCCESS:
             write_file(folder / "eval_info.json", json.dumps(eval_info(found), indent=1))
         write_manifest(folder, read)
@@ -168,26 +181,16 @@ def _camera(task: Task) -> "Camera | None":
     return Camera(task.photograph, task.timestep_s, task.objective.horizon * task.timestep_s)
 
 
-def _with_common_rows(sizes: Iterable[Results]) -> list[Results]:
-    """Leave out the rows that are not finished at every dataset size."""
-    found = list(sizes)
-    rows = [row for row in found[0].methods if all(row in results.methods for results in found)]
-    return [
-        results.model_copy(update={"methods": {row: results.methods[row] for row in rows}})
-        for results in found
+def _made(recipe: Reported, root: Path, published: Container[int | None]) -> Sequence[int | None]:
+    """Return the dataset sizes with a finished row, here or published; the first without any."""
+    percents = recipe.percents or (None,)
+    made = [
+        percent
+        for percent in percents
+        if percent in published
+        or Runs(recipe.name, root, recipe.methods, recipe.seeds, recipe.groundings, percent).any_finished
     ]
-
-
-def _sizes(recipe: Reported, command: str, sizes: Sequence[Results]) -> SizesResults:
-    return SizesResults(
-        recipe=recipe.name,
-        task=task_named(recipe.task).name,
-        command=command,
-        sizes=[
-            SizeResults(percent=percent, results=results)
-            for percent, results in zip(recipe.percents, sizes, strict=True)
-        ],
-    )
+    return made or percents[:1]
 
 
 def _headline(results: Results) -> str:

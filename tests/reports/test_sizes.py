@@ -37,6 +37,27 @@ def test_the_table_has_a_column_for_each_size() -> None:
     assert "Data efficiency" not in page
 
 
+def test_rows_that_are_not_finished_are_left_open() -> None:
+    nas = bare_results("toy", {"nas": [0, 1], "astra": [1]}, {})
+    rows = {"nas": summarised(nas.methods["nas"], 100), "astra": summarised(nas.methods["astra"], 100)}
+    found = SizesResults(
+        recipe="toy",
+        task="maze",
+        command="run it",
+        sizes=[
+            SizeResults(percent=50, results=SMALL.model_copy(update={"unfinished": ["NAS", "DT"]})),
+            SizeResults(percent=100, results=nas.model_copy(update={"methods": rows, "seeds": [0, 1]})),
+        ],
+        unfinished=[10, 150],
+    )
+    page = render_sizes(found, {})
+    assert "Not finished yet: NAS and DT at 50 %; all rows at 10 %; all rows at 150 %. Produced by" in page
+    assert "| astra | 0.38 ± 0.18 | 0.00 (1 seed) |" in page and "| nas | - | 0.00 ± 0.00 |" in page
+    assert "| astra | 0.38 [0.25, 0.50] | 0.00 |" in page and "| nas | - | 0.00 [0.00, 0.00] |" in page
+    assert "Not finished" not in render_sizes(FOUND, {})
+    assert "unfinished" in found.model_dump() and "unfinished" not in FOUND.model_dump()
+
+
 def test_stages_that_all_sizes_share_are_timed_once() -> None:
     # Of twice 210 s, the 160 s of collect and pair are counted once.
     assert "Wall time of the stages, summed: 4 min." in render_sizes(FOUND, {})

@@ -244,6 +244,38 @@ def test_sizes_are_set_side_by_side(tasks: None, tmp_path: Path) -> None:
     ]
 
 
+def test_a_report_of_sizes_leaves_open_what_is_not_finished(tasks: None, tmp_path: Path) -> None:
+    root = tmp_path / "runs" / "sizes"
+    sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(10, 150, 50, 100))
+    with pytest.raises(MissingStageError, match="found none for direct_transfer seed 0, 1, 2; astra seed"):
+        make(root, recipe=sized)
+    for seed in SEEDS:
+        write_evaluation(root, "astra", seed, 50)
+        write_evaluation(root, "astra", seed, 100)
+        write_evaluation(root, "direct_transfer", seed, 100)
+    published = tmp_path / "results"
+    make(root, published, sized)
+    found = SizesResults.model_validate_json((root / "report/results.json").read_text())
+    assert [(size.percent, list(size.results.methods)) for size in found.sizes] == [
+        *((50, ["astra"]), (100, ["direct_transfer", "astra"])),
+    ]
+    html = read_page((root / "report/results.html").read_text())
+    assert html.table("Success in the target, mean")[1:] == [
+        ["Direct transfer", "-", "0.17 ± 0.14"],
+        ["ASTRA", "0.50 ± 0.25", "0.50 ± 0.25"],
+    ]
+    unfinished = "Direct transfer at 50 %; all rows at 10 %; all rows at 150 %."
+    assert f"Not finished yet: {unfinished}" in html.text
+    # Other sizes are added to what is published.
+    shutil.rmtree(root / "evaluate")
+    for seed in SEEDS[:2]:
+        write_evaluation(root, "direct_transfer", seed, 10)
+    make(root, published, sized, add_to=published / "sizes.json")
+    page = (published / "sizes.md").read_text()
+    assert "| method | 10 % | 50 % | 100 % |" in page
+    assert "| Direct transfer | 0.12 ± 0.18 (2 seeds) | - | 0.17 ± 0.14 |" in page
+
+
 def test_rows_that_were_tested_in_no_simulator_have_no_predictive_validity(root: Path) -> None:
     for row in ROWS:
         edit_json(root / f"evaluate/{row}/seed_1/evaluation.json", raw=None, grounded=None)

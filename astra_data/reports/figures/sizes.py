@@ -30,11 +30,26 @@ class Visits:
     extent: tuple[float, float, float, float]
 
 
+@dataclass(frozen=True)
+class Scored:
+    """A score of one row at one size.
+
+    Attributes:
+        seeds: of each seed, (seeds,).
+        middle: the interquartile mean.
+        low, high: ends of its interval, NaN for a single seed.
+    """
+
+    seeds: Floats
+    middle: float
+    low: float
+    high: float
+
+
 def data_efficiency(
     score: Score,
     percents: Sequence[int],
-    scores: Mapping[str, Sequence[Floats]],
-    intervals: Mapping[str, Floats],
+    rows: Mapping[str, Mapping[int, Scored]],
     covered: Mapping[str, Sequence[Visits]],
     tested: str = "in the target",
 ) -> Figure:
@@ -42,15 +57,13 @@ def data_efficiency(
 
     Args:
         score: what is drawn over the size.
-        percents: the K sizes.
-        scores: those of each row's seeds, K times (seeds,).
-        intervals: interquartile mean, low and high of each row, (3, K); low and high NaN for a single seed.
+        percents: the sizes.
+        rows: the scores of each row by size, as far as there are any.
         covered: what is mapped, such as "position (m)" → the visits of each size.
         tested: where.
     """
     with style():
         order = np.argsort(percents)
-        sizes = np.array(percents, dtype=float)[order]
         ratios = [1.0] * len(covered) + [2.2]
         figure = Figure(figsize=(1.0 + 1.5 * max(4, len(percents)), 1.6 * sum(ratios)), layout="constrained")
         grid = figure.add_gridspec(len(ratios), len(percents), height_ratios=ratios)
@@ -65,15 +78,9 @@ def data_efficiency(
                 for axes, k in zip(panels, order, strict=True):
                     axes.set_title(f"{percents[k]} %")
         axes = figure.add_subplot(grid[len(covered), :])
-        for method, seeds in scores.items():
-            _band(
-                axes,
-                sizes,
-                [seeds[k] for k in order],
-                intervals[method][:, order],
-                method,
-            )
-        axes.set_xticks(sizes, [f"{percent:g} %" for percent in sizes])
+        for method, sizes in rows.items():
+            _band(axes, sizes, method)
+        axes.set_xticks(sorted(percents), [f"{percent} %" for percent in sorted(percents)])
         axes.set_xlabel("size of the dataset")
         score_axis(axes, score)
         axes.set_ylabel(f"{score.quantity} {tested}")
@@ -101,11 +108,15 @@ def _maps(panels: Sequence[Axes], visits: Sequence[Visits], label: str) -> None:
     panels[0].set_ylabel(label)
 
 
-def _band(axes: Axes, percents: Floats, seeds: Sequence[Floats], interval: Floats, method: str) -> None:
-    middle, low, high = interval
+def _band(axes: Axes, sizes: Mapping[int, Scored], method: str) -> None:
+    percents = sorted(sizes)
+    scored = [sizes[percent] for percent in percents]
+    low, high = (np.array([getattr(one, end) for one in scored]) for end in ("low", "high"))
     colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
     if np.isfinite(low).all():
         axes.fill_between(percents, low, high, color=colour, alpha=0.18, lw=0)
+    middle = [one.middle for one in scored]
     axes.plot(percents, middle, dashes, color=colour, marker="o", ms=4, label=method_title(method))
-    places = np.repeat(percents, [len(of_size) for of_size in seeds])
-    axes.plot(places, np.concatenate(seeds), ".", color=colour, alpha=0.45, ms=4, zorder=1)
+    places = np.repeat(percents, [len(one.seeds) for one in scored])
+    seeds = np.concatenate([one.seeds for one in scored])
+    axes.plot(places, seeds, ".", color=colour, alpha=0.45, ms=4, zorder=1)
