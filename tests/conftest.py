@@ -25,7 +25,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def quick_failures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fit failure models in a few updates, where what they foresee does not matter."""
-    importlib.import_module("rail_run").fit_failures_quickly(monkeypatch)
+    importlib.import_module("quick_runs").fit_failures_quickly(monkeypatch)
 
 
 @pytest.fixture

@@ -3,11 +3,7 @@
 from pathlib import Path
 
 import pytest
-
-from astra_data.core.progress import silent
-from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.plan import plan, stage_of, stages_until
-from astra_data.learning.descent import DescentConfig
+from quick_runs import fit_failures_quickly, run_here
 
 ROOT = Path(__file__).parents[1]
 SMALL = """
@@ -52,22 +48,3 @@ def make_rail_run(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", m
     with pytest.MonkeyPatch.context() as patch:
         fit_failures_quickly(patch)
         return run_here(path, until="align")
-
-
-def run_here(path: Path, until: str | None = None) -> Path:
-    """Run a recipe in this process, to `runs` beside it; return its folder.
-
-    A process of its own takes seconds to load what this one has loaded.
-    """
-    experiment, stages = load_experiment(path, path.parent / "runs"), stages_until(until)
-    experiment.folder.mkdir(parents=True)
-    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
-    for item in plan(experiment.recipe, path, experiment.folder):
-        if stage_of(item) in stages:
-            item.call(progress=silent)
-    return experiment.folder
-
-
-def fit_failures_quickly(patch: pytest.MonkeyPatch) -> None:
-    """Make failure models of a few updates, which foresee nothing."""
-    patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=3))

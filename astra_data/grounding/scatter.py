@@ -22,8 +22,9 @@ def fit_scatter(
     """Fit scales to the residuals of the training episodes; take the forms from held-out ones.
 
     Returns:
-        the scatter model, and its figures on held-out steps: "gain_nats", of the log-likelihood of a step
-        over scatter of one size; "kurtosis", of the forms, 3 for a Gaussian.
+        the scatter model, and its figures on held-out steps, of the entries that scatter: "gain_nats", of the
+        log-likelihood of a step over scatter of one size; "kurtosis", of the forms, 3 for a Gaussian, NaN
+        where nothing scatters.
     """
     inputs, residual = _residuals(model, training)
     seen, unexplained = _residuals(model, held_out)
@@ -39,9 +40,12 @@ def fit_scatter(
     in_units = scatters.in_units(seen, unexplained)
     scatters.forms.copy_(in_units[torch.randperm(len(seen))[:forms]])
     usual, log_scale = _deviation(unexplained / scatters.usual), scatters.log_scale(seen)
+    gains = usual.log() - _deviation(in_units).log() - log_scale.mean(0)
+    kurtosis = in_units.pow(4).mean(0) / in_units.square().mean(0).square()
+    scattered = usual > 0
     return scatters, {
-        "gain_nats": float((usual.log() - _deviation(in_units).log() - log_scale.mean(0)).sum()),
-        "kurtosis": float((in_units.pow(4).mean(0) / in_units.square().mean(0).square()).mean()),
+        "gain_nats": float(gains[scattered].sum()),
+        "kurtosis": float(kurtosis[scattered].mean()),
     }
 
 

@@ -187,15 +187,15 @@ def mean_rank_correlation(
     Returns:
         None where no row has enough seeds, or in none do both sides vary.
     """
-    from scipy.stats import rankdata
 
     def of(seeds: Sequence[int]) -> float | None:
-        found = []
-        for row in rows:
-            sides = np.array([row[seed] for seed in seeds if seed in row], dtype=np.float64).T
-            if sides.size >= 2 * least and all(map(np.ptp, sides)):
-                found.append(float(np.corrcoef(*map(rankdata, sides))[0, 1]))
-        return float(np.mean(found)) if found else None
+        sides = [np.array([row[seed] for seed in seeds if seed in row], dtype=np.float64).T for row in rows]
+        found = [
+            float(_coefficients(one[None], other[None], ranks=True)[0])
+            for one, other in (pair for pair in sides if pair.size >= 2 * least)
+        ]
+        known = [value for value in found if not np.isnan(value)]
+        return float(np.mean(known)) if known else None
 
     rng, seeds = np.random.default_rng(0), sorted({seed for row in rows for seed in row})
     value = of(seeds)

@@ -76,6 +76,32 @@ def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_ste
     assert figures["kurtosis"] == pytest.approx(3.0, abs=0.6)
 
 
+def test_entries_that_are_always_right_have_no_say_in_the_figures(quick: None) -> None:
+    training, held_out = scattered_episodes(0), scattered_episodes(1)
+
+    def exact(episodes: PairedEpisodes, entries: slice) -> PairedEpisodes:
+        windows = episodes.windows
+        next_state = windows.next_state.clone()
+        next_state[..., entries] = windows.simulated_next[..., entries]
+        return replace(episodes, windows=replace(windows, next_state=next_state))
+
+    model = grounding_model()
+    assert torch.equal(
+        model.correct(
+            model.encode(training.windows)[0], training.windows.action, training.windows.simulated_next
+        ),
+        training.windows.simulated_next,
+    )
+    _, whole = fit_scatter(model, training, held_out, seed=0)
+    _, figures = fit_scatter(model, exact(training, slice(2, 4)), exact(held_out, slice(2, 4)), seed=0)
+    # All entries scatter alike, so half of them gain half.
+    assert figures["gain_nats"] == pytest.approx(whole["gain_nats"] / 2, rel=0.3)
+    assert figures["kurtosis"] == pytest.approx(whole["kurtosis"], rel=0.1)
+    scatters, figures = fit_scatter(model, exact(training, slice(None)), exact(held_out, slice(None)), seed=0)
+    assert figures["gain_nats"] == 0.0 and figures["kurtosis"] != figures["kurtosis"]
+    assert not scatters.forms.any()
+
+
 def test_forms_are_as_wild_as_held_out_steps_where_training_ones_are_not(
     fitted: tuple[ScatterModel, dict[str, float]],
 ) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from humanoid_recipe import RECIPE
-from rail_run import run_here
+from quick_runs import run_here
 from safetensors.torch import load_file
 from torch.nn import functional
 

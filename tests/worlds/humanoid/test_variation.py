@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from humanoid_recipe import RECIPE
-from rail_run import run_here
+from quick_runs import run_here
 
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.files import load_grounding
