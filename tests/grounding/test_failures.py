@@ -1,3 +1,4 @@
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -59,8 +60,18 @@ def said_of(model: FailureModel, episodes: PairedEpisodes) -> Tensor:
     return model.probability(replayed_inputs(TASK, HistoryGrounding(grounding_model()), model, episodes))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_updates() -> Iterator[None]:
+    """Enough for these toys."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "astra_data.grounding.failures._DESCENT", DescentConfig(updates=60, learning_rate=1e-2)
+        )
+        yield
+
+
 @pytest.fixture(scope="module")
-def foreseeing() -> FailureModel:
+def foreseeing(few_updates: None) -> FailureModel:
     return fit_failures(TASK, HistoryGrounding(grounding_model()), hurried(40, 0), 2, seed=0)
 
 

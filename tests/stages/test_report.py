@@ -4,6 +4,7 @@ import json
 import shutil
 from base64 import b64decode
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +26,7 @@ from fake_runs import (
     write_runs,
 )
 from html_pages import read_page
+from matplotlib.figure import Figure
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
@@ -48,7 +50,15 @@ def tasks() -> Iterator[None]:
 
 
 @pytest.fixture
-def root(tasks: None, tmp_path: Path) -> Path:
+def root(tasks: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Runs whose report has rough figures, which are drawn quickly."""
+
+    def rough(figure: Figure) -> bytes:
+        figure.set_layout_engine("none")
+        figure.savefig(content := BytesIO(), format="png", dpi=20)
+        return content.getvalue()
+
+    monkeypatch.setattr("astra_data.reports.figures.png", rough)
     return write_runs(tmp_path)
 
 
