@@ -81,9 +81,8 @@ def _tables(spreads: tuple[Spread, ...]) -> Iterator[RenderableType]:
         for name in ("min", "mean", "max"):
             table.add_column(name, justify="right", min_width=10, no_wrap=True)
         table.add_column("spread", min_width=BINS, no_wrap=True)
-        units = (column.astra or {}).get("unit", [""] * column.size)
         labels = column.names or [str(index) if column.size > 1 else "" for index in range(column.size)]
-        for index, (label, unit) in enumerate(zip(labels, units, strict=True)):
+        for index, (label, unit) in enumerate(zip(labels, column.units, strict=True)):
             figures = (f"{values[index]:.4g}" for values in (spread.low, spread.mean, spread.high))
             table.add_row(*map(Text, (label, unit, *figures, sparkline(spread.counts[index]))))
         yield Text(f"{column.name} ({column.size}) {column.dtype}", style="bold")

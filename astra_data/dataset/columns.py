@@ -122,6 +122,11 @@ class Column:
         return self.names or tuple(map(str, range(self.size)))
 
     @property
+    def units(self) -> list[str]:
+        """The unit of each value; "" where it is not known."""
+        return (self.astra or {}).get("unit", [""] * self.size)
+
+    @property
     def roles(self) -> list[tuple[str, slice]]:
         """Each role with the indices that it acts on at once, in order; empty if roles are unknown."""
         groups, index, roles = [], 0, (self.astra or {}).get("role", [])

@@ -70,8 +70,7 @@ def _of_commands(task: Task) -> Column:
 
 def labels(column: Column) -> list[str]:
     """Return the names of a column's entries with their units, where these are known."""
-    units = (column.astra or {}).get("unit", ["1"] * column.size)
-    named = zip(column.labels, units, strict=True)
+    named = zip(column.labels, column.units, strict=True)
     return [name if unit in ("1", "") else f"{name} ({unit})" for name, unit in named]
 
 

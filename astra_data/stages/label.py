@@ -196,8 +196,7 @@ def _contradictions(recorded: Column, expected: Column) -> list[str]:
     if any(name in names and names.index(name) != place for place, name in enumerate(expected.names or ())):
         order = ", ".join(expected.labels)
         faults.append(f"has the values {', '.join(names)} in {expected.name}, expected the order {order}")
-    units = ((column.astra or {}).get("unit", [""] * column.size) for column in (recorded, expected))
-    for name, own, other in zip(recorded.labels, *units, strict=True):
+    for name, own, other in zip(recorded.labels, recorded.units, expected.units, strict=True):
         if own and other and own != other:
             faults.append(f"has {name} of {expected.name} in {own}, expected {other}: scale it on import")
     return faults

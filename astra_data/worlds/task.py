@@ -1,6 +1,7 @@
 """A task: target environment, abstract simulator, the map between their states, and the objective."""
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -151,7 +152,6 @@ class Task:
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
-        names = abstract.labels
         size = self.objective.goal_size
         usual = {
             "instruction": self.name,
@@ -159,7 +159,7 @@ class Task:
             "goal": Column(GOAL, size=size) if size else None,
             "abstraction": getattr(self.make_simulator, "abstraction", None),
             "abstract_state": replace(abstract, name=ABSTRACT_STATE),
-            "quantities": {name: (index,) for index, name in enumerate(names)},
+            "quantities": {name: (index,) for index, name in enumerate(_with_units(abstract))},
             "simulator_id": _named(self.make_simulator),
         }
         derived = {name: value for name, value in usual.items() if not getattr(self, name)}
@@ -282,6 +282,17 @@ def roles(
     """Return a `Column`'s arguments on its entries: names, units, frames, roles and mirror images."""
     astra = {"unit": units, "frame": frames, "role": entries}
     return {"names": names, "astra": astra if mirror is None else {**astra, "mirror": mirror}}
+
+
+def _with_units(column: Column) -> list[str]:
+    """Return the names of a column's values, with units where these are known: "speed_m_s"."""
+    words = [
+        "_".join(re.findall("[a-z0-9]+", unit.replace("²", "2").replace("°", "deg"))) for unit in column.units
+    ]
+    return [
+        name if word in ("", "1") or name.endswith(f"_{word}") else f"{name}_{word}"
+        for name, word in zip(column.labels, words, strict=True)
+    ]
 
 
 def _named(made: object) -> str:

@@ -64,9 +64,7 @@ def said_of(model: FailureModel, episodes: PairedEpisodes) -> Tensor:
 def few_updates() -> Iterator[None]:
     """Enough for these toys."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "astra_data.grounding.failures._DESCENT", DescentConfig(updates=60, learning_rate=1e-2)
-        )
+        patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=60, learning_rate=1e-2))
         yield
 
 

@@ -110,6 +110,20 @@ class HalfRail(Rail):
         return 0.5 * state[..., :1]
 
 
+@pytest.mark.parametrize(
+    ("unit", "name"),
+    [
+        *(("m", "v_m"), ("m/s", "v_m_s"), ("rad/s", "v_rad_s"), ("m/s²", "v_m_s2"), ("°", "v_deg")),
+        *(("1", "v"), ("", "v"), (None, "v")),
+    ],
+)
+def test_what_the_gap_lists_by_default_is_named_with_its_unit(unit: str | None, name: str) -> None:
+    astra = None if unit is None else {"unit": ["rad", unit]}
+    state = Column("abstract.state", size=2, names=("lean_rad", "v"), astra=astra)
+    task = Task(**{**GIVEN, "abstract_state": state, "abstraction": lambda state: state})
+    assert task.quantities == {"lean_rad": (0,), name: (1,)}
+
+
 def test_what_was_filled_in_is_filled_in_anew_where_a_field_is_replaced() -> None:
     other = replace(TASK, make_simulator=HalfRail, commands={"push": (0.0, 1.0)}, name="half")
     state = torch.tensor([[4.0, 1.0]])

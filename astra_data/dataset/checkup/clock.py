@@ -36,7 +36,7 @@ class Clock:
 
     def __init__(self, column: Column, fps: int) -> None:
         self._name, self._fps = column.name, fps
-        unit = (column.astra or {}).get("unit", [""])[0] or column.name.rpartition("_")[2]
+        unit = column.units[0] or column.name.rpartition("_")[2]
         self._scale = _SECONDS.get(unit, 1.0)
         self._bins: NDArray[np.int64] = np.zeros(FINE * MOST_PERIODS + 1, np.int64)
         self._longest_s: list[float] = []

@@ -36,10 +36,12 @@ class Jumps:
 
     def __init__(self, column: Column, steps: int) -> None:
         self._column = column
-        units, roles = _units_and_roles(column)
         # A velocity may change at once, where the robot hits something, and so may a force or a timer.
         self._placed = np.array(
-            [unit in PLACES and role != "vector" for unit, role in zip(units, roles, strict=True)]
+            [
+                unit in PLACES and role != "vector"
+                for unit, role in zip(column.units, _role_of_each(column), strict=True)
+            ]
         )
         self._turns = full_turns(column)
         self._quaternions = [group for role, group in column.roles if role == "quaternion"]
@@ -121,15 +123,14 @@ def full_turns(column: Column) -> Floats:
     """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
     turns = [
         _TURN.get(unit, 2 * np.pi if role == "heading" else 0.0)
-        for unit, role in zip(*_units_and_roles(column), strict=True)
+        for unit, role in zip(column.units, _role_of_each(column), strict=True)
     ]
     return np.array(turns)
 
 
-def _units_and_roles(column: Column) -> tuple[list[str], list[str]]:
-    """Return both of each value; "" where they are unknown."""
-    unknown, astra = [""] * column.size, column.astra or {}
-    return astra.get("unit", unknown), astra.get("role", unknown)
+def _role_of_each(column: Column) -> list[str]:
+    """Return the role of each value; "" where they are unknown."""
+    return (column.astra or {}).get("role", [""] * column.size)
 
 
 def shortest(steps: Floats, turns: Floats) -> Floats:

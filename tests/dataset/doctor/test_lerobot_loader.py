@@ -1,11 +1,13 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from damaged import EPISODES, alter, drop
-from fake_dataset import write_fake
+from fake_dataset import COLUMNS, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Column, Episode
 from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
 
@@ -24,7 +26,15 @@ def compared(root: Path, episodes: int = 5, frames: int = 55) -> list[str]:
 
 
 def test_lerobot_reads_the_same_windows(tmp_path: Path) -> None:
-    assert compared(write_fake(tmp_path / "set").root) == []
+    import datasets.config  # noqa: PLC0415 - slow
+
+    usual = datasets.config.HF_DATASETS_CACHE
+    with writer(tmp_path / "set", columns=[*COLUMNS, Column("observation.fine", "float64")]) as out:
+        for one in fake_episodes():
+            fine = np.random.default_rng(one.uid).normal(size=len(one.columns["mode"]))
+            out.add(Episode(one.uid, one.columns | {"observation.fine": fine}, one.metadata))
+    assert compared(tmp_path / "set") == []
+    assert usual == datasets.config.HF_DATASETS_CACHE
 
 
 def test_other_boundaries_of_episodes_are_found(tmp_path: Path) -> None:
@@ -32,14 +42,19 @@ def test_other_boundaries_of_episodes_are_found(tmp_path: Path) -> None:
     # lerobot takes boundaries from meta/episodes: the fourth episode now begins two steps early.
     alter(EPISODES, "dataset_to_index", 2, 18)(root)
     alter(EPISODES, "dataset_from_index", 3, 18)(root)
+    # The first begins and the last ends a step off.
+    alter(EPISODES, "dataset_from_index", 0, 1)(root)
+    alter(EPISODES, "dataset_to_index", 4, 54)(root)
     faults = compared(root)
-    assert any("has other padding" in fault for fault in faults)
-    assert any("has other values" in fault for fault in faults)
+    for name in ("observation.state", "action"):
+        for row, other in ((0, "values"), (54, "values"), (18, "padding")):
+            assert f"lerobot's window of {name} around row {row} has other {other}" in faults
 
 
 def test_other_counts_are_found(tmp_path: Path) -> None:
-    faults = compared(write_fake(tmp_path / "set").root, episodes=6, frames=50)
-    assert faults == ["lerobot sees 5 episodes, 55 frames, not 6, 50"]
+    root = write_fake(tmp_path / "set").root
+    assert compared(root, episodes=6) == ["lerobot sees 5 episodes, 55 frames, not 6, 55"]
+    assert compared(root, frames=50) == ["lerobot sees 5 episodes, 55 frames, not 5, 50"]
 
 
 def test_what_lerobot_cannot_open_is_a_fault(tmp_path: Path) -> None:

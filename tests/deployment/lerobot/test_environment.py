@@ -97,10 +97,14 @@ def test_commands_are_in_their_units_and_the_horizon_ends_episodes(environment: 
         assert truncated.tolist() == [number == 40] * 2
     assert not terminated.any() and not info["is_success"].any()
     assert env.call("task_description") == ("rail-cart", "rail-cart")
+    assert env.call("_max_episode_steps") == (40, 40) and robot.metadata["render_fps"] == 10
     assert env.envs[0].render().shape == (64, 64, 3)
     ended, reward, *_ = env.step(np.array([[4.0], [4.0]], np.float32))
     np.testing.assert_allclose(ended["observation.state"], shown["observation.state"])
     assert not reward.any()
+    env.reset(seed=[3, 3])
+    *_, truncated, _ = env.step(np.zeros((2, 1), np.float32))
+    assert not truncated.any()
 
 
 def test_a_push_to_the_goal_is_a_success_and_one_that_tips_is_none(environment: Any, run: Path) -> None:  # noqa: ANN401
