@@ -40,7 +40,10 @@ class Repository:
 
 
 class Hub(ThreadingHTTPServer):
-    """Repositories "user/name" and large files by sha256; `refuse` may answer any request with a status."""
+    """Repositories "user/name" and large files by sha256; `refuse` may answer any request with a status.
+
+    Where nobody asks for another one, `visibility` is that of new repositories, as organisations may choose.
+    """
 
     daemon_threads = True
 
@@ -48,6 +51,7 @@ class Hub(ThreadingHTTPServer):
         self.repos: dict[str, Repository] = {}
         self.large: Files = {}
         self.ranges: list[str] = []
+        self.visibility = "public"
         self.refuse: Callable[[str, str], int | None] = lambda method, path: None
         super().__init__(("127.0.0.1", 0), Handler)
 
@@ -139,7 +143,9 @@ class Handler(BaseHTTPRequestHandler):
         name = f"{asked['organization'] or 'me'}/{asked['name']}"
         if name in self.server.repos:
             return self._answer({"error": "exists", "url": f"{self.server.url}/datasets/{name}"}, 409)
-        self.server.repos[name] = Repository(private=asked.get("visibility") == "private")
+        self.server.repos[name] = Repository(
+            private=asked.get("visibility", self.server.visibility) == "private"
+        )
         return self._answer({"url": f"{self.server.url}/datasets/{name}", "id": name})
 
     def validate(self) -> None:

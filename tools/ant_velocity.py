@@ -13,13 +13,13 @@ from astra_data.worlds.ant.body import (
     Floats,
     ant_model,
     canonical_view,
-    rotation_matrix,
     standing_pose,
     torques_to_body,
     up_cosine,
 )
 from astra_data.worlds.batched import Step
 from astra_data.worlds.batched_mujoco import BatchedPhysics, Bools
+from astra_data.worlds.geometry import rotation_matrix
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,9 @@ from typing import Annotated
 
 import typer
 from timing import complain
+from trial_regret import Pool, at_random, by_equal_shares, by_halving, estimate, pools_of
 
 from astra_data.core.errors import AstraDataError
-from astra_data.experiments.trial_regret import (
-    Pool,
-    at_random,
-    by_equal_shares,
-    by_halving,
-    estimate,
-    pools_of,
-)
 from astra_data.reports.files import read_published
 from astra_data.reports.formatting import interval, table
 from astra_data.reports.sizes import by_size

@@ -17,6 +17,8 @@ from typing import Annotated
 
 import torch
 import typer
+from altered_latents import ALTERATIONS, AlteredLatents, in_target
+from probes import Probed, dropped_values, picking_split, probe, recent_actions, way_to_goal
 from torch import Tensor
 
 from astra_data.core.naming import place
@@ -24,16 +26,7 @@ from astra_data.core.seeding import derive
 from astra_data.experiments.trained_policy import load_policy, policy_files, settings_of
 from astra_data.grounding.files import load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.probes import (
-    Probed,
-    dropped_values,
-    picking_split,
-    probe,
-    recent_actions,
-    way_to_goal,
-)
 from astra_data.methods import grounded_as
-from astra_data.training.altered_latents import ALTERATIONS, AlteredLatents, in_target
 from astra_data.training.own_world import in_simulator, own_world, started
 from astra_data.training.policy_file import PolicyFile
 from astra_data.worlds.plane.navigation import Navigation

@@ -243,6 +243,15 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
+    def _counts_recorded_episodes(self) -> Self:
+        if self.augment and self.sweep.percent:
+            raise ValueError(
+                "sweep.percent: sizes are of recorded episodes, and [augment] adds copies of these: leave "
+                "one of both out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _has_no_repeats(self) -> Self:
         axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
         for name, values in axes.items():

@@ -90,7 +90,7 @@ def sweep(
     ]
     show = partial(_shown, PointTable(experiment, points), log)
     make(experiment, wanted, jobs=jobs, device=device, cluster=cluster, show=show)
-    if until == "ground":
+    if any(stage_of(item) == "ground" for item in wanted):
         write_errors(experiment, part)
     return experiment.folder
 

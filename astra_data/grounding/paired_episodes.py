@@ -174,9 +174,14 @@ class PairedEpisodes:
         Augmented datasets mark them: with a random split, copies of held-out episodes would be trained on.
 
         Raises:
-            BadInputError: there are too few episodes.
+            BadInputError: there are too few episodes, or all are held out.
         """
         if self.held_out is not None:
+            if self.held_out.all():
+                raise BadInputError(
+                    f"{self.reference}: expected episodes to train on, got {len(self)} that augmentation "
+                    "held out: take a larger subset"
+                )
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
         order = torch.from_numpy(generator(seed, "held-out episodes").permutation(len(self)))
         order = order.to(self.target_state.device)

@@ -27,7 +27,7 @@ class Learner(ABC):
     """A training in progress.
 
     Every iteration seeds torch from (seed, iteration): a training that resumes from a checkpoint repeats what
-    an uninterrupted one would have done.
+    an uninterrupted one would have done, where the environment can be restored.
 
     Attributes:
         env: the environment. acting: how a policy acts in it.
@@ -88,9 +88,15 @@ class Learner(ABC):
         progress = {"steps": self.steps, "iteration": self._iteration, "acting": self.acting.state_dict()}
         return {name: part.state_dict() for name, part in self._parts.items()} | progress
 
-    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Continue from `state`, once the environment is restored and returned `observation` (B, O)."""
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor, *, goes_on: bool = True) -> None:
+        """Continue from `state`, once the environment is restored and returned `observation` (B, O).
+
+        Where its episodes do not go on, as those of robots that are where they are, new ones begin with it.
+        """
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.steps, self._iteration = state["steps"], state["iteration"]
-        self.acting.load_state_dict(state["acting"], observation)
+        if goes_on:
+            self.acting.load_state_dict(state["acting"], observation)
+        else:
+            self.acting.observation = observation

@@ -121,6 +121,10 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
         else judged(task.objective, "reached", after, goal) & ~over
     )
     failed = (over | missed) & ~reached
+    success = reached.clone()
+    if SUCCESS not in given:
+        late = slice(task.objective.horizon - 1, None)
+        success[late] = task.objective.succeeded(reached[late], failed[late], task.objective.horizon)
     reward = paid(task.objective, before, after, goal, failed).numpy()
     terminated = (reached | failed).numpy()
     length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
@@ -129,21 +133,21 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     computed: dict[str, Array] = {
         **({GOAL: as_column(goal.numpy())} if task.goal else {}),
         REWARD: reward.astype(np.float32),
-        SUCCESS: reached.numpy(),
+        SUCCESS: success.numpy(),
     }
     columns = (
         computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
     )
-    success = bool(columns[SUCCESS][:length].any())
-    metadata = {
-        "success": success,
-        "failed": bool(terminated[length - 1]) and not success,
+    succeeded = bool(columns[SUCCESS][:length].any())
+    outcome = {
+        "success": succeeded,
+        "failed": bool(terminated[length - 1]) and not succeeded,
         "return": float(columns[REWARD][:length].sum(dtype=np.float64)),
     }
     return Episode(
         episode.uid,
         {key: values[:length] for key, values in columns.items()},
-        metadata | dict(episode.metadata),
+        dict(episode.metadata) | outcome,
     )
 
 

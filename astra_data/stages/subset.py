@@ -15,7 +15,7 @@ def subset(dataset: Path, *, percent: int, of: int | None = None, out: Path, pro
         percent: the size; may exceed 100.
         of: number of episodes that count as 100 per cent, by default all.
         out: the folder to write.
-        progress: called with the number of episodes.
+        progress: called with the fraction done and a note.
 
     Raises:
         BadInputError: `dataset` has fewer episodes, or `out` exists.

@@ -59,7 +59,8 @@ class EnvConfig(Config):
     """Subtracted from the reward of a step, times the squared change of the command, from the start: robots
     fall and lose time where commands jump about."""
     command_limit_m_s: Positive = 2.0
-    """Shorten longer commands to this, in training and in the target; by default longer than any command."""
+    """Shorten longer commands to this, in training and in the target, as a multiple of the largest along an
+    axis, which is 1 m/s for the ant; by default longer than any command."""
     ramp: Share = 0.0
     """Share of the training over which the penalties grow from zero: at full size from the start, they teach
     the robot to stand still."""

@@ -1,4 +1,4 @@
-"""Run a policy in a simulator; in particular a trained one in its own, without the noise of training."""
+"""Run a policy in a simulator; in particular a trained one in its own, by the mean of its actions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class Reached:
 
 
 def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
-    """Test a policy that was trained in a simulator there, from the task's starts and without noise."""
+    """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions."""
     assert trained.simulation is not None
     deployed = deploy(task, trained, grounding)
     world = own_world(task, trained.simulation, grounding, _EPISODES)

@@ -82,7 +82,7 @@ class SimulatorEnv:
             reward: where the reward comes from.
             topple: end episodes by the topple head.
             risk_weight: how many topples a predicted one counts for in the reward "blend".
-            command_limit_m_s: longer velocity commands are shortened to this.
+            command_limit_m_s: longer velocity commands, ±1 per axis, are shortened to this.
             thinness: subtracted from the reward of a step to each cell of the maze's fine grid, (height,
                 width); None without a maze.
             disagreement_penalty: subtracted from the reward, times the simulator's `disagreement`.

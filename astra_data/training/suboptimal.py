@@ -113,7 +113,8 @@ def _train(
     """
 
     def go_on(state: dict[str, Any]) -> None:
-        learner.load_state_dict(state["learner"], world.load_state_dict(state["world"]))
+        observation = world.load_state_dict(state["world"])
+        learner.load_state_dict(state["learner"], observation, goes_on=bool(state["world"]))
 
     logbook = Logbook(folder / "training.safetensors", go_on)
     share = logbook.points[-1]["share"] if logbook.points else 0.0

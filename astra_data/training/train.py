@@ -48,7 +48,7 @@ class TrainConfig(EnvConfig):
     """Size of the policy's own GRU, where no grounding provides a latent."""
     tries: AtOnce = 1
     """Trainings at most: where the policy did not master its own simulator, in 100 episodes from the task's
-    starts and without the noise of training, it is trained again from another seed."""
+    starts and by the mean of its actions, it is trained again from another seed."""
     least_success: Share = 0.9
     """Success in these with which a simulator is mastered; the best try is kept where none has it."""
     most_of_horizon: Share = 0.85
@@ -262,7 +262,7 @@ def optimise(
 
     def go_on(state: dict[str, Any]) -> None:
         world = {name: values.to(training.device) for name, values in state["world"].items()}
-        learner.load_state_dict(state["learner"], env.load_state_dict(world))
+        learner.load_state_dict(state["learner"], env.load_state_dict(world), goes_on=bool(world))
 
     logbook = Logbook(training.folder / checkpoint_name, go_on)
     points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps

@@ -21,6 +21,16 @@ _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
 
 
+def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
+    """Return the first and last geom id of the maze walls (ids are contiguous), or None on an open plane."""
+    walls = [
+        geom
+        for geom in range(model.ngeom)
+        if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom).startswith("block_")
+    ]
+    return (walls[0], walls[-1]) if walls else None
+
+
 class BatchedPhysics:
     """B independent copies of `model`, stepped `substeps` physics steps per control step.
 

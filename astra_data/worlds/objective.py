@@ -67,7 +67,7 @@ class Objective(ABC):
         return torch.cat([state, goal], dim=-1)
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
-        """Clip actions (..., A) to ±1; `limit`, in m/s, has no effect on actions that are no velocities."""
+        """Clip actions (..., A) to ±1; `limit` has no effect on actions that are no velocities."""
         return action.clamp(-1.0, 1.0)
 
     @abstractmethod

@@ -102,7 +102,7 @@ class PlanarVariation(Variation):
     action_scale: Range = (0.0, 0.0)
     """Relative error of commands: 0.1 makes them 10 % longer."""
     action_noise: NoiseRange = (0.0, 0.0)
-    """Standard deviation of Gaussian noise on commands, in m/s."""
+    """Standard deviation of Gaussian noise on commands of ±1 per axis."""
     position_noise_m: NoiseRange = (0.0, 0.0)
     """Half width of the uniform noise on observed positions."""
     velocity_noise_m_s: NoiseRange = (0.0, 0.0)

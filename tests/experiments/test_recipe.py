@@ -125,6 +125,10 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ({"collect": {"start": "task", "episodes": 10**18}}, "collect.episodes: expected less than or equal"),
         ({"collect": {"start": "task", "episodes": 10**10}}, "collect: episodes: 10000000000 of up to 500"),
         ({"sweep": {"percent": [10**9]}}, "sweep.percent.0: expected less than or equal to 10000"),
+        (
+            {"task": "antmaze-umaze", "sweep": {"percent": [50]}, "augment": {"copies": 2}},
+            "sweep.percent: sizes are of recorded episodes, and [augment] adds copies",
+        ),
         ({"train": {"num_envs": 10**9}}, "train.num_envs: expected less than or equal to 1000000"),
         ({"train": {"hidden_sizes": [10**9]}}, "train.hidden_sizes.0: expected less than or equal to"),
         ({"evaluate": {"episodes": 10**9}}, "evaluate.episodes: expected less than or equal to 1000000"),

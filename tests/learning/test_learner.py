@@ -101,3 +101,18 @@ def _cloned(state: dict[str, Any]) -> dict[str, Any]:
         else (value.clone() if torch.is_tensor(value) else value)
         for name, value in state.items()
     }
+
+
+def test_where_the_episodes_cannot_go_on_new_ones_begin() -> None:
+    learner = Noisy(world(), 3)
+    learner.iterate()
+    state = learner.state_dict()
+    assert state["acting"]["hidden"].any() and state["acting"]["age"].any()
+    resumed, observation = Noisy(world(), 3), torch.full((6, 1), 0.25)
+    resumed.load_state_dict(state, observation, goes_on=False)
+    acting = resumed.acting.state_dict()
+    assert resumed.steps == learner.steps and torch.equal(resumed.layer.weight, learner.layer.weight)
+    assert torch.equal(resumed.acting.observation, observation) and acting["first"].all()
+    assert not any(acting[name].any() for name in ("hidden", "previous_action", "age", "lasted"))
+    resumed.load_state_dict(state, observation)
+    assert torch.equal(resumed.acting.hidden, state["acting"]["hidden"])

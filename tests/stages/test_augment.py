@@ -31,7 +31,8 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.stages.augment import AugmentConfig, _free_uid, _moving, _shares, augment
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair
-from astra_data.worlds.ant.body import WALL_REACH_M, rotation_matrix, up_cosine
+from astra_data.worlds.ant.body import WALL_REACH_M, up_cosine
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.relocation import Relocation
 from astra_data.worlds.registry import TASKS

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_cart import Last
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -95,6 +96,25 @@ def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
         **{"driver": "Ada", "success": False, "failed": True},
         "return": pytest.approx(-9.0),
     }
+
+
+def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
+    task = replace(task_named(CART), objective=Last(horizon=10))
+    short, long = (Episode(0, drive(0.01, steps), {}) for steps in (9, 10))
+    assert not labels(task, short, 0).columns[SUCCESS].any()
+    lasted = labels(task, long, 0)
+    assert lasted.columns[SUCCESS].tolist() == [False] * 9 + [True]
+    assert lasted.metadata["success"] and lasted.columns[TRUNCATED].tolist() == [False] * 9 + [True]
+    fell = labels(task, Episode(0, long.columns | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0)
+    assert not fell.columns[SUCCESS].any() and fell.metadata["failed"]
+
+
+def test_outcomes_are_those_of_the_steps_that_are_kept() -> None:
+    recorded = {"success": False, "failed": True, "return": -3.0, "driver": "Ada"}
+    labelled = labels(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
+    reward = float(labelled.columns[REWARD].sum(dtype=np.float64))
+    outcome = {"success": True, "failed": False, "return": reward}
+    assert len(labelled) < 10 and dict(labelled.metadata) == {"driver": "Ada"} | outcome
 
 
 def test_the_seed_decides_the_goals(tmp_path: Path) -> None:

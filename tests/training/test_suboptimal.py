@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from small_cart import TASK as CART
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
@@ -17,6 +18,7 @@ from astra_data.learning.sac import SacConfig
 from astra_data.training import suboptimal
 from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac
 from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
 
 MAZE, WALKER = TASKS["antmaze-umaze"], TASKS["humanoid-kinematics"]
 
@@ -28,7 +30,7 @@ class Counting:
 
     def __init__(self, env: Any, policy: Any, config: Any, *, horizon: int, seed: int) -> None:  # noqa: ANN401
         self.env, self.policy, self.config, self.horizon, self.seed = env, policy, config, horizon, seed
-        self.steps, self.went_on_from = 0, 0
+        self.steps, self.went_on_from, self.goes_on = 0, 0, True
         self.made.append(self)
 
     def iterate(self) -> dict[str, float]:
@@ -38,8 +40,9 @@ class Counting:
     def state_dict(self) -> dict[str, Tensor]:
         return {"steps": torch.tensor(self.steps)}
 
-    def load_state_dict(self, state: dict[str, Tensor], observation: Tensor) -> None:
+    def load_state_dict(self, state: dict[str, Tensor], observation: Tensor, *, goes_on: bool) -> None:
         self.steps = self.went_on_from = int(state["steps"])
+        self.goes_on = goes_on
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +80,10 @@ def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
     assert metadata["spent"].keys() == {"wall_seconds", "cpu_seconds"}
 
 
-def test_it_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("task", "episodes_go_on"), [(MAZE, True), (CART, False)])
+def test_it_goes_on_from_its_checkpoint(
+    task: Task, episodes_go_on: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
 
     class Stopped(Exception):  # noqa: N818 - stands for a kill
@@ -89,12 +95,13 @@ def test_it_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.Monk
 
     given: dict[str, Any] = {"steps": 250, "seed": 7, "folder": tmp_path, "num_threads": 1}
     with pytest.raises(Stopped):
-        suboptimal_by_ppo(MAZE, **given, progress=stop)
-    _, metadata = suboptimal_by_ppo(MAZE, **given, progress=silent)
+        suboptimal_by_ppo(task, **given, progress=stop)
+    _, metadata = suboptimal_by_ppo(task, **given, progress=silent)
     assert [one.went_on_from for one in Counting.made] == [0, 100]
+    assert Counting.made[-1].goes_on == episodes_go_on
     assert metadata["trained_steps"] == 300
     # What is finished is not trained again.
-    suboptimal_by_ppo(MAZE, **given, progress=silent)
+    suboptimal_by_ppo(task, **given, progress=silent)
     assert Counting.made[-1].steps == Counting.made[-1].went_on_from == 300
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from astra_data.worlds.ant.body import ant_model
-from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats
-from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats, wall_geoms
+from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE
 
 gymnasium.register_envs(gymnasium_robotics)
 
@@ -106,3 +106,10 @@ def test_what_is_measured_is_of_the_copys_own_last_step() -> None:
     assert physics.measured[0, 2] != 1.0
     unmeasured = BatchedPhysics(model, 1, substeps=1, num_threads=1)
     assert unmeasured.measured.shape == (1, 0)
+
+
+def test_an_open_plane_has_no_walls() -> None:
+    assert wall_geoms(ant_model()) is None
+    walls = wall_geoms(ant_model(LONG_MAZE))
+    assert walls is not None
+    assert walls[1] - walls[0] + 1 == len(LONG_MAZE.wall_cells())

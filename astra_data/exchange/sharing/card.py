@@ -21,7 +21,7 @@ from astra_data.reports.formatting import table
 
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 
-SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B")
+SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
 """Upper bounds of the Hub's size categories in steps, from 1000 in factors of ten."""
 
 WIDE = 4

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.errors import BadInputError
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
 
 Floats = NDArray[np.float64]
@@ -95,16 +96,6 @@ def _scale_legs(torso: ElementTree.Element, factor: float) -> None:
             body.set("pos", scaled(body.get("pos", "0 0 0")))
 
 
-def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
-    """Return the first and last geom id of the maze walls (ids are contiguous), or None on an open plane."""
-    walls = [
-        geom
-        for geom in range(model.ngeom)
-        if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom).startswith("block_")
-    ]
-    return (walls[0], walls[-1]) if walls else None
-
-
 def standing_pose(count: int) -> Floats:
     """Return `count` upright poses (count, 15) at the origin, legs within their joint limits."""
     qpos = np.zeros((count, POSITIONS))
@@ -118,17 +109,6 @@ def up_cosine(quaternion: Floats) -> Floats:
     """Return the cosine (B,) between the torso's up axis and the vertical, from `quaternion` (B, 4) wxyz."""
     _, x, y, _ = quaternion.T
     return np.asarray(1.0 - 2.0 * (x * x + y * y))
-
-
-def rotation_matrix(quaternion: Floats) -> Floats:
-    """Return body-to-world rotations (B, 3, 3) of unit quaternions (B, 4) wxyz."""
-    w, x, y, z = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:

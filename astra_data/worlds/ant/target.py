@@ -14,10 +14,9 @@ from astra_data.worlds.ant.body import (
     ant_model,
     standing_pose,
     up_cosine,
-    wall_geoms,
 )
 from astra_data.worlds.batched import Step
-from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats
+from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats, wall_geoms
 from astra_data.worlds.objective import PlanarObjective
 
 

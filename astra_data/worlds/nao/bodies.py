@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.worlds.ant.body import wall_geoms
+from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.nao.body import STIFFNESS_NM_PER_RAD, SUBSTEPS
 from astra_data.worlds.nao.kinematics import TO_MOTORS
 from astra_data.worlds.nao.steps import Bools, Floats

@@ -17,7 +17,6 @@ TIBIA_M = 0.1029
 FOOT_HEIGHT_M = 0.04519
 SHOULDER_M: Triple = (0.0, 0.098, 0.100)
 NECK_M: Triple = (0.0, 0.0, 0.1265)
-TOTAL_MASS_KG = 5.36
 
 SOLE_POINTS_M = ((0.100, 0.048), (0.100, -0.038), (-0.048, 0.048), (-0.048, -0.038))
 """Contact points of the left sole, from the ankle: the corners of its outline; in front, where the toes are

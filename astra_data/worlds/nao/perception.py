@@ -50,10 +50,6 @@ class PerceptionErrors:
     """Weight of the previous estimate of the ball's velocity when the ball is seen again."""
 
 
-NO_ERRORS = PerceptionErrors(*(0.0,) * 3, 2.0, 0.0, (0.0, 0.0), *(0.0,) * 4, 0.5, 0.0, np.pi, 0.0)
-"""Exact estimates."""
-
-
 class Localisation:
     """Estimated poses of B robots.
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.ant.body import rotation_matrix
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.worlds.nao.body import TICK_S, nao_model
 from astra_data.worlds.nao.kinematics import TO_MOTORS, leg_angles

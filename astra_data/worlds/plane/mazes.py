@@ -11,6 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from astra_data.core.errors import BadInputError
+
 Floats = NDArray[np.float64]
 
 
@@ -31,6 +33,30 @@ class Maze:
     start: tuple[int, int]
     goal: tuple[int, int]
     fine_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check the maze.
+
+        Raises:
+            BadInputError: rows differ in length or have other characters, the start or the goal is no free
+                cell, or the fine grid does not divide the cells; lists every fault.
+        """
+        faults = []
+        if not self.rows or not self.rows[0] or len({len(row) for row in self.rows}) != 1:
+            faults.append("rows: expected strings of one length")
+        elif set("".join(self.rows)) - {"0", "1"}:
+            faults.append("rows: expected 1 for a wall and 0 for free space")
+        else:
+            faults += [
+                f"{name}: expected (row, column) of a free cell, got {cell}"
+                for name, cell in (("start", self.start), ("goal", self.goal))
+                if cell not in self.free_cells()
+            ]
+        per_cell = self.scale / self.fine_m if self.fine_m > 0 else 0.0
+        if self.scale <= 0 or round(per_cell) < 1 or abs(per_cell - round(per_cell)) > 1e-6:
+            faults.append(f"fine_m: expected a part of the scale, {self.scale} m, got {self.fine_m} m")
+        if faults:
+            raise BadInputError(f"maze: {'; '.join(faults)}")
 
     @cached_property
     def walls(self) -> NDArray[np.bool_]:
@@ -84,11 +110,19 @@ class Maze:
     def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
-        Cells within `radius` m of a wall are not free; the goal's cell must be. Paths keep `margin` m from
-        walls where they can: within it, cells cost more the closer they are to a wall. Cells that are not
-        free take the value of the nearest free one plus the distance to it.
+        Cells within `radius` m of a wall are not free. Paths keep `margin` m from walls where they can:
+        within it, cells cost more the closer they are to a wall. Cells that are not free take the value of
+        the nearest free one plus the distance to it.
+
+        Raises:
+            BadInputError: the goal's cell is not free.
         """
         free = self.clearance_field > radius
+        goal_cell = self.fine_index(goal)
+        if not free[goal_cell]:
+            raise BadInputError(
+                f"expected a goal farther than {radius:g} m from walls, got ({goal[0]:.2f}, {goal[1]:.2f})"
+            )
         numbers = np.full(free.shape, -1, dtype=np.int32)  # as the search takes them, in every version
         numbers[free] = np.arange(free.sum())
         cost = np.ones(free.shape)
@@ -105,7 +139,7 @@ class Maze:
         count = int(free.sum())
         entries = (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets)))
         graph = scipy.sparse.coo_array(entries, shape=(count, count)).tocsr()
-        source = int(numbers[self.fine_index(goal)])
+        source = int(numbers[goal_cell])
         lengths = (
             np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=source)) * self.fine_m
         )

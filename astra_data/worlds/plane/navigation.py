@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.plane.free_space import GoalDistance
 
@@ -44,6 +45,19 @@ class Navigation(PlanarObjective):
     spread_m: float = 0.2
     start_clearance_m: float = 0.8
     start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+
+    def __post_init__(self) -> None:
+        """Check that starts and goals are in free space.
+
+        Raises:
+            BadInputError: they are spread into the walls around their cells.
+        """
+        farthest = 3 * self.spread_m + self.path_clearance_m
+        if farthest >= self.maze.scale / 2:
+            raise BadInputError(
+                f"expected goals within their cell of {self.maze.scale:g} m, got 3 spread_m + "
+                f"path_clearance_m = {farthest:g} m around its centre: take a smaller spread_m"
+            )
 
     @cached_property
     def goal_distance(self) -> GoalDistance:

@@ -29,25 +29,26 @@ def test_lerobot_reads_the_same_windows(tmp_path: Path) -> None:
     import datasets.config  # noqa: PLC0415 - slow
 
     usual = datasets.config.HF_DATASETS_CACHE
-    with writer(tmp_path / "set", columns=[*COLUMNS, Column("observation.fine", "float64")]) as out:
+    with writer(tmp_path / "set", columns=[*COLUMNS, Column("observation.count", "int64")]) as out:
         for one in fake_episodes():
-            fine = np.random.default_rng(one.uid).normal(size=len(one.columns["mode"]))
-            out.add(Episode(one.uid, one.columns | {"observation.fine": fine}, one.metadata))
+            counted = one.columns | {"observation.count": one.columns["mode"]}
+            out.add(Episode(one.uid, counted, one.metadata))
     assert compared(tmp_path / "set") == []
     assert usual == datasets.config.HF_DATASETS_CACHE
 
 
-def test_other_boundaries_of_episodes_are_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("column", "episode", "value", "row"), [("dataset_from_index", 0, 1, 0), ("dataset_to_index", 4, 54, 54)]
+)
+def test_other_boundaries_of_episodes_are_found(
+    column: str, episode: int, value: int, row: int, tmp_path: Path
+) -> None:
     root = write_fake(tmp_path / "set").root
-    # lerobot takes boundaries from meta/episodes: the fourth episode now begins two steps early.
-    alter(EPISODES, "dataset_to_index", 2, 18)(root)
-    alter(EPISODES, "dataset_from_index", 3, 18)(root)
-    # The first begins and the last ends a step off.
-    alter(EPISODES, "dataset_from_index", 0, 1)(root)
-    alter(EPISODES, "dataset_to_index", 4, 54)(root)
+    # lerobot takes boundaries from meta/episodes: the first begins, or the last ends, a step off.
+    alter(EPISODES, column, episode, value)(root)
     faults = compared(root)
     for name in ("observation.state", "action"):
-        for row, other in ((0, "values"), (54, "values"), (18, "padding")):
+        for other in ("values", "padding"):
             assert f"lerobot's window of {name} around row {row} has other {other}" in faults
 
 

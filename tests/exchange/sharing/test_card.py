@@ -1,4 +1,5 @@
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ from huggingface_hub import DatasetCard
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import DiskError, RecipeError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import ACTION, STATE, Column, Episode
-from astra_data.exchange.sharing.card import render_card, write_card
+from astra_data.dataset.columns import ACTION, STATE, SUCCESS, Column, Episode
+from astra_data.exchange.sharing.card import _size_category, render_card, write_card
 from astra_data.exchange.sharing.notes import Notes
 
 NOTES = Notes(
@@ -42,10 +43,12 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
             "2 of 5 episodes (40.0%)",
             "1 to 30 steps; quartiles 5, 7, 12",
             "| steps | 55 |",
+            "| duration | 0.0 min |",
             "Deng",
             "x, y, yaw",
         ),
         f"| `{STATE}` | float32 | (3,) | m (2), rad | pose: x, y, yaw |",
+        f"| `{ACTION}` | float32 | (2,) |  | x, y |",
     ]
     assert [words for words in told if words not in text] == []
     assert [name for name in dataset.features if f"`{name}`" not in text] == []
@@ -54,11 +57,36 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
 
 def test_the_card_says_that_a_robot_is_a_stand_in(fake: Dataset, tmp_path: Path) -> None:
     assert "stand-in" not in render_card(fake, NOTES)
-    description = {**DESCRIPTION, "environment": {"id": "nao", "stand_in": "surrogate"}}
-    dataset = write_fake(tmp_path / "fake", description=description)
-    assert "The robot is a simulated stand-in (`surrogate`) for a physical one." in render_card(
-        dataset, NOTES
-    )
+    description = {**DESCRIPTION, "environment": {"id": "naö", "stand_in": "surrogate"}}
+    text = render_card(write_fake(tmp_path / "fake", description=description), NOTES)
+    assert "The robot is a simulated stand-in (`surrogate`) for a physical one." in text
+    assert '"naö"' in text and "| from | nothing earlier |" in text
+
+
+def test_long_names_stand_below_the_table_and_facts_are_of_the_episodes_that_have_them(
+    tmp_path: Path,
+) -> None:
+    joints = tuple("abcde")
+    columns = [Column("near", size=5, names=joints), Column("far", size=5, names=joints)]
+    columns += [Column("few", size=4, names=joints[:4]), Column(SUCCESS, "bool")]
+    with writer(tmp_path / "wide", columns=columns) as out:
+        for uid, facts in enumerate(({"return": 1.0}, {"return": 3.0}, {})):
+            values = {column.name: np.zeros((500, column.size), np.float32) for column in columns[:3]}
+            out.add(Episode(uid, values | {SUCCESS: np.full(500, uid == 1)}, facts))
+    text = render_card(Dataset.open(tmp_path / "wide"), Notes())
+    assert "In `near` and `far`, in order: a, b, c, d, e." in text and text.count("in order") == 1
+    assert "| `few` | float32 | (4,) |  | a, b, c, d |" in text
+    assert "| return | mean 2.00; 1.00 to 3.00 |\n| success | 1 of 3 episodes (33.3%) |" in text
+    assert "- 1K<n<10K\n" in text
+
+
+def test_sizes_are_the_hubs() -> None:
+    """As size_categories.json of the package datasets lists them."""
+    units = ["1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T"]
+    listed = ["n<1K", *(f"{least}<n<{most}" for least, most in pairwise(units)), "n>1T"]
+    bounds = [10**power for power in range(3, 13)]
+    assert [_size_category(steps) for steps in (1, *bounds)] == listed
+    assert [_size_category(steps - 1) for steps in bounds] == listed[:-1]
 
 
 def test_without_notes_their_sections_are_left_out(fake: Dataset) -> None:

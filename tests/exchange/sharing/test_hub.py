@@ -36,7 +36,10 @@ def versioned(root: Path, version: str, **changes: object) -> Dataset:
 
 
 def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) -> None:
-    assert push(fake.root, "me/it") == "hf://datasets/me/it@data-1.0.0"
+    told: list[tuple[float, str]] = []
+    pushed = push(fake.root, "me/it", progress=lambda share, note: told.append((share, note)))
+    assert pushed == "hf://datasets/me/it@data-1.0.0"
+    assert (sorted(told), told[-1]) == (told, (1.0, "data-1.0.0"))
     repo = hub.repos["me/it"]
     assert not repo.private
     assert repo.history == ["initial commit", "Add fake@data-1.0.0"]
@@ -76,6 +79,8 @@ def test_every_version_keeps_its_tag_and_main_shows_the_newest(
     assert set(files) - set(contents(newer.root)) == {
         *(".gitattributes", "LICENSE", "README.md", "README-coverage.png", "SHA256SUMS")
     }
+    push(fake.root, "me/it")  # it is there, though not the newest
+    repo.tags = dict(sorted(repo.tags.items(), reverse=True))
     assert contents(pull("me/it", out=tmp_path / "a").root) == contents(newer.root)
     assert contents(pull("me/it@data-1.0.0", out=tmp_path / "b").root) == contents(fake.root)
     with pytest.raises(BadInputError, match=r"no version data-3\.0\.0; it has data-1\.0\.0, data-1\.10\.0"):
@@ -107,9 +112,16 @@ def test_an_altered_file_there_is_told_without_a_download(hub: Hub, fake: Datase
 
 
 def test_a_push_that_stopped_is_finished_by_the_next(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
-    hub.refuse = lambda method, path: 500 if "/tag/" in path else None
-    with pytest.raises(SharingError, match="it answered 500"):
+    tagged: list[str] = []
+
+    def no_second_tag(method: str, path: str) -> int | None:
+        tagged.extend([path] if "/tag/" in path else [])
+        return 500 if "/tag/" in path and len(tagged) == 2 else None
+
+    hub.refuse = no_second_tag
+    with pytest.raises(SharingError, match=r"it answered 500: refused$"):
         push(fake.root, "me/it")
+    assert set(hub.repos["me/it"].tags) == {"v3.0"}
     with pytest.raises(SharingError, match="has no dataset of astra-data"):
         pull("me/it", out=tmp_path / "out")
     hub.refuse = lambda method, path: None
@@ -127,6 +139,21 @@ def test_a_commit_never_goes_on_top_of_one_that_came_between(hub: Hub, fake: Dat
         push(fake.root, "me/it")
     repo = hub.repos["me/it"]
     assert (repo.history[-1], repo.tags) == ("of somebody else", {})
+    hub.refuse = lambda method, path: 409 if path.endswith("/commit/main") else None
+    with pytest.raises(SharingError, match="changed by somebody else at the same time"):
+        push(fake.root, "me/it")
+
+
+def test_tags_name_what_was_pushed_though_somebody_else_goes_on(hub: Hub, fake: Dataset) -> None:
+    def another(method: str, path: str) -> None:
+        if "/tag/" in path:
+            hub.repos["me/it"].commit({}, "of somebody else")
+
+    hub.refuse = another
+    push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    pushed = list(repo.commits)[repo.history.index("Add fake@data-1.0.0")]
+    assert repo.tags == {"v3.0": pushed, "data-1.0.0": pushed} and pushed != repo.head
 
 
 def test_a_public_repository_does_not_get_what_is_to_be_private(hub: Hub, fake: Dataset) -> None:
@@ -138,6 +165,9 @@ def test_a_public_repository_does_not_get_what_is_to_be_private(hub: Hub, fake: 
     hub.repos["me/it"].private = True
     push(fake.root, "me/it", private=True)
     assert "data-1.0.0" in hub.repos["me/it"].tags
+    hub.visibility = "private"  # which nobody asked to change
+    push(fake.root, "me/other")
+    assert hub.repos["me/other"].private
 
 
 def test_a_private_repository_is_hidden_from_others(
@@ -190,6 +220,10 @@ def test_a_card_that_the_hub_refuses_is_told(hub: Hub, fake: Dataset, tmp_path: 
     (tmp_path / "notes.toml").write_text('license = "none-such"\n')
     with pytest.raises(BadInputError, match=r'rejects this: (.|\n)*"license" must be one of a list'):
         push(fake.root, "me/it", notes=tmp_path / "notes.toml")
+    hub.refuse = lambda method, path: 503 if "validate" in path else None
+    with pytest.raises(SharingError, match="it answered 503"):
+        push(fake.root, "me/it")
+    hub.refuse = lambda method, path: None
     assert not hub.repos
     push(fake.root, "me/it")
     assert set(hub.repos["me/it"].tags) == {"v3.0", "data-1.0.0"}

@@ -87,6 +87,10 @@ def test_an_altered_remote_is_told(fake: Dataset, tmp_path: Path) -> None:
     (shared / "SHA256SUMS").write_text(f"{sums}{'0' * 64}  meta/astra/policy.safetensors\n")
     with pytest.raises(BadInputError, match=r"lists other files as meta/astra/policy\.safetensors: it was"):
         push(fake.root, f"file://{tmp_path}/shared")
+    lines = sums.splitlines(keepends=True)
+    (shared / "SHA256SUMS").write_text("".join(line for line in lines if "meta/stats" not in line))
+    with pytest.raises(BadInputError, match=r"lists other files as meta/stats\.json: it was"):
+        push(fake.root, f"file://{tmp_path}/shared")
     # As 0.1 wrote them, without sizes.
     (shared / "SHA256SUMS").write_text("".join(f"{line}\n" for line in sums.splitlines() if line[0] != "#"))
     push(fake.root, f"file://{tmp_path}/shared")

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.ant.body import ant_model, standing_pose, wall_geoms
+from astra_data.worlds.ant.body import ant_model, standing_pose
 from astra_data.worlds.ant.target import AntMazeEnv
+from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 

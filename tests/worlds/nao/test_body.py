@@ -2,7 +2,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from astra_data.worlds.ant.body import ant_model, wall_geoms
+from astra_data.worlds.ant.body import ant_model
+from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.nao.body import BALL_MASS_KG, SUBSTEPS, TICK_S, nao_model
 from astra_data.worlds.nao.links import LEG_JOINTS
 from astra_data.worlds.plane.ball import BALL_RADIUS_M

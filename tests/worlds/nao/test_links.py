@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from nao_values import TOTAL_MASS_KG
 
 from astra_data.worlds.nao.links import (
     ARM,
@@ -10,7 +11,6 @@ from astra_data.worlds.nao.links import (
     LEG,
     SOLE_POINTS_M,
     TORSO,
-    TOTAL_MASS_KG,
     Link,
     box_inertia,
 )

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from nao_values import NO_ERRORS
 from numpy.typing import NDArray
 
-from astra_data.worlds.nao.perception import NO_ERRORS, BallSight, Localisation, PerceptionErrors
+from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
 
 STEP_S = 0.192
 ROBOTS = 4000

@@ -4,9 +4,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nao_values import NO_ERRORS
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.nao.perception import NO_ERRORS
 from astra_data.worlds.nao.target import Floats, NaoEnv
 from astra_data.worlds.registry import TASKS
 

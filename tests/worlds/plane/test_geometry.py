@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, Array, Column
-from astra_data.worlds.ant.body import ant_model, rotation_matrix
+from astra_data.worlds.ant.body import ant_model
 from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.batched_mujoco import BatchedPhysics
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.geometry import PlanarMap, wrapped
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.navigation import Navigation

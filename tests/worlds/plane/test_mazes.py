@@ -1,6 +1,10 @@
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 
 CORRIDOR = Maze(rows=("1111111", "1000001", "1111111"), scale=4.0, start=(1, 1), goal=(1, 5))
@@ -84,3 +88,27 @@ def test_a_margin_keeps_paths_away_from_corners() -> None:
     # Past the corners at 1 m, a path is longer, and nowhere shorter than the free one.
     assert wide[start] > 1.02 * U_MAZE.distance_field(goal)[start]
     assert wide[start] < 2 * np.hypot(6.0, 3.0) + 6.0 + 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"rows": ("111", "1001", "111")}, "rows: expected strings of one length"),
+        ({"rows": ()}, "rows: expected strings of one length"),
+        ({"rows": ("111", "1x1", "111")}, "rows: expected 1 for a wall and 0 for free space"),
+        ({"start": (0, 1)}, r"start: expected \(row, column\) of a free cell, got \(0, 1\)"),
+        ({"goal": (1, 9)}, r"goal: expected \(row, column\) of a free cell, got \(1, 9\)"),
+        ({"fine_m": 0.3}, "fine_m: expected a part of the scale, 4.0 m, got 0.3 m"),
+        ({"fine_m": 8.0}, "fine_m: expected a part of the scale"),
+        ({"fine_m": 0.0}, "fine_m: expected a part of the scale"),
+    ],
+)
+def test_a_maze_that_cannot_be_is_refused(changes: dict[str, Any], fault: str) -> None:
+    with pytest.raises(BadInputError, match=f"maze: {fault}"):
+        replace(CORRIDOR, **changes)
+
+
+def test_there_is_no_distance_to_a_goal_in_a_wall() -> None:
+    with pytest.raises(BadInputError, match=r"farther than 0.5 m from walls, got \(8.00, 1.60\)"):
+        CORRIDOR.distance_field(np.array([8.0, 1.6]), radius=0.5)
+    assert np.isfinite(CORRIDOR.distance_field(np.array([8.0, 1.6]), radius=0.3)).all()

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.worlds.plane.navigation import Navigation, RewardKind
 
@@ -93,6 +96,20 @@ def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
         assert points.mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.02)
         assert points.std(axis=0) == pytest.approx([0.2, 0.2], abs=0.01)
         assert np.abs(points).max() <= 0.6 + 1e-9
+
+
+def test_goals_have_to_be_within_their_cell() -> None:
+    narrow = replace(U_MAZE, scale=1.0)
+    with pytest.raises(BadInputError, match=r"3 spread_m \+ path_clearance_m = 0.6 m around its centre"):
+        Navigation(narrow, horizon=1)
+    with pytest.raises(BadInputError, match=r"goals within their cell of 1 m, got .* = 0.5 m"):
+        Navigation(narrow, horizon=1, spread_m=0.1, path_clearance_m=0.2)
+    distance = Navigation(narrow, horizon=1, spread_m=0.11, path_clearance_m=0.1).goal_distance
+    rows, columns = narrow.fine_index(distance.lattice.double().numpy())
+    # Each field is least at its own goal.
+    assert [divmod(int(field.argmin()), 50) for field in distance.fields] == [
+        *zip(rows, columns, strict=True)
+    ]
 
 
 def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -> None:

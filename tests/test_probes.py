@@ -3,19 +3,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from probes import Probed, dropped_values, picking_split, probe, recent_actions, way_to_goal
 from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.dataset.columns import Column
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.probes import (
-    Probed,
-    dropped_values,
-    picking_split,
-    probe,
-    recent_actions,
-    way_to_goal,
-)
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import TASKS
 

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from fake_runs import bare_results
 from scipy.stats import binom, hypergeom
-
-from astra_data.core.errors import BadInputError
-from astra_data.experiments.trial_regret import (
+from trial_regret import (
     Pool,
     _Deck,
     at_random,
@@ -19,6 +17,8 @@ from astra_data.experiments.trial_regret import (
     mean_regret,
     pools_of,
 )
+
+from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Choice, Ranked, Results
 
 
@@ -126,7 +126,7 @@ def chosen_from(results: Results, candidates: list[Ranked]) -> Results:
     return results.model_copy(update={"choice": choice, "episodes": 100})
 
 
-TOOL = Path(__file__).parents[2] / "tools/check_trials.py"
+TOOL = Path(__file__).parents[1] / "tools/check_trials.py"
 
 
 def test_the_tool_prints_a_table(tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
 from dataclasses import replace
 
 import torch
+from altered_latents import ALTERATIONS, AlteredLatents, in_target, of_another
 
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.altered_latents import ALTERATIONS, AlteredLatents, in_target, of_another
 from astra_data.training.deployment import DeployedPolicy
 from astra_data.worlds.registry import TASKS
 
