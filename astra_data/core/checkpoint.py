@@ -137,6 +137,16 @@ def understood(
         ) from error
 
 
+def refuse_finished(out: Path) -> None:
+    """Refuse to make `out` once more.
+
+    Raises:
+        BadInputError: it exists.
+    """
+    if out.exists():
+        raise BadInputError(f"{out} is finished already: remove it to run the stage again")
+
+
 @contextmanager
 def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds.
@@ -160,8 +170,8 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         sweep(out)
         if old.exists() and not out.exists():  # a kill came between the two renames below
             move(old, out)
-        if out.exists() and not replace:
-            raise BadInputError(f"{out} is finished already: remove it to run the stage again")
+        if not replace:
+            refuse_finished(out)
         for folder in (partial, old):
             if replace and folder.exists():
                 discard(folder, out)

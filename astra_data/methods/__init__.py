@@ -52,8 +52,6 @@ ENTRY_POINTS = "astra_data.methods"
 _NAME = re.compile("[a-z][a-z0-9_]*")
 _PLACES: dict[str, str] = {}
 """Where the methods come from that are none of the package's, by name; in this process each name is one."""
-_OWN_KINDS: set[str] = set()
-"""The kinds of their groundings."""
 
 
 def add_method(name: str, place: str) -> None:
@@ -80,12 +78,12 @@ def add_method(name: str, place: str) -> None:
     if method.table is not None and method.table.ranges:
         raise BadInputError(f"{place} has a table of ranges, which only methods of the package have")
     if kind := method.grounding:
-        if kind.kind in KINDS and kind.kind not in _OWN_KINDS:
+        known = KINDS.setdefault(kind.kind, kind)
+        if known is not kind:
             raise BadInputError(
-                f"{place}: groundings of kind '{kind.kind}' are the package's: rename its kind"
+                f"{place}: groundings of kind '{kind.kind}' are those of {known.__name__} in "
+                f"{known.__module__}: rename its kind"
             )
-        _OWN_KINDS.add(kind.kind)
-        KINDS[kind.kind] = kind
     if isinstance(method.learn, OwnLearner):
         add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)

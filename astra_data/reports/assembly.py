@@ -24,7 +24,7 @@ from astra_data.reports.artefacts import (
 )
 from astra_data.reports.choice import Judged, choice_of, read_judged
 from astra_data.reports.comparing import SHARED_WORLDS
-from astra_data.reports.costs import Files, seconds, seed_cost, throughput
+from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, throughput
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
@@ -106,7 +106,7 @@ def _read(
     gaps = read.optional("ground", "gap.json", Gap)
     curves = read.optional("train", CURVE, CurveFile)
     alignments = read.optional("align", "metrics.json", Metrics)
-    datasets = {stage: read.datasets(stage) for stage in ("collect", "label", "pair", "subset")}
+    datasets = {stage: read.datasets(stage) for stage in DATASET_STAGES}
     gap_means = {owner: mean_gap(of_seeds) for owner, of_seeds in gaps.items()}
     rows, uses = {}, {}
     for method, of_seeds in evaluations.items():
@@ -138,8 +138,7 @@ def _read(
         uses[method] = [line.dataset for line in lines]
         rows[method] = row_of(lines, gap_means)
     files: Files = {
-        "collect": {"all": list(datasets["collect"].values())},
-        "pair": {"all": list(datasets["pair"].values())},
+        **{stage: {"all": list(of_seeds.values())} for stage, of_seeds in datasets.items() if of_seeds},
         "ground": _listed(metrics),
         "train": _listed(curves),
         "align": _listed(alignments),

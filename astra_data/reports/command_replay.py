@@ -49,11 +49,12 @@ def replay_commands(task: Task) -> CommandReplay:
     robots.reset_to(np.arange(_ROBOTS), states)
     simulator = task.simulator(1)
     simulator.reset_to(task.abstraction(robots.state[:1]))
-    simulated, target = [], []
+    simulated, target, fallen = [], [], torch.zeros(_ROBOTS, dtype=torch.bool)
     for velocity in torch.from_numpy(command).float():
         simulated.append(simulator.step(velocity.expand(1, 2))[0])
         robots.step(velocity.expand(_ROBOTS, 2))
-        target.append(task.abstraction(robots.state))
+        target.append(torch.where(fallen[:, None], torch.nan, task.abstraction(robots.state)))
+        fallen |= robots.failed
     return CommandReplay(
         time_s=np.arange(1, len(command) + 1, dtype=np.float64) * task.timestep_s,
         command=command,

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from astra_data.methods import method_title
+from astra_data.reports.costs import DATASET_STAGES
 from astra_data.reports.formatting import duration, short
 from astra_data.reports.schema import Origin, Results
 
@@ -15,7 +16,7 @@ COSTED = ("ground", "train", "align", "evaluate")
 def stage_costs(results: Results) -> list[list[str]]:
     """Return lines of wall time, CPU time and speed by stage, and of the whole recipe."""
     lines = []
-    for stage in ("collect", "pair", *COSTED[:-1], "select", COSTED[-1]):
+    for stage in (*DATASET_STAGES, *COSTED[:-1], "select", COSTED[-1]):
         speeds = results.throughput.get(stage, {})
         shown = [f"{_rates(rows)} {_unit(figure)}" for figure, rows in speeds.items() if rows]
         wall, cpu = (spent.get(stage) for spent in (results.wall_seconds, results.cpu_seconds))

@@ -7,7 +7,11 @@ from astra_data.methods import METHODS
 from astra_data.reports.artefacts import Artefact
 from astra_data.reports.schema import Cost
 
+DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")
+"""Stages that write a dataset of each seed, in their order."""
+
 THROUGHPUT = {
+    **dict.fromkeys(DATASET_STAGES, ()),
     "collect": ("target_steps_per_second",),
     "pair": ("pairs_per_second",),
     "ground": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.fit_rates)),

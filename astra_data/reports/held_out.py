@@ -177,7 +177,7 @@ def _lines(
     has_sizes: bool,
 ) -> list[list[str]]:
     lines = []
-    for size in next(iter(found.values())):
+    for size in sorted({size for sizes in found.values() for size in sizes}, key=lambda size: size or 0):
         sized = {method_title(method): sizes[size] for method, sizes in found.items() if size in sizes}
         first = next(iter(sized.values()))
         bands = {"No grounding": (first.raw[quantity], first)}

@@ -25,6 +25,7 @@ from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator
+from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import (
     ABSTRACT_STATE,
     GOAL,
@@ -159,7 +160,7 @@ def augment(
         seeds=source.description["seeds"] | {"augment": seed},
     )
     taken = set(source.uids.tolist())
-    placed, lost, moving = 0, 0, _moving(source)
+    stopwatch, placed, lost, moving = Stopwatch(), 0, 0, _moving(source)
     with DatasetWriter.like(source, out, description) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
@@ -182,7 +183,12 @@ def augment(
                 f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
             )
         skipped = int((~held_out & (copies == 0)).sum())
-        writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
+        writer.made = {
+            "copies": placed,
+            "copies_without_place": lost,
+            "episodes_not_copied": skipped,
+            **stopwatch.spent(),
+        }
     return out
 
 

@@ -265,12 +265,6 @@ def _behavior(
     grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
     encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
     deployed = deploy(task, trained, grounding, encoder)
-    if deployed.observation_size != trained.policy.shape.observation_size:
-        raise BadInputError(
-            f"{files['policy']} takes {trained.policy.shape.observation_size} values, the task gives "
-            f"{deployed.observation_size}: expected a policy of {task.name} and, if it was trained in a "
-            "grounded simulator, its grounding"
-        )
     return PolicyBehavior(deployed), {"policy_dataset": trained.dataset}
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.core.checkpoint import finished_folder, save_tensors
+from astra_data.core.checkpoint import finished_folder, refuse_finished, save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
@@ -86,7 +86,7 @@ def evaluate(
         num_threads: of the physics, by default one per core; the outcome is the same with any number.
 
     Raises:
-        BadInputError: an input is missing or malformed.
+        BadInputError: an input is missing or malformed, or `out` exists.
 
     Example:
         >>> import json
@@ -97,6 +97,7 @@ def evaluate(
         >>> json.loads(Path("evaluation/evaluation.json").read_text())["target"]["success"]
         [1.0, 1.0]
     """
+    refuse_finished(out)
     world, base = task_named(task), method_named(method)
     if base.trains and policy is None:
         raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")

@@ -11,6 +11,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
+from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import (
     DONE,
     GOAL,
@@ -86,7 +87,7 @@ def label(
         name=name,
         out=out,
     )
-    steps = successes = failures = 0
+    stopwatch, steps, successes, failures = Stopwatch(), 0, 0, 0
     with DatasetWriter.like(source, out, description, more=more) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
             labelled = labels(world, episode, seed)
@@ -95,7 +96,7 @@ def label(
             successes += bool(labelled.metadata["success"])
             failures += bool(labelled.metadata["failed"])
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
-        writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
+        writer.made = {"dropped_steps": int(source.lengths.sum()) - steps, **stopwatch.spent()}
     return out
 
 

@@ -98,9 +98,9 @@ def measure_gap(
     torch.set_num_threads(1)
     with shown(f"{name}/{folder.name}") as progress:
         found = run_study(recipe, tested, learned, folder, progress)
-    command = f"uv run astra-data gap {recipe_path} --data {data.name}" + (
-        f" --train {train.name}" if train else ""
-    )
+    command = f"uv run astra-data gap {recipe_path} --data {data.name}"
+    command += f" --train {train.name}" if train else ""
+    command += "".join(f" --seed {seed}" for seed in seeds)
     image = png(figure(found))
     for place, stem in [(folder, "results")] + ([(recipe_path.parent / "results", name)] if publish else []):
         write_file(place / f"{stem}.json", json.dumps(found, indent=1) + "\n")

@@ -37,13 +37,13 @@ def add_policy_kind(made: type[SavedPolicy]) -> None:
     """Let files hold policies of another learner.
 
     Raises:
-        BadInputError: the package has policies of this kind itself.
+        BadInputError: the package, or another learner, has policies of this kind.
     """
-    if made.kind in _KINDS:
+    if made.kind in _KINDS or KINDS.setdefault(made.kind, made) is not made:
         raise BadInputError(
-            f"policies of kind '{made.kind}' are the package's: rename that of {made.__name__}"
+            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of "
+            f"{made.__name__}"
         )
-    KINDS[made.kind] = made
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,13 @@ def deploy(
     grounding: Grounding = NO_GROUNDING,
     target_encoder: TargetEncoder | None = None,
 ) -> DeployedPolicy:
-    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
+    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s.
+
+    Raises:
+        BadInputError: it is of another task, or of another grounding.
+    """
     world = trained.simulation.world if trained.simulation else EnvConfig()
-    return DeployedPolicy(
+    deployed = DeployedPolicy(
         task,
         trained.policy,
         grounding.encoder,
@@ -171,3 +175,9 @@ def deploy(
         command_limit_m_s=world.command_limit_m_s,
         observed=trained.observed,
     )
+    if deployed.observation_size != (taken := trained.policy.shape.observation_size):
+        raise BadInputError(
+            f"the policy takes {taken} values, {task.name} gives {deployed.observation_size}: expected a "
+            "policy of this task and, if it was trained in a grounded simulator, its grounding"
+        )
+    return deployed

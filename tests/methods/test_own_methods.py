@@ -223,9 +223,23 @@ def test_what_is_no_method_is_refused_in_one_line(tmp_path: Path, name: str, pla
 def test_a_kind_of_the_package_is_not_replaced(tmp_path: Path) -> None:
     text = (EXAMPLES / "delta_action.py").read_text().replace('kind = "delta action"', 'kind = "residual"')
     (tmp_path / "mine.py").write_text(text)
-    with pytest.raises(BadInputError, match="groundings of kind 'residual' are the package's"):
+    with pytest.raises(
+        BadInputError, match=r"kind 'residual' are those of Residual.* in astra_data.grounding"
+    ):
         add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
     assert "mine" not in METHODS
+
+
+def test_another_methods_kind_is_not_replaced(tmp_path: Path) -> None:
+    example = EXAMPLES / "delta_action.py"
+    (tmp_path / "mine.py").write_text(example.read_text())
+    add_method("first", f"{example}:METHOD")
+    add_method("again", f"{example}:METHOD")
+    with pytest.raises(
+        BadInputError, match=r"groundings of kind 'delta action' are those of .* rename its kind"
+    ):
+        add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
+    assert {"first", "again"} <= METHODS.keys() and "mine" not in METHODS
 
 
 def test_installed_packages_offer_methods(monkeypatch: pytest.MonkeyPatch) -> None:

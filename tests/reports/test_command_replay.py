@@ -1,9 +1,14 @@
+import itertools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from small_cart import TASK
+from torch import Tensor
 
 from astra_data.reports.command_replay import can_replay, replay_commands
+from astra_data.worlds.batched import Step
+from astra_data.worlds.nao.target import NaoEnv
 from astra_data.worlds.registry import TASKS
 
 
@@ -22,6 +27,25 @@ def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -
     assert way[-1] == pytest.approx([-0.2 * 0.192, 0.0], abs=1e-5)
     assert replay.simulated[0, :2] == pytest.approx(start, abs=0.2)
     assert replay.target[:, 0, :2].mean(axis=0) == pytest.approx(start, abs=0.05)
+
+
+def test_who_has_fallen_is_no_longer_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = TASKS["nao-navigation"]
+    falls = {7: 3, 20: 0}  # step: robot
+    step, steps = NaoEnv.step, itertools.count()
+
+    def falling(self: NaoEnv, action: Tensor, active: Tensor | None = None) -> Step:
+        outcome = step(self, action, active)
+        self.failed[:] = False
+        if (robot := falls.get(next(steps))) is not None:
+            self.failed[robot] = True
+        return outcome
+
+    monkeypatch.setattr(NaoEnv, "step", falling)
+    gone = np.isnan(replay_commands(task).target)
+    expected = np.zeros_like(gone)
+    expected[3, 8:] = expected[0, 21:] = True
+    assert (gone == expected).all()
 
 
 def test_only_targets_that_can_be_driven_from_the_start_cell_are() -> None:

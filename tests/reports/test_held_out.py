@@ -50,6 +50,21 @@ def test_enough_is_where_more_makes_no_difference(
     assert "averaged over seeds 0, 1." in page.read_text()
 
 
+def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
+    for percent in (25, 100):
+        write(tmp_path, percent, 0, 0.1)
+    (tmp_path / "ground/nas/percent_100").rename(tmp_path / "astra")
+    (tmp_path / "ground/astra").mkdir()
+    (tmp_path / "astra").rename(tmp_path / "ground/astra/percent_100")
+    page = write_held_out("r", tmp_path, ("nas", "astra"), (0,), (25, 100), timestep_s=0.05)
+    assert page is not None
+    rows = [line.split(" | ")[:2] for line in page.read_text().splitlines() if "%" in line and "|" in line]
+    assert rows == [
+        *(["| 25 %", "No grounding"], ["| 25 %", "NAS"]),
+        *(["| 100 %", "No grounding"], ["| 100 %", "ASTRA"]),
+    ]
+
+
 def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Path) -> None:
     assert write_held_out("r", tmp_path, ("nas",), (0,), (25,), timestep_s=0.1) is None
     write(tmp_path, 25, 0, 0.1)

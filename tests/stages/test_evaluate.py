@@ -237,3 +237,16 @@ def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> No
     with pytest.raises(BadInputError, match=r"policy.safetensors does not exist") as caught:
         make(task, "direct_transfer", tmp_path / "out", {"policy": tmp_path})
     assert "\n" not in str(caught.value)
+
+
+def test_what_does_not_fit_is_refused_before_any_episode(
+    task: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(
+        BadInputError, match=r"the policy takes 24 values, .* gives 8: expected a policy of this"
+    ):
+        make(task, "direct_transfer", tmp_path / "out", {"policy": trained})
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr("astra_data.stages.evaluate.task_named", lambda name: pytest.fail("work was begun"))
+    with pytest.raises(BadInputError, match=r"out is finished already: remove it"):
+        make(task, "follower", tmp_path / "out")

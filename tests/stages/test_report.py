@@ -23,6 +23,7 @@ from fake_runs import (
     write_choice,
     write_elsewhere,
     write_evaluation,
+    write_json,
     write_runs,
 )
 from html_pages import read_page
@@ -133,6 +134,22 @@ def test_a_row_that_was_in_no_simulator_is_reported(root: Path) -> None:
     assert "| IQL | 3 | **0.17 ± 0.14** |" in page
     assert "| IQL | - | 3 s | - | 10 s | 13 s | - |" in page
     assert not (root / "report/learning.png").exists()
+
+
+def test_every_dataset_is_named_and_timed(root: Path) -> None:
+    made = {"name": "antmaze-u-random", "version": "data-2.0.0", "content_hash": "hash"}
+    for made_by, seconds in (("label", 11.0), ("augment", 13.0)):
+        write_json(
+            root / made_by / place(1, None) / "meta/astra/dataset.json", made | {"wall_seconds": seconds}
+        )
+    make(root)
+    found = Results.model_validate_json((root / "report/results.json").read_text())
+    stages = [(dataset.stage, dataset.seed) for dataset in found.datasets if dataset.version == "data-2.0.0"]
+    assert stages == [("augment", 1), ("label", 1)]
+    assert (found.wall_seconds["label"], found.wall_seconds["augment"]) == (11.0, 13.0)
+    assert found.wall_seconds["total"] >= 24.0
+    page = (root / "report/results.md").read_text()
+    assert page.index("| collect |") < page.index("| label | 11 s |") < page.index("| augment | 13 s |")
 
 
 def test_publishing_copies_all_under_the_recipes_name(root: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from pydantic import ValidationError
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
@@ -13,6 +14,7 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.build_env import EnvConfig, env_parts, training_env
+from astra_data.training.ramp import Ramp
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
@@ -76,6 +78,13 @@ def test_failures_are_foreseen_where_rewards_or_ends_depend_on_them() -> None:
     assert EnvConfig(topple=True).foresees
 
 
+def test_settings_have_their_old_names_as_well_and_penalties_grow_as_they_say() -> None:
+    assert EnvConfig.model_validate({"doubt_penalty": 0.5}).disagreement_penalty == 0.5
+    assert EnvConfig(ramp=0.4, ramp_while=0.5).penalty_ramp == Ramp(0.4, 0.5)
+    with pytest.raises(ValidationError, match="ramp_while: expected a ramp"):
+        EnvConfig(ramp_while=0.5)
+
+
 def test_rows_may_differ_by_their_members(episodes: PairedEpisodes) -> None:
     torch.manual_seed(0)
     model, *members = (GroundingModel(GroundingShape(4, 2, 2, latent_size=8)) for _ in range(3))
@@ -116,6 +125,21 @@ def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
     assert (thinness[cells(far)] == 1.0).all()
     visited = episodes.steps(episodes.windows.state)[:, :2]
     assert float(thinness[cells(visited)].mean()) < 0.1
+
+
+def test_what_is_enough_is_a_share_of_the_usual_density(episodes: PairedEpisodes) -> None:
+    height, width = TASK.maze.fine_walls.shape
+    extent = torch.tensor([width, height]) * TASK.maze.fine_m
+    everywhere = torch.cat([extent * (torch.rand(2, 400, 2) - 0.5), torch.zeros(2, 400, 2)], dim=-1)
+    spread = replace(episodes, windows=replace(episodes.windows, state=everywhere))
+    little, more = (
+        env_parts(TASK, EnvConfig(support_density=share), spread, NO_GROUNDING).thinness
+        for share in (0.4, 0.8)
+    )
+    assert little is not None and more is not None
+    some = little > 0
+    assert some.sum() > 10
+    torch.testing.assert_close(0.4 * (1 - little[some]), 0.8 * (1 - more[some]))
 
 
 def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -114,6 +115,51 @@ def test_the_same_seed_repeats_all_episodes() -> None:
     assert run() == run()
 
 
+def test_a_seed_of_a_list_is_the_first_and_nothing_else_is_drawn_from() -> None:
+    env = point_mazes(2, max_episode_steps=5)
+    drawn = torch.get_rng_state()
+    listed, first, second = (env.reset(seed=seed)[0] for seed in ([3, 9], 3, 9))
+    assert np.array_equal(listed, first) and not np.array_equal(listed, second)
+    assert torch.equal(torch.get_rng_state(), drawn)
+
+
+def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
+    task = TASKS["antmaze-umaze"]
+    simulator = NO_GROUNDING.simulator(task, 1, scatter=0.1 * torch.eye(4))
+    env = SeededSimulatorEnv(SimulatorEnv(task.objective, simulator))
+
+    def velocities(seed: int) -> list[list[float]]:
+        env.reseed(seed)
+        env.reset()
+        shown = []
+        for _ in range(2):
+            env.step(torch.zeros(1, 2))
+            shown.append(simulator.state[0, 2:].tolist())
+            simulator.state[0, 2:] = 0.0
+        return shown
+
+    one, again, other = (velocities(seed) for seed in (1, 1, 2))
+    assert one == again and one[0] != one[1] and one[0] != other[0]
+
+
+def test_episodes_are_cut_off_so_long_after_their_start() -> None:
+    env = point_mazes(2, max_episode_steps=4)
+
+    def cut(steps: int) -> list[int]:
+        still = np.zeros((2, 2), dtype=np.float32)
+        return [number for number in range(1, steps + 1) if env.step(still)[3].all()]
+
+    env.reset(seed=0)
+    assert cut(10) == [4, 8]
+    env.reset()  # in the middle of one
+    assert cut(5) == [4]
+    one = SingleEnv(gymnasium.make(NAMES[2]).unwrapped.env, max_episode_steps=3)  # type: ignore[attr-defined]
+    for steps in (2, 3):
+        one.reset()
+        truncated = [one.step(np.zeros(2, dtype=np.float32))[3] for _ in range(steps)]
+        assert truncated == [False, False, True][:steps]
+
+
 def test_the_vector_env_declares_and_does_same_step_resets() -> None:
     env = point_mazes(3, max_episode_steps=4)
     assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
@@ -157,6 +203,7 @@ def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
                 np.testing.assert_array_equal(final["_success"], terminated)
                 assert infos["final_obs"][rows[0]].shape == (8,)
                 assert infos["final_obs"].dtype == object
+                assert all(infos["final_obs"][row] is None for row in np.flatnonzero(~terminated))
                 successes += len(rows)
         assert successes == 2
 

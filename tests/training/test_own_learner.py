@@ -132,3 +132,11 @@ def test_a_kind_of_the_package_is_not_replaced(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(Constant, "kind", "actor_critic")
     with pytest.raises(BadInputError, match="policies of kind 'actor_critic' are the package's"):
         add_policy_kind(Constant)
+
+
+def test_another_learners_kind_is_not_replaced() -> None:
+    other = type("Other", (Constant,), {})
+    with pytest.raises(BadInputError, match=r"policies of kind 'constant' are .*: rename that of Other"):
+        add_policy_kind(other)
+    add_policy_kind(Constant)
+    assert KINDS["constant"] is Constant

@@ -30,7 +30,8 @@ def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
     assert reached.success == 1.0 and reached.steps == pytest.approx(4.2, abs=0.2)
     # At 0.4 m/s goals up to 1.6 m are in reach in 4 s.
     some = trial(TASK, constant(-0.44), NO_GROUNDING, seed=0)
-    assert some.success == pytest.approx(0.6, abs=0.15) and 25 < some.steps < 40
+    assert some.success == pytest.approx(0.6, abs=0.15)
+    assert some.steps == pytest.approx(32.5, abs=1.5)  # of those that arrive, in 25 to 40
     none = trial(TASK, constant(-1.0), NO_GROUNDING, seed=0)
     assert (none.success, none.steps) == (0.0, 40.0)
     assert trial(TASK, constant(-0.44), NO_GROUNDING, seed=1) != some
