@@ -50,9 +50,21 @@ Hold = Annotated[
 PpoSteps = Annotated[
     int | None, typer.Option(help="Steps after which suboptimal_ppo stops learning.", show_default="300000")
 ]
+SacSteps = Annotated[
+    int | None,
+    typer.Option(help="Steps after which suboptimal_sac stops at the latest.", show_default="300000"),
+]
 SacEpisodeSteps = Annotated[
     int | None,
     typer.Option(help="Mean episode length at which suboptimal_sac stops learning.", show_default="500"),
+]
+RandomShare = Annotated[
+    float | None,
+    typer.Option(help="Share of the episodes of a policy that are random instead.", show_default="0"),
+]
+Clearance = Annotated[
+    float | None,
+    typer.Option(help="Replace random commands that lead closer to walls, in m.", show_default="0"),
 ]
 Policy = Annotated[
     str | None,
@@ -88,7 +100,10 @@ def collect(
     start: Start = None,
     hold_s: Hold = None,
     ppo_steps: PpoSteps = None,
+    sac_steps: SacSteps = None,
     sac_episode_steps: SacEpisodeSteps = None,
+    random_share: RandomShare = None,
+    clearance_m: Clearance = None,
     policy: Policy = None,
     grounding: Grounding = None,
     target_encoder: Encoder = None,
@@ -106,7 +121,10 @@ def collect(
         "start": start,
         "hold_s": hold_s,
         "ppo_steps": ppo_steps,
+        "sac_steps": sac_steps,
         "sac_episode_steps": sac_episode_steps,
+        "random_share": random_share,
+        "clearance_m": clearance_m,
         "policy": policy,
         "grounding": grounding,
         "target_encoder": target_encoder,

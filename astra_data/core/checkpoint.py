@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from astra_data.core.disk import writing
+from astra_data.core.disk import refuse_finished, writing
 from astra_data.core.durable import (
     clean,
     discard,
@@ -135,16 +135,6 @@ def understood(
         raise BadInputError(
             f"{path}: expected {what} as this version writes it, found {found}: run that stage again"
         ) from error
-
-
-def refuse_finished(out: Path) -> None:
-    """Refuse to make `out` once more.
-
-    Raises:
-        BadInputError: it exists.
-    """
-    if out.exists():
-        raise BadInputError(f"{out} is finished already: remove it to run the stage again")
 
 
 @contextmanager

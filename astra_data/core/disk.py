@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from astra_data.core.errors import AstraDataError, DiskError
+from astra_data.core.errors import AstraDataError, BadInputError, DiskError
 
 _OF_THE_DISK = {
     errno.ENOSPC: ("the disk is full", "free space"),
@@ -88,3 +88,13 @@ def _is_about(error: Exception, target: Path) -> bool:
     path = Path(os.fsdecode(name))
     hidden = str(target.with_name(f".{target.name}."))
     return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
+
+
+def refuse_finished(out: Path) -> None:
+    """Refuse to make `out` once more.
+
+    Raises:
+        BadInputError: it exists.
+    """
+    if out.exists():
+        raise BadInputError(f"{out} is finished already: remove it to run the stage again")

@@ -7,6 +7,7 @@ same seed gives the same numbers in every process and on every machine.
 import hashlib
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def derive(seed: int, purpose: str) -> int:
@@ -18,3 +19,16 @@ def derive(seed: int, purpose: str) -> int:
 def generator(seed: int, purpose: str) -> np.random.Generator:
     """Return a numpy generator for `purpose`."""
     return np.random.default_rng(derive(seed, purpose))
+
+
+def held_out_episodes(episodes: int, share: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Draw a `share` of so many episodes to hold out, at least one if it is not 0.
+
+    Every stage that is given the same three numbers holds out the same ones.
+
+    Returns:
+        the numbers of the others and of those, both in random order.
+    """
+    order = generator(seed, "held-out episodes").permutation(episodes)
+    count = max(1, round(share * episodes)) if share else 0
+    return order[count:], order[:count]

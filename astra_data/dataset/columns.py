@@ -162,9 +162,8 @@ class Column:
         if words is None:
             return []
         roles, names = (self.astra or {}).get("role", []), self.names or ()
-        of = {
-            name: word for name, word, role in zip(names, words, roles, strict=False) if role == "invariant"
-        }
+        named = zip(names, words, roles, strict=False)
+        of = {name: word for name, word, role in named if role == "invariant"}
         faults = [
             f"mirror {word!r} of a {role}, expected '', because its role defines it"
             for word, role in zip(words, roles, strict=False)
@@ -178,10 +177,9 @@ class Column:
 
     def feature(self) -> dict[str, Any]:
         """Return the column's entry in LeRobot's `features`."""
-        names = self.names and list(self.names)
         astra: dict[str, Any] = {"meaning": self.meaning} if self.meaning else {}
         astra |= {key: list(words) for key, words in (self.astra or {}).items()}
-        entry = {"dtype": self.dtype, "shape": [self.size], "names": names}
+        entry = {"dtype": self.dtype, "shape": [self.size], "names": self.names and list(self.names)}
         return entry | ({"astra": astra} if astra else {})
 
     @classmethod
@@ -193,12 +191,11 @@ class Column:
         """
         try:
             astra = dict(feature.get("astra") or {})
-            names = feature.get("names")
             return cls(
                 name=name,
                 dtype=feature["dtype"],
                 size=feature["shape"][0],
-                names=None if names is None else tuple(names),
+                names=None if feature.get("names") is None else tuple(feature["names"]),
                 meaning=astra.pop("meaning", ""),
                 astra=astra or None,
             )
@@ -253,9 +250,8 @@ class Episode:
     def __post_init__(self) -> None:
         """Convert numpy scalars and array layouts, and validate the episode."""
         metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
-        given = self.columns.items()
-        masked = [name for name, a in given if isinstance(a, np.ma.MaskedArray) and a.mask.any()]
-        columns = {name: np.asarray(values, order="C") for name, values in given}
+        masked = [name for name, values in self.columns.items() if np.ma.is_masked(values)]
+        columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
         faults = []

@@ -62,7 +62,10 @@ def settings_of(run: str | Path) -> dict[str, Any]:
         raise BadInputError(
             f"{run}: expected the folder of a run, which holds recipe.json: make it with astra-data run"
         )
-    settings: dict[str, Any] = json.loads(recipe.read_text())
+    try:
+        settings: dict[str, Any] = json.loads(recipe.read_text())
+    except ValueError as error:
+        raise BadInputError(f"{recipe}: expected the settings of a run, in JSON: {error}") from None
     return settings
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.seeding import generator
+from astra_data.core.seeding import held_out_episodes
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -183,15 +183,17 @@ class PairedEpisodes:
                     "held out: take a larger subset"
                 )
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
-        order = torch.from_numpy(generator(seed, "held-out episodes").permutation(len(self)))
-        order = order.to(self.target_state.device)
-        count = max(1, round(held_out_share * len(self)))
-        if count >= len(self):
+        training, held_out = held_out_episodes(len(self), held_out_share, seed)
+        if not len(training):
             raise BadInputError(
-                f"{self.reference} has {len(self)} episodes, of which {count} would be held out: expected "
-                "more episodes, or a smaller held_out_share"
+                f"{self.reference} has {len(self)} episodes, of which {len(held_out)} would be held out: "
+                "expected more episodes, or a smaller held_out_share"
             )
-        return self.select(order[count:]), self.select(order[:count])
+        device = self.target_state.device
+        return (
+            self.select(torch.from_numpy(training).to(device)),
+            self.select(torch.from_numpy(held_out).to(device)),
+        )
 
     def steps(self, values: Tensor) -> Tensor:
         """Return the real steps of `values` (E, T, ...), one after another, (N, ...)."""

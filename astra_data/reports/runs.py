@@ -124,7 +124,7 @@ class Runs:
         """Check that the rows have a file for every finished seed.
 
         Raises:
-            MissingStageError: some do not; the message lists them and the command that makes the first.
+            MissingStageError: some do not; the message lists them.
         """
         self._require(stage, name, {method: self.finished[method] for method in methods})
 
@@ -136,12 +136,11 @@ class Runs:
         missing = {method: seeds for method, seeds in missing.items() if seeds}
         if not missing:
             return
-        method, (seed, *_) = next(iter(missing.items()))
         absent = "; ".join(f"{row} seed {', '.join(map(str, seeds))}" for row, seeds in missing.items())
-        option = "" if self.root.parent == Path("runs") else f" --root {self.root.parent}"
+        size = "" if self.percent is None else f"percent_{self.percent:03d}/"
         raise MissingStageError(
-            f"expected {name} in {self.root / stage}/<method>/seed_<seed>/, found none for {absent}; "
-            f"run `astra-data {stage} recipes/{self.recipe}.toml --method {method} --seed {seed}{option}`"
+            f"expected {name} in {self.root / stage}/<method>/{size}seed_<seed>/, found none for {absent}; "
+            f"run the recipe {self.recipe} again: it goes on with what is missing"
         )
 
     def _read[T: Artefact](

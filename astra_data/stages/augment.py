@@ -24,8 +24,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
-from astra_data.core.seeding import derive, generator
-from astra_data.core.stopwatch import Stopwatch
+from astra_data.core.seeding import derive, generator, held_out_episodes
 from astra_data.dataset.columns import (
     ABSTRACT_STATE,
     GOAL,
@@ -160,7 +159,7 @@ def augment(
         seeds=source.description["seeds"] | {"augment": seed},
     )
     taken = set(source.uids.tolist())
-    stopwatch, placed, lost, moving = Stopwatch(), 0, 0, _moving(source)
+    placed, lost, moving = 0, 0, _moving(source)
     with DatasetWriter.like(source, out, description) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
@@ -183,12 +182,7 @@ def augment(
                 f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
             )
         skipped = int((~held_out & (copies == 0)).sum())
-        writer.made = {
-            "copies": placed,
-            "copies_without_place": lost,
-            "episodes_not_copied": skipped,
-            **stopwatch.spent(),
-        }
+        writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
     return out
 
 
@@ -238,27 +232,26 @@ def _shares(
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     """Return which episodes are held out (E,), and how many copies each is to have (E,)."""
     count = len(source)
-    order = generator(seed, "held-out episodes").permutation(count)
-    held = max(1, round(config.held_out_share * count)) if config.held_out_share else 0
-    held_out = np.isin(np.arange(count), order[:held])
+    training, held = held_out_episodes(count, config.held_out_share, seed)
+    held_out = np.isin(np.arange(count), held)
     usable = ~held_out
     for index, episode in enumerate(source.episodes([STATE, NEXT_STATE])):
         usable[index] &= bool(relocation.stretches(episode))
     if not usable.any():
         raise BadInputError(
-            f"{source.reference}: none of {count - held} training episodes keeps {relocation.margin_m:g} m "
+            f"{source.reference}: none of {len(training)} training episodes keeps {relocation.margin_m:g} m "
             f"from the walls for {config.min_steps} steps: lower --margin-m, --min-steps or --held-out-share "
-            f"({held} episodes)"
+            f"({len(held)} episodes)"
         )
     copies = np.zeros(count, dtype=np.intp)
     copies[usable] = config.copies or DEFAULT_COPIES
     if config.episodes is not None:
-        kept = count if config.keep_originals else held
+        kept = count if config.keep_originals else len(held)
         if config.episodes < kept:
             raise BadInputError(f"--episodes {config.episodes}: expected at least the {kept} that are kept")
         each, more = divmod(config.episodes - kept, int(usable.sum()))
         copies[usable] = each
-        copies[order[usable[order]][:more]] += 1
+        copies[training[usable[training]][:more]] += 1
     return held_out, copies
 
 

@@ -11,7 +11,6 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import (
     DONE,
     GOAL,
@@ -87,7 +86,7 @@ def label(
         name=name,
         out=out,
     )
-    stopwatch, steps, successes, failures = Stopwatch(), 0, 0, 0
+    steps = successes = failures = 0
     with DatasetWriter.like(source, out, description, more=more) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
             labelled = labels(world, episode, seed)
@@ -96,7 +95,7 @@ def label(
             successes += bool(labelled.metadata["success"])
             failures += bool(labelled.metadata["failed"])
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
-        writer.made = {"dropped_steps": int(source.lengths.sum()) - steps, **stopwatch.spent()}
+        writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
     return out
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.training.episode_record import EpisodeRecord, Outcome
 from astra_data.training.own_world import Begin
@@ -49,7 +50,12 @@ def in_target(
         num_threads: of the physics, by default one per core; the outcome is the same with any number.
         progress: called with the fraction done and the speed.
         asked: counts commands beyond what was recorded.
+
+    Raises:
+        BadInputError: the robot has no legs of another length.
     """
+    if leg_scale != 1.0 and task.robot is not None:
+        raise BadInputError(f"leg_scale: the robot of {task.name} has one length of legs: expected 1")
     legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
     env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
     env.reset()

@@ -49,7 +49,7 @@ class MujocoModel(FreeStates):
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": float(self.model.opt.timestep), "substeps": self.substeps}
+        return {"timestep_s": self.substeps * float(self.model.opt.timestep), "substeps": self.substeps}
 
     def step(self, action: Tensor) -> Tensor:
         """Apply controls `action` (B, nu), clipped by the motors; return the new state (B, nq + nv)."""

@@ -133,4 +133,5 @@ class RememberingSimulator(Protocol):
     """A simulator whose next steps depend on more than its states."""
 
     memory: Tensor
-    """The memory that they, and corrections, depend on besides states, (B, M); `reset_to` resets it."""
+    """The memory that they, and corrections, depend on besides states, (B, M); `reset_to` of given rows
+    begins theirs anew."""

@@ -62,6 +62,15 @@ def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
         (["collect", "recipe.toml", "--resume"], r"leave out --resume"),
         (["collect", "antmaze-umaze", "--seed", "1", "--seed", "2"], r"takes one --seed"),
         (["collect", "antmaze-umaze", "--behavior", "wild"], r"behavior: expected 'random', .*got 'wild'"),
+        (
+            ["collect", "antmaze-umaze", "--random-share", "0.5"],
+            r"random_share: expected the behavior of a pol",
+        ),
+        (["collect", "antmaze-umaze", "--sac-steps", "-1"], r"sac_steps: expected greater than"),
+        (
+            ["collect", "humanoid-walker2d", "--clearance-m", "0.5", "--start", "task"],
+            r"expected a task in a maze",
+        ),
         (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),
         (["pair", "recipe.toml", "--simulator", "antmaze-umaze"], r"in \[pair\]: leave out --simulator"),
         (["pair", "walks", "--jobs", "2", "--simulator", "antmaze-umaze"], r"neither --seed nor --jobs"),

@@ -1,6 +1,6 @@
 import numpy as np
 
-from astra_data.core.seeding import derive, generator
+from astra_data.core.seeding import derive, generator, held_out_episodes
 
 
 def test_streams_are_the_same_on_every_machine() -> None:
@@ -17,3 +17,11 @@ def test_seeds_and_purposes_give_different_streams() -> None:
 def test_streams_of_two_purposes_are_uncorrelated() -> None:
     one, two = (generator(0, purpose).standard_normal(10_000) for purpose in ("one", "two"))
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.05
+
+
+def test_episodes_are_held_out_as_many_as_asked_for_and_at_least_one() -> None:
+    for share, count in ((0.0, 0), (0.01, 1), (0.25, 5), (1.0, 20)):
+        training, held_out = held_out_episodes(20, share, seed=3)
+        assert len(held_out) == count and sorted([*training, *held_out]) == list(range(20))
+    same, other = (held_out_episodes(20, 0.25, seed)[1].tolist() for seed in (3, 4))
+    assert held_out_episodes(20, 0.25, 3)[1].tolist() == same != other

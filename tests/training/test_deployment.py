@@ -49,6 +49,10 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
     torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
+    assert (
+        deployed.observation_size == 16
+        and DeployedPolicy(TASK, policy, observed="full").observation_size == 33
+    )
 
 
 @torch.no_grad()
@@ -63,6 +67,14 @@ def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> N
     )
     torch.testing.assert_close(actions, policy.policy(features)[0], atol=1e-5, rtol=0)
     assert torch.equal(run(deployed), actions)
+    drawn = []
+    for seed in (1, 1, 2):
+        deployed.start(3, torch.Generator().manual_seed(seed))
+        begun = deployed.memory
+        drawn.append(deployed.act(STATE[:, 0], GOAL))
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+    deployed.resume(begun)
+    assert torch.equal(deployed.act(STATE[:, 0], GOAL), actions[:, 0])
 
 
 @torch.no_grad()

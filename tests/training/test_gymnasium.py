@@ -118,7 +118,7 @@ def test_the_same_seed_repeats_all_episodes() -> None:
 def test_a_seed_of_a_list_is_the_first_and_nothing_else_is_drawn_from() -> None:
     env = point_mazes(2, max_episode_steps=5)
     drawn = torch.get_rng_state()
-    listed, first, second = (env.reset(seed=seed)[0] for seed in ([3, 9], 3, 9))
+    listed, (first, second) = env.reset(seed=[3, 9])[0], (env.reset(seed=seed)[0] for seed in (3, 9))
     assert np.array_equal(listed, first) and not np.array_equal(listed, second)
     assert torch.equal(torch.get_rng_state(), drawn)
 

@@ -5,6 +5,7 @@ import torch
 from small_cart import TASK, Cart, Last
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.training.own_world import Act
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.target_episodes import in_target
@@ -98,3 +99,8 @@ def test_progress_is_told_by_the_horizon() -> None:
     told: list[float] = []
     in_target(TASK, lambda goal: driving(-0.5), 2, 0, progress=lambda done, note: told.append(done))
     assert len(told) == TASK.objective.horizon and told[-1] == pytest.approx(0.99)
+
+
+def test_a_robot_of_ones_own_has_one_length_of_legs() -> None:
+    with pytest.raises(BadInputError, match="leg_scale: the robot of rail-cart has one length of legs"):
+        in_target(TASK, lambda goal: driving(0.9), 1, seed=3, leg_scale=1.25)

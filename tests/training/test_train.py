@@ -238,6 +238,7 @@ def test_a_recipe_decides_the_reward_before_the_method(tmp_path: Path) -> None:
 
 def test_switches_reach_the_environment_and_the_policy_file(tmp_path: Path) -> None:
     switches = {
+        "num_envs": 3,
         "topple": True,
         "risk_weight": 2.0,
         "residual_noise": 0.5,
@@ -249,7 +250,7 @@ def test_switches_reach_the_environment_and_the_policy_file(tmp_path: Path) -> N
     }
     given = training(tmp_path, PPO.model_copy(update=switches))
     env, simulation = InSimulator().world(given)
-    assert (env.num_envs, env.topple, env.risk_weight, env.disagreement_penalty) == (4, True, 2.0, 0.3)
+    assert (env.num_envs, env.topple, env.risk_weight, env.disagreement_penalty) == (3, True, 2.0, 0.3)
     assert (env.command_limit_m_s, env.data_start_share, env.change_penalty) == (0.7, 0.6, 0.1)
     assert simulation.thinness is not None and env.thinness is not None
     torch.testing.assert_close(env.thinness, 0.2 * simulation.thinness)

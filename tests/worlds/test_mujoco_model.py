@@ -52,7 +52,7 @@ def test_some_rows_are_reset_and_earlier_states_stay(model: mujoco.MjModel) -> N
 
 
 def test_parameters_name_the_step(model: mujoco.MjModel) -> None:
-    assert MujocoModel(model, 1, substeps=4).parameters == {"timestep_s": 0.01, "substeps": 4}
+    assert MujocoModel(model, 1, substeps=4).parameters == {"timestep_s": 0.04, "substeps": 4}
 
 
 def test_motors_with_states_of_their_own_are_refused() -> None:

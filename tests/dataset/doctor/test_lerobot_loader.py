@@ -1,7 +1,6 @@
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from damaged import EPISODES, alter, drop
 from fake_dataset import COLUMNS, fake_episodes, write_fake, writer
@@ -31,7 +30,7 @@ def test_lerobot_reads_the_same_windows(tmp_path: Path) -> None:
     usual = datasets.config.HF_DATASETS_CACHE
     with writer(tmp_path / "set", columns=[*COLUMNS, Column("observation.count", "int64")]) as out:
         for one in fake_episodes():
-            counted = one.columns | {"observation.count": one.columns["mode"]}
+            counted = {**one.columns, "observation.count": one.columns["mode"]}
             out.add(Episode(one.uid, counted, one.metadata))
     assert compared(tmp_path / "set") == []
     assert usual == datasets.config.HF_DATASETS_CACHE
