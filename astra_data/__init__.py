@@ -13,7 +13,7 @@ all of it   run
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from astra_data.core.optional import explained
+from astra_data.core.optional import missing_extra
 
 if TYPE_CHECKING:
     from astra_data.dataset.columns import Column as Column
@@ -74,7 +74,7 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever is named
     try:
         module = import_module(f"astra_data.{_MODULES[name]}")
     except ModuleNotFoundError as error:
-        if (reported := explained(error)) is None:
+        if (reported := missing_extra(error)) is None:
             raise
         raise reported from None
     globals()[name] = value = getattr(module, name)

@@ -32,7 +32,7 @@ from astra_data.cli import (
 from astra_data.core.disk import disk_error
 from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import AstraDataError
-from astra_data.core.optional import explained
+from astra_data.core.optional import missing_extra
 
 app = typer.Typer(
     help="Robot trajectories into datasets, datasets into policies that transfer from an abstract simulator.",
@@ -136,7 +136,7 @@ def main() -> None:
 def _reported(error: Exception) -> AstraDataError | None:
     """Return what to print of `error`; None if it is a fault of the program."""
     if isinstance(error, ModuleNotFoundError):
-        return explained(error)
+        return missing_extra(error)
     return error if isinstance(error, AstraDataError) else disk_error(error)
 
 

@@ -35,7 +35,7 @@ def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
         raise _not_installed(module, extra) from error
 
 
-def explained(error: ModuleNotFoundError) -> BadInputError | None:
+def missing_extra(error: ModuleNotFoundError) -> BadInputError | None:
     """Return an error that says which extra brings the missing module; None if none of `EXTRAS` does."""
     package = (error.name or "").partition(".")[0]
     return _not_installed(package, EXTRAS[package]) if package in EXTRAS else None

@@ -11,7 +11,7 @@ from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import base_method, place
 from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
 
-SHARED = ("ground", "align")
+SHARED_BY_ROWS = ("ground", "align")
 """Stages whose artefacts a "_plus" row takes from its base row."""
 
 
@@ -65,7 +65,7 @@ class Runs:
 
     def owner(self, stage: str, method: str) -> str:
         """Return the row in whose folder the artefact is: rows may share a grounding and its alignment."""
-        if stage in SHARED and not (self.root / stage / method).is_dir():
+        if stage in SHARED_BY_ROWS and not (self.root / stage / method).is_dir():
             return self.groundings.get(method, base_method(method))
         return method
 

@@ -6,7 +6,7 @@ from pydantic import Field, field_validator
 
 from astra_data.core.config import Config, Positive, did_you_mean
 from astra_data.studies.joints import JointsConfig
-from astra_data.studies.rollouts import MODELS, FitConfig
+from astra_data.studies.rollouts import FITS, FitConfig
 from astra_data.studies.walking import WalkingConfig
 from astra_data.studies.walks import StepsConfig
 
@@ -17,7 +17,7 @@ class GapRecipe(Config):
     mapping: str
     """How logs become columns: a file of `astra-data import`, relative to the recipe."""
     models: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Names in `rollouts.MODELS`; the raw simulator is always added."""
+    """Names in `rollouts.FITS`; the raw simulator is always added."""
     seeds: Annotated[tuple[int, ...], Field(min_length=1)]
     """Seeds of the smaller data sizes' choice of pieces, and of the networks."""
     minutes: tuple[Positive, ...] = ()
@@ -43,8 +43,8 @@ class GapRecipe(Config):
     @classmethod
     def _are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
         for name in models:
-            if name not in MODELS:
-                raise ValueError(f"unknown model '{name}'{did_you_mean(name, MODELS)}")
+            if name not in FITS:
+                raise ValueError(f"unknown model '{name}'{did_you_mean(name, FITS)}")
         return ("raw", *(name for name in dict.fromkeys(models) if name != "raw"))
 
     @property

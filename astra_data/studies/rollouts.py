@@ -76,13 +76,13 @@ def rollout(model: Predictor, stretch: Stretch) -> Tensor:
 
 
 def fit(name: str, walks: Walks, history: int, config: FitConfig, seed: int, progress: Progress) -> Predictor:
-    """Fit the model `name` of `MODELS` to `walks`, with a history of `history` steps.
+    """Fit the model `name` of `FITS` to `walks`, with a history of `history` steps.
 
     Raises:
         BadInputError: there are too few steps of walking.
     """
     torch.manual_seed(derive(seed, f"walk model {name}"))
-    return MODELS[name](walks, history, config, progress)
+    return FITS[name](walks, history, config, progress)
 
 
 def _raw(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
@@ -140,7 +140,7 @@ def _history_model(weights: LossWeights) -> Callable[[Walks, int, FitConfig, Pro
     return fitted
 
 
-MODELS: dict[str, Callable[[Walks, int, FitConfig, Progress], Predictor]] = {
+FITS: dict[str, Callable[[Walks, int, FitConfig, Progress], Predictor]] = {
     "raw": _raw,
     "gains": _gains,
     "ridge": _ridge,

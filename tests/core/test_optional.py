@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.optional import EXTRAS, explained, optional
+from astra_data.core.optional import EXTRAS, missing_extra, optional
 
 DISTRIBUTIONS = {"PIL": "pillow", "gymnasium_robotics": "gymnasium-robotics"}
 
@@ -16,11 +16,11 @@ def test_a_missing_package_is_one_error_that_says_how_to_install_it() -> None:
 
 
 def test_a_module_of_an_extra_is_explained_and_others_are_not() -> None:
-    reported = explained(ModuleNotFoundError("No module named 'torch'", name="torch.nn"))
+    reported = missing_extra(ModuleNotFoundError("No module named 'torch'", name="torch.nn"))
     assert reported is not None
     assert 'pip install "astra-data[sim]"' in str(reported)
     assert (
-        explained(ModuleNotFoundError("No module named 'astra_data.nosuch'", name="astra_data.nosuch"))
+        missing_extra(ModuleNotFoundError("No module named 'astra_data.nosuch'", name="astra_data.nosuch"))
         is None
     )
 

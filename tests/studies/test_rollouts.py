@@ -6,7 +6,7 @@ from astra_data.core.progress import silent
 from astra_data.studies.errors import Trial
 from astra_data.studies.motion import MIRROR
 from astra_data.studies.predictors import Gains
-from astra_data.studies.rollouts import MODELS, FitConfig, fit, predict
+from astra_data.studies.rollouts import FITS, FitConfig, fit, predict
 from astra_data.studies.walks import StepsConfig, Walks
 
 CONFIG = StepsConfig(rows=10, history=4)
@@ -55,7 +55,7 @@ def test_networks_learn_that_the_robot_is_late(name: str) -> None:
     assert (error(name) < error("gains")).all()
 
 
-@pytest.mark.parametrize("name", sorted(MODELS))
+@pytest.mark.parametrize("name", sorted(FITS))
 def test_left_and_right_are_alike(name: str) -> None:
     short = FitConfig(**{**QUICK.model_dump(), "updates": 3})
     model = fit(name, WALKS, 4, short, 0, silent)
