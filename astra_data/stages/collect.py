@@ -136,18 +136,7 @@ def collect(
     world = task_named(task)
     plan = None if config.plan is None else Plan.load(config.plan, world)
     episodes = config.episodes if plan is None else min(config.episodes, len(plan.episodes))
-    files = _saved_files(config).items()
-    saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
-    saved |= {"plan_sha256": file_digest(Path(config.plan))} if config.plan is not None else {}
-    behaviors = config.behavior + ("-and-random" if config.random_share else "")
-    description = {
-        "name": name or f"{world.name}-{behaviors}-seed{seed}".replace("_", "-"),
-        "version": "1.0.0",
-        "stage": "collect",
-        "config": config.model_dump(mode="json") | saved,
-        "seeds": {"collect": seed, "subset": derive(seed, "subset")},
-        "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
-    }
+    description = _description(world, config, seed, name)
     folder = out or place(description)
     with StagedWriter(
         folder,
@@ -214,6 +203,22 @@ def collect(
     note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
     progress(1.0, f"{len(returns)} episodes, {note}, {rate:,.0f} target steps/s")
     return folder
+
+
+def _description(world: Task, config: CollectConfig, seed: int, name: str | None) -> dict[str, Any]:
+    """Return what the dataset says of itself."""
+    files = _saved_files(config).items()
+    saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
+    saved |= {"plan_sha256": file_digest(Path(config.plan))} if config.plan is not None else {}
+    behaviors = config.behavior + ("-and-random" if config.random_share else "")
+    return {
+        "name": name or f"{world.name}-{behaviors}-seed{seed}".replace("_", "-"),
+        "version": "1.0.0",
+        "stage": "collect",
+        "config": config.model_dump(mode="json") | saved,
+        "seeds": {"collect": seed, "subset": derive(seed, "subset")},
+        "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
+    }
 
 
 def _steps_before(position: int, writer: StagedWriter) -> int:
