@@ -73,6 +73,8 @@ def train(
         raise BadInputError(f"method '{method}' starts from the policy of {base.initial}: train that first")
     if not base.accepts(config.reward):
         raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
+    if config.ramp_while and world.objective.is_lasting:
+        raise BadInputError(f"ramp_while: no episode of {world.name} succeeds before its end: expected 0")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
     episodes.check(world.limits)
