@@ -78,11 +78,11 @@ def add_method(name: str, place: str) -> None:
     if method.table is not None and method.table.ranges:
         raise BadInputError(f"{place} has a table of ranges, which only methods of the package have")
     if kind := method.grounding:
-        known = KINDS.setdefault(kind.kind, kind)
-        if known is not kind:
+        owner = KINDS.setdefault(kind.kind, kind)
+        if owner is not kind:
             raise BadInputError(
-                f"{place}: groundings of kind '{kind.kind}' are those of {known.__name__} in "
-                f"{known.__module__}: rename its kind"
+                f"{place}: groundings of kind '{kind.kind}' are those of {owner.__name__} in "
+                f"{owner.__module__}: rename its kind"
             )
     if isinstance(method.learn, OwnLearner):
         add_policy_kind(method.learn.policy)

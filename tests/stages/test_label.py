@@ -105,12 +105,12 @@ def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
     lasted = labels(task, long, 0)
     assert lasted.columns[SUCCESS].tolist() == [False] * 9 + [True]
     assert lasted.metadata["success"] and lasted.columns[TRUNCATED].tolist() == [False] * 9 + [True]
-    fell = labels(task, Episode(0, long.columns | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0)
+    fell = labels(task, Episode(0, dict(long.columns) | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0)
     assert not fell.columns[SUCCESS].any() and fell.metadata["failed"]
 
 
 def test_outcomes_are_those_of_the_steps_that_are_kept() -> None:
-    recorded = {"success": False, "failed": True, "return": -3.0, "driver": "Ada"}
+    recorded: dict[str, float | str] = {"success": False, "failed": True, "return": -3.0, "driver": "Ada"}
     labelled = labels(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
     reward = float(labelled.columns[REWARD].sum(dtype=np.float64))
     outcome = {"success": True, "failed": False, "return": reward}
