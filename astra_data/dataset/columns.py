@@ -250,7 +250,7 @@ class Episode:
     def __post_init__(self) -> None:
         """Convert numpy scalars and array layouts, and validate the episode."""
         metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
-        masked = [name for name, values in self.columns.items() if np.ma.is_masked(values)]
+        masked = [k for k, v in self.columns.items() if isinstance(v, np.ma.MaskedArray) and v.mask.any()]
         columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
