@@ -5,7 +5,7 @@ from altered_latents import ALTERATIONS, AlteredLatents, in_target, of_another
 
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
@@ -22,13 +22,13 @@ def test_each_robot_is_given_the_latent_of_another_anew_at_every_call() -> None:
 
 
 @torch.no_grad()
-def deployed(latents: bool = True) -> DeployedPolicy:
+def deployed(latents: bool = True) -> RunningPolicy:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)) if latents else None
     policy = ActorCritic(ActorCriticShape(observation_size=16 if latents else 8, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)
-    return DeployedPolicy(TASK, policy, model, None, command_limit_m_s=0.3)
+    return RunningPolicy(TASK, policy, model, None, command_limit_m_s=0.3)
 
 
 @torch.no_grad()
@@ -37,7 +37,7 @@ def test_latents_are_altered_where_the_policy_sees_them_alone() -> None:
     plain = deployed()
     state, goal = torch.randn(5, 4, 29), torch.randn(4, 2)
 
-    def acted(policy: DeployedPolicy, inside: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    def acted(policy: RunningPolicy, inside: bool) -> tuple[torch.Tensor, torch.Tensor]:
         policy.start(4)
         act = policy.act_in_simulator if inside else policy.act
         seen = TASK.abstraction(state) if inside else state

@@ -24,8 +24,8 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.reports.files import read_published
 from astra_data.reports.schema import Results
 from astra_data.stages.pair import pair
-from astra_data.training.deployment import DeployedPolicy
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import PolicyFile, running
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.registry import TASKS
 
 OLD = Path(__file__).parent / "formats/0.1"
@@ -95,13 +95,13 @@ def test_policies_act_as_they_did(old: Path, row: str) -> None:
 
 def test_a_policy_learned_by_sac_acts_as_it_did() -> None:
     known = json.loads((OLD / "sac_actions.json").read_text())
-    policy = deploy(TASKS["humanoid-kinematics"], PolicyFile.load(OLD / "sac_policy.safetensors"))
+    policy = running(TASKS["humanoid-kinematics"], PolicyFile.load(OLD / "sac_policy.safetensors"))
     inputs = [(torch.tensor(known["state"]), torch.zeros(4, 0))]
     assert_acts(policy, inputs, torch.tensor([known["action"]]))
 
 
 def assert_acts(
-    policy: DeployedPolicy, inputs: Iterable[tuple[torch.Tensor, ...]], expected: torch.Tensor
+    policy: RunningPolicy, inputs: Iterable[tuple[torch.Tensor, ...]], expected: torch.Tensor
 ) -> None:
     policy.start(expected.shape[1])
     for (state, goal), actions in zip(inputs, expected, strict=True):

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from astra_data.learning.networks.history import LatentEncoder
 from astra_data.training import target_episodes
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.episode_record import Outcome
 from astra_data.training.own_world import Act, started
+from astra_data.training.running_policy import RunningPolicy
 
 Alteration = Callable[[Tensor], Tensor]
 """Latents (B, Z) to those that the policy is shown."""
@@ -32,13 +32,13 @@ ALTERATIONS: Mapping[str, Alteration] = {
 
 
 @dataclass
-class AlteredLatents(DeployedPolicy):
+class AlteredLatents(RunningPolicy):
     """A policy whose latents are altered after they were encoded; its encoder goes on as if they were not."""
 
     alter: Alteration = torch.clone
 
     @classmethod
-    def of(cls, deployed: DeployedPolicy, alter: Alteration) -> "AlteredLatents":
+    def of(cls, deployed: RunningPolicy, alter: Alteration) -> "AlteredLatents":
         """Return `deployed` with `alter`."""
         return cls(
             deployed.task,
@@ -55,7 +55,7 @@ class AlteredLatents(DeployedPolicy):
         return None if latent is None else self.alter(latent)
 
 
-def in_target(policy: DeployedPolicy, episodes: int, seed: int, num_threads: int | None = None) -> Outcome:
+def in_target(policy: RunningPolicy, episodes: int, seed: int, num_threads: int | None = None) -> Outcome:
     """Run a policy in B = `episodes` target environments, from the task's starts."""
 
     def begin(goal: Tensor) -> Act:

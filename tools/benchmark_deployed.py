@@ -26,7 +26,7 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.train import PpoTrainConfig
 from astra_data.worlds.registry import TASKS
 
@@ -51,7 +51,7 @@ def main(seconds: Annotated[float, typer.Option(help="Of each way to run each po
         print(f"{name:<28}{onnx:>12,.0f}{script:>14,.0f}{ours:>13,.0f}{slow_ms:>11.3f} ms")
 
 
-def policies() -> dict[str, DeployedPolicy]:
+def policies() -> dict[str, RunningPolicy]:
     """Return a policy of the raw simulator and one of ASTRA, untrained."""
     config = SETTINGS.train
     assert isinstance(config, PpoTrainConfig)
@@ -62,18 +62,18 @@ def policies() -> dict[str, DeployedPolicy]:
     encoder = TargetEncoder(
         TASK.state.size, goal, action, embedding_size=64, latent_size=SETTINGS.ground.latent_size
     )
-    seen = DeployedPolicy(TASK, ActorCritic(ActorCriticShape(1, action))).observation_size
+    seen = RunningPolicy(TASK, ActorCritic(ActorCriticShape(1, action))).observation_size
     recurrent = ActorCriticShape(
         seen, action, memory_size=config.memory_size, hidden_sizes=config.hidden_sizes
     )
     latent = ActorCriticShape(seen + SETTINGS.ground.latent_size, action, hidden_sizes=config.hidden_sizes)
     return {
-        "direct transfer, recurrent": DeployedPolicy(TASK, ActorCritic(recurrent)),
-        "ASTRA, target encoder": DeployedPolicy(TASK, ActorCritic(latent), model, encoder),
+        "direct transfer, recurrent": RunningPolicy(TASK, ActorCritic(recurrent)),
+        "ASTRA, target encoder": RunningPolicy(TASK, ActorCritic(latent), model, encoder),
     }
 
 
-def ways(deployed: DeployedPolicy, folder: Path) -> dict[str, Callable[[], object]]:
+def ways(deployed: RunningPolicy, folder: Path) -> dict[str, Callable[[], object]]:
     """Return one step by the folder's own loop, by TorchScript and by this package, from NumPy to NumPy."""
     written = write_graphs(deployed, folder)
     about = describe(deployed, written.parts)

@@ -33,8 +33,8 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.history import HistoryEncoder, mlp
 from astra_data.methods import method_named
-from astra_data.training.deployment import target_observation
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import PolicyFile, running
+from astra_data.training.running_policy import target_observation
 from astra_data.worlds.humanoid.model import CommandRanges
 from astra_data.worlds.humanoid.skeleton import rotation
 from astra_data.worlds.humanoid.target import HumanoidEnv
@@ -71,9 +71,9 @@ def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
     grounds = method_named(row).grounds
     folder = run / "ground" / base_method(row) / f"seed_{seed}"
     grounding = load_grounding(folder / "grounding.safetensors") if grounds else NO_GROUNDING
-    deployed = deploy(task, trained, grounding)
-    deployed.start(count)
-    return lambda state: deployed.act(state, no_goals(len(state)))
+    policy = running(task, trained, grounding)
+    policy.start(count)
+    return lambda state: policy.act(state, no_goals(len(state)))
 
 
 def straight(state: Tensor) -> Tensor:

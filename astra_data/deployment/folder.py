@@ -17,8 +17,8 @@ from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, TORCHSCRIPT, writ
 from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.deployment.page import page
 from astra_data.experiments.trained_policy import load_policy, policy_files, task_of
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.policy_file import PolicyFile
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.own_code import file_of
 
 DESCRIPTION, LOOP, PAGE = "policy.json", "run_policy.py", "README.md"
@@ -68,7 +68,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     return out
 
 
-def describe(deployed: DeployedPolicy, parts: Mapping[str, int]) -> dict[str, Any]:
+def describe(deployed: RunningPolicy, parts: Mapping[str, int]) -> dict[str, Any]:
     """Return what one has to know to run a policy whose hidden state has these `parts`, by their sizes."""
     task = deployed.task
     encoder = "target" if deployed.target_encoder is not None else "source"

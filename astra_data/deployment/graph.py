@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.training.deployment import DeployedPolicy, Memory
 from astra_data.training.own_policy import OwnPolicy
+from astra_data.training.running_policy import Memory, RunningPolicy
 
 ONNX, TORCHSCRIPT = "policy.onnx", "policy.torchscript"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
@@ -35,7 +35,7 @@ class PolicyGraph(nn.Module):
         parts: the parts of the hidden state, (1, H), one after the other: each with its size.
     """
 
-    def __init__(self, deployed: DeployedPolicy) -> None:
+    def __init__(self, deployed: RunningPolicy) -> None:
         super().__init__()
         networks = (deployed.policy, deployed.source_encoder, deployed.target_encoder)
         self.networks = nn.ModuleList([network for network in networks if isinstance(network, nn.Module)])
@@ -73,7 +73,7 @@ class Written(NamedTuple):
     apart: dict[str, float]
 
 
-def write_graphs(deployed: DeployedPolicy, folder: Path) -> Written:
+def write_graphs(deployed: RunningPolicy, folder: Path) -> Written:
     """Write the policy as ONNX and TorchScript into `folder`, and compare both with it.
 
     Raises:
@@ -164,7 +164,7 @@ _DECOMPOSED: dict[Any, Callable[..., Any]] = {torch.ops.aten.hypot.default: _hyp
 """Operations that ONNX has not."""
 
 
-def _not_traceable(deployed: DeployedPolicy, error: Exception) -> BadInputError:
+def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
     """Return the error that names the task's function which cannot be traced."""
     task, (state, goal, _) = deployed.task, PolicyGraph(deployed).example
     action = torch.zeros(1, task.objective.action_size)

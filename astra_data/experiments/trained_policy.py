@@ -10,12 +10,12 @@ from astra_data.experiments.own_methods import add_all
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named
-from astra_data.training.deployment import DeployedPolicy
-from astra_data.training.policy_file import POLICY, PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, running
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.registry import task_named
 
 
-def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> DeployedPolicy:
+def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> RunningPolicy:
     """Load the policy of a row, with its encoder if it has one; call `start` before the first `command`.
 
     Args:
@@ -34,7 +34,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         >>> velocity = policy.command(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
     """
     files = policy_files(run, row, seed=seed, percent=percent)
-    return deploy(
+    return running(
         task_named(task_of(run)),
         PolicyFile.load(files["train"]),
         load_grounding(files["ground"]) if "ground" in files else NO_GROUNDING,

@@ -31,7 +31,7 @@ from astra_data.training.behaviors import (
     held_steps,
 )
 from astra_data.training.plan import Plan, PlannedCommands
-from astra_data.training.policy_file import POLICY, PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.recording import record
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
@@ -264,13 +264,13 @@ def _behavior(
         writer.policy = writer.folder / POLICY
         policy.save(writer.policy)
         metadata["policy_sha256"] = file_digest(writer.policy)
-        return PolicyBehavior(deploy(task, policy)), metadata
+        return PolicyBehavior(running(task, policy)), metadata
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
     grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
     encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
-    deployed = deploy(task, trained, grounding, encoder)
-    return PolicyBehavior(deployed), {"policy_dataset": trained.dataset}
+    acts = running(task, trained, grounding, encoder)
+    return PolicyBehavior(acts), {"policy_dataset": trained.dataset}
 
 
 def _random(task: Task, config: CollectConfig, commands: type[RandomCommands]) -> RandomCommands:

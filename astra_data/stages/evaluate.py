@@ -31,11 +31,11 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
 from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES
-from astra_data.training.deployment import EncoderKind
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import Act, Begin, in_simulator, own_world, started
-from astra_data.training.policy_file import POLICY, PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.recorded_range import RecordedRange
+from astra_data.training.running_policy import EncoderKind
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.target_episodes import in_target
 from astra_data.worlds.registry import task_named
@@ -189,7 +189,7 @@ def _follower(task: Task) -> _Row:
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
     trained = loaded or PolicyFile.load(files["policy"])
     grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
-    source = deploy(task, trained, grounding)
+    source = running(task, trained, grounding)
     robots: dict[EncoderKind, Begin] = {"source": partial(started, source, source.act)}
     if "target_encoder" in files:
         aligned = replace(source, target_encoder=load_target_encoder(files["target_encoder"]))

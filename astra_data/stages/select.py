@@ -29,9 +29,9 @@ from astra_data.methods import grounded_as, method_named
 from astra_data.reports.choice import SELECTED, Candidate, Judged
 from astra_data.reports.choice_page import select_page
 from astra_data.reports.runs import Reported
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
-from astra_data.training.policy_file import POLICY, PolicyFile, deploy
+from astra_data.training.policy_file import POLICY, PolicyFile, running
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.registry import task_named
 
 FOLDER = "select"
@@ -66,10 +66,10 @@ class Entry:
     policy: str
     grounding: str | None
 
-    def load(self, root: Path, task: str) -> DeployedPolicy:
+    def load(self, root: Path, task: str) -> RunningPolicy:
         """Return the policy, with the encoder of its own grounding."""
         model = load_grounding(root / self.grounding / GROUNDING) if self.grounding else NO_GROUNDING
-        return deploy(task_named(task), PolicyFile.load(root / self.policy / POLICY), model)
+        return running(task_named(task), PolicyFile.load(root / self.policy / POLICY), model)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.core.config import NotNegative, in_order
 from astra_data.core.seeding import derive, generator
-from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.task import Task
 
 _FORESIGHT_S = 1.0
@@ -129,16 +129,16 @@ class StressCommands(RandomCommands):
 class PolicyBehavior:
     """A policy that draws its actions from its distribution, as it does in training."""
 
-    def __init__(self, deployed: DeployedPolicy) -> None:
-        self._deployed = deployed
+    def __init__(self, running: RunningPolicy) -> None:
+        self._running = running
 
     def start(self, count: int, seed: int) -> None:
         """Begin new episodes of B = `count` robots."""
-        self._deployed.start(count, torch.Generator().manual_seed(derive(seed, "behavior")))
+        self._running.start(count, torch.Generator().manual_seed(derive(seed, "behavior")))
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
-        return self._deployed.act(state, goal)
+        return self._running.act(state, goal)
 
 
 class MixedBehavior:

@@ -10,8 +10,8 @@ from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.own_world import in_simulator, started
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.task import Task
 
@@ -65,7 +65,7 @@ class Judge:
         simulator = made.simulator(self.task, episodes, scatter=scatter)
         return SimulatorEnv(self.task.objective, simulator, topple=foresees)
 
-    def success(self, policy: DeployedPolicy, episodes: int, seed: int) -> float:
+    def success(self, policy: RunningPolicy, episodes: int, seed: int) -> float:
         """Return the share of so many episodes in which a policy succeeds; starts and goals are of `seed`."""
         begin = partial(started, policy, policy.act_in_simulator)
         outcome, _ = in_simulator(self.simulator(episodes), begin, self.task.objective.horizon, seed)

@@ -11,10 +11,10 @@ from torch import Tensor
 from astra_data.core.seeding import derive
 from astra_data.grounding.protocols import Grounding
 from astra_data.training.build_env import EnvParts, training_env
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.episode_record import EpisodeRecord, Outcome
-from astra_data.training.policy_file import PolicyFile, Simulation, deploy
+from astra_data.training.policy_file import PolicyFile, Simulation, running
 from astra_data.training.recorded_range import RecordedRange
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.task import Task
 
@@ -25,9 +25,9 @@ Begin = Callable[[Tensor], Act]
 _EPISODES = 100
 
 
-def started(deployed: DeployedPolicy, act: Act, goal: Tensor) -> Act:
+def started(policy: RunningPolicy, act: Act, goal: Tensor) -> Act:
     """Start a policy in as many episodes as there are goals (N, G), and return its `act`."""
-    deployed.start(len(goal))
+    policy.start(len(goal))
     return act
 
 
@@ -80,9 +80,9 @@ class Reached:
 def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
     """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions."""
     assert trained.simulation is not None
-    deployed = deploy(task, trained, grounding)
+    policy = running(task, trained, grounding)
     world = own_world(task, trained.simulation, grounding, _EPISODES)
-    begin = partial(started, deployed, deployed.act_in_simulator)
+    begin = partial(started, policy, policy.act_in_simulator)
     horizon = task.objective.horizon
     outcome, _ = in_simulator(world, begin, horizon, derive(seed, "trial in its own simulator"))
     steps = [steps for steps, success in zip(outcome.steps, outcome.success, strict=True) if success]

@@ -17,8 +17,8 @@ from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.training.build_env import EnvConfig
-from astra_data.training.deployment import DeployedPolicy, Observed
 from astra_data.training.own_policy import KINDS, OwnPolicy, SavedPolicy
+from astra_data.training.running_policy import Observed, RunningPolicy
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
@@ -155,19 +155,19 @@ def _put_together(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Polic
     return policy
 
 
-def deploy(
+def running(
     task: Task,
     trained: PolicyFile,
     grounding: Grounding = NO_GROUNDING,
     target_encoder: TargetEncoder | None = None,
-) -> DeployedPolicy:
+) -> RunningPolicy:
     """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s.
 
     Raises:
         BadInputError: it is of another task, or of another grounding.
     """
     world = trained.simulation.world if trained.simulation else EnvConfig()
-    deployed = DeployedPolicy(
+    made = RunningPolicy(
         task,
         trained.policy,
         grounding.encoder,
@@ -175,9 +175,9 @@ def deploy(
         command_limit_m_s=world.command_limit_m_s,
         observed=trained.observed,
     )
-    if deployed.observation_size != (taken := trained.policy.shape.observation_size):
+    if made.observation_size != (taken := trained.policy.shape.observation_size):
         raise BadInputError(
-            f"the policy takes {taken} values, {task.name} gives {deployed.observation_size}: expected a "
+            f"the policy takes {taken} values, {task.name} gives {made.observation_size}: expected a "
             "policy of this task and, if it was trained in a grounded simulator, its grounding"
         )
-    return deployed
+    return made

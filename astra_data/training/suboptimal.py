@@ -17,8 +17,8 @@ from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo, PpoConfig
 from astra_data.learning.sac import Sac, SacConfig
 from astra_data.training.behaviors import PolicyBehavior
-from astra_data.training.deployment import DeployedPolicy, Observed
 from astra_data.training.policy_file import PolicyFile
+from astra_data.training.running_policy import Observed, RunningPolicy
 from astra_data.training.target_env import ObservedTargetEnv
 from astra_data.worlds.task import Task
 
@@ -89,10 +89,10 @@ def suboptimal_by_sac(
     actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))
     config = _SAC.model_copy(update={"total_steps": steps})
     sac = Sac(world, actor, config, horizon=task.objective.horizon, seed=seed)
-    deployed = DeployedPolicy(task, actor, observed="full")
+    running = RunningPolicy(task, actor, observed="full")
 
     def judge(figures: Mapping[str, float]) -> tuple[float, str]:
-        lasted = _lasts(deployed, derive(seed, f"trial {sac.steps}"), num_threads)
+        lasted = _lasts(running, derive(seed, f"trial {sac.steps}"), num_threads)
         return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
 
     spent = _train(sac, world, judge, folder, progress)
@@ -128,12 +128,12 @@ def _train(
     return logbook.stopwatch.spent()
 
 
-def _lasts(deployed: DeployedPolicy, seed: int, num_threads: int | None) -> float:
+def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
     """Return how many steps episodes last on average with actions drawn from the policy.
 
     Training episodes would underestimate it: they began when the policy was worse.
     """
-    behavior, task = PolicyBehavior(deployed), deployed.task
+    behavior, task = PolicyBehavior(running), running.task
     env = task.target(_TRIALS, seed=derive(seed, "starts"), num_threads=num_threads)
     env.reset()
     behavior.start(_TRIALS, seed)

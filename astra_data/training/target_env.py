@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.training.deployment import Observed, target_observation
+from astra_data.training.running_policy import Observed, target_observation
 from astra_data.worlds.batched import Step
 from astra_data.worlds.task import Task
 

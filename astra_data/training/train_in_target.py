@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from astra_data.core.config import AtOnce, Config, Count, Number
-from astra_data.training.deployment import Observed
 from astra_data.training.policy_file import PolicyFile
+from astra_data.training.running_policy import Observed
 from astra_data.training.target_env import ObservedTargetEnv, TargetStarts
 from astra_data.training.train import Training, train_in
 

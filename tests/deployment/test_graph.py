@@ -27,7 +27,7 @@ from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.policy import PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 
@@ -60,7 +60,7 @@ def actor(observation_size: int, action_size: int = 2, **sizes: Any) -> ActorCri
     return lively(ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(8,), **sizes)))
 
 
-def policies() -> dict[str, DeployedPolicy]:
+def policies() -> dict[str, RunningPolicy]:
     torch.manual_seed(0)
     latent = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
@@ -68,13 +68,13 @@ def policies() -> dict[str, DeployedPolicy]:
     still = Task(**GIVEN | {"make_simulator": Speed, "objective": Stay(horizon=40)})
     whole = SoftActor(PolicyShape(33, 2, hidden_sizes=(8,)))
     return {
-        "feed-forward": DeployedPolicy(ANT, actor(8), command_limit_m_s=0.4),
-        "recurrent": DeployedPolicy(ANT, actor(8, memory_size=8), command_limit_m_s=0.4),
-        "source encoder": DeployedPolicy(ANT, actor(16), latent, command_limit_m_s=0.4),
-        "target encoder": DeployedPolicy(ANT, actor(16, memory_size=8), latent, aligned),
-        "adaptive": DeployedPolicy(ANT, lively(Student(rma))),
-        "full state": DeployedPolicy(ANT, whole, observed="full"),
-        "units, no goal": DeployedPolicy(still, actor(1, 1, memory_size=4)),
+        "feed-forward": RunningPolicy(ANT, actor(8), command_limit_m_s=0.4),
+        "recurrent": RunningPolicy(ANT, actor(8, memory_size=8), command_limit_m_s=0.4),
+        "source encoder": RunningPolicy(ANT, actor(16), latent, command_limit_m_s=0.4),
+        "target encoder": RunningPolicy(ANT, actor(16, memory_size=8), latent, aligned),
+        "adaptive": RunningPolicy(ANT, lively(Student(rma))),
+        "full state": RunningPolicy(ANT, whole, observed="full"),
+        "units, no goal": RunningPolicy(still, actor(1, 1, memory_size=4)),
     }
 
 
@@ -154,5 +154,5 @@ class Forgetful:
 def test_code_that_is_no_graph_is_named_in_one_line(abstraction: Any, told: str, tmp_path: Path) -> None:  # noqa: ANN401
     task = replace(CART, abstraction=abstraction)
     with pytest.raises(BadInputError, match=told) as raised:
-        write_graphs(DeployedPolicy(task, actor(2, 1)), tmp_path)
+        write_graphs(RunningPolicy(task, actor(2, 1)), tmp_path)
     assert "\n" not in str(raised.value)

@@ -11,14 +11,14 @@ from astra_data.deployment.folder import describe
 from astra_data.deployment.graph import write_graphs
 from astra_data.deployment.run_policy import RobotPolicy, run
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.running_policy import RunningPolicy
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("cart")
     torch.manual_seed(0)
-    deployed = DeployedPolicy(TASK, ActorCritic(ActorCriticShape(2, 1, memory_size=4)))
+    deployed = RunningPolicy(TASK, ActorCritic(ActorCriticShape(2, 1, memory_size=4)))
     written = write_graphs(deployed, made)
     (made / "policy.json").write_text(json.dumps(describe(deployed, written.parts)))
     return made

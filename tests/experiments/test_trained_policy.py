@@ -14,7 +14,7 @@ from astra_data.stages.collect import collect
 from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.train import train
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import PolicyFile, running
 from astra_data.worlds.registry import TASKS
 
 
@@ -37,7 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("row", ["astra_plus", "astra_task_reward"])
 def test_it_acts_as_the_artefacts_put_together_by_hand(row: str, run: Path) -> None:
-    by_hand = deploy(
+    by_hand = running(
         TASKS["antmaze-umaze"],
         PolicyFile.load(run / "train" / row / "seed_0/policy.safetensors"),
         load_grounding(run / "ground/astra/seed_0/grounding.safetensors"),

@@ -17,8 +17,8 @@ from astra_data.experiments.selecting import select
 from astra_data.experiments.trials import choose_by_trials
 from astra_data.reports.halving import halve
 from astra_data.reports.trials import TrialsFile
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
+from astra_data.training.running_policy import RunningPolicy
 
 pytestmark = pytest.mark.usefixtures("quick_failures")
 
@@ -42,7 +42,7 @@ class Tries:
     """In place of `in_target`: who was tried how often from which seed; succeeds as it is asked."""
 
     def __init__(self, *, breaks_at: int = 0, success: float = 1.0) -> None:
-        self.made: list[tuple[DeployedPolicy, int, int, dict[str, Any]]] = []
+        self.made: list[tuple[RunningPolicy, int, int, dict[str, Any]]] = []
         self.breaks_at, self.success = breaks_at, success
 
     def __call__(self, task: object, begin: Any, episodes: int, seed: int, **more: Any) -> Any:  # noqa: ANN401

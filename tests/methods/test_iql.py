@@ -17,7 +17,7 @@ from astra_data.learning.iql import IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import PolicyFile, running
 from astra_data.training.train import PpoTrainConfig, Training
 from astra_data.worlds.registry import TASKS
 
@@ -114,9 +114,9 @@ def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
     assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "0")
     assert [(point["steps"], point["success"]) for point in curve["points"]] == [(20, None)]
     assert curve["updates_per_second"] > 0
-    deployed = deploy(TASK, trained)
-    deployed.start(3)
-    assert deployed.act(torch.randn(3, 29), torch.randn(3, 2)).abs().max() <= 1.0
+    policy = running(TASK, trained)
+    policy.start(3)
+    assert policy.act(torch.randn(3, 29), torch.randn(3, 2)).abs().max() <= 1.0
 
 
 def test_fine_tuning_begins_with_the_given_policy(learn: Learn, given: PolicyFile, tmp_path: Path) -> None:

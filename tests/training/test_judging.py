@@ -16,9 +16,9 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.failure import FailureModel
 from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
 from astra_data.training import judging
-from astra_data.training.deployment import DeployedPolicy
 from astra_data.training.judging import Judge
-from astra_data.training.policy_file import PolicyFile, deploy
+from astra_data.training.policy_file import PolicyFile, running
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.protocols import PlacedSimulator
 
@@ -37,15 +37,15 @@ def judge(folder: Path) -> Judge:
 
 
 @pytest.fixture
-def policy(folder: Path, judge: Judge) -> DeployedPolicy:
-    return deploy(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
+def policy(folder: Path, judge: Judge) -> RunningPolicy:
+    return running(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
 
 
 @pytest.mark.parametrize("foresees", [True, False])
 def test_a_judge_ends_episodes_by_its_failure_model_or_else_scatters_states(
     foresees: bool,
     judge: Judge,
-    policy: DeployedPolicy,
+    policy: RunningPolicy,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = []
@@ -131,7 +131,7 @@ def test_a_judge_without_a_failure_model_gets_one_where_its_episodes_fail(
 
 
 def test_success_is_the_share_of_the_episodes(
-    judge: Judge, policy: DeployedPolicy, monkeypatch: pytest.MonkeyPatch
+    judge: Judge, policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A policy that drives on reaches every goal within the horizon, where nothing fails."""
     monkeypatch.setattr(judging, "HistoryGrounding", int)
@@ -140,5 +140,5 @@ def test_success_is_the_share_of_the_episodes(
         def act(_: object, state: object, goal: torch.Tensor, speed: float = speed) -> torch.Tensor:
             return goal * 0 + speed
 
-        monkeypatch.setattr(DeployedPolicy, "act_in_simulator", act)
+        monkeypatch.setattr(RunningPolicy, "act_in_simulator", act)
         assert judge.success(policy, 5, 0) == success

@@ -15,7 +15,7 @@ from astra_data.deployment.graph import write_graphs
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.own_policy import KINDS, Array
-from astra_data.training.policy_file import PolicyFile, add_policy_kind, deploy
+from astra_data.training.policy_file import PolicyFile, add_policy_kind, running
 from astra_data.training.train import PpoTrainConfig, Training
 from astra_data.training.watched_env import WatchedEnv
 
@@ -106,13 +106,13 @@ def test_the_same_seed_shows_it_the_same(tmp_path: Path) -> None:
 def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
     policy, _ = driving(0.25, 8)(training(tmp_path))
     policy.save(tmp_path / "policy.safetensors")
-    deployed = deploy(TASK, PolicyFile.load(tmp_path / "policy.safetensors"))
-    deployed.start(2)
-    assert deployed.act(torch.zeros(2, 2), torch.ones(2, 1)).tolist() == [[0.25], [0.25]]
+    read = running(TASK, PolicyFile.load(tmp_path / "policy.safetensors"))
+    read.start(2)
+    assert read.act(torch.zeros(2, 2), torch.ones(2, 1)).tolist() == [[0.25], [0.25]]
     with pytest.raises(
         BadInputError, match="Constant is a policy of another learner, which cannot be traced"
     ):
-        write_graphs(deployed, tmp_path)
+        write_graphs(read, tmp_path)
     del KINDS["constant"]
     with pytest.raises(BadInputError, match="found kind constant"):
         PolicyFile.load(tmp_path / "policy.safetensors")

@@ -13,7 +13,7 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.build_env import EnvConfig
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import in_simulator, own_world, started, trial
-from astra_data.training.policy_file import PolicyFile, Simulation, deploy
+from astra_data.training.policy_file import PolicyFile, Simulation, running
 from astra_data.training.recorded_range import RecordedRange
 
 SIMULATION = Simulation(None, torch.zeros(1, 1), EnvConfig())
@@ -51,7 +51,7 @@ def test_it_has_the_noise_that_it_was_trained_with() -> None:
 
 
 def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
-    acting = deploy(TASK, constant(1.0), NO_GROUNDING)
+    acting = running(TASK, constant(1.0), NO_GROUNDING)
     begin = partial(started, acting, acting.act_in_simulator)
     asked = RecordedRange(torch.tensor([0.0]), torch.tensor([2.0]), TASK.limits)
     runs = [

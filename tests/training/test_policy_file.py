@@ -15,7 +15,7 @@ from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.build_env import EnvConfig
-from astra_data.training.policy_file import PolicyFile, Simulation, deploy
+from astra_data.training.policy_file import PolicyFile, Simulation, running
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 
@@ -46,7 +46,7 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     assert torch.equal(loaded.policy.value(features), policy.value(features))
 
 
-def test_it_is_deployed_as_it_was_trained(tmp_path: Path) -> None:
+def test_it_runs_as_it_was_trained(tmp_path: Path) -> None:
     simulation = Simulation(None, torch.zeros(4, 4), EnvConfig(command_limit_m_s=0.7))
     policy = ActorCritic(ActorCriticShape(41, 2))
     PolicyFile(policy, simulation, None, None, "full").save(tmp_path / "policy.safetensors")
@@ -54,7 +54,7 @@ def test_it_is_deployed_as_it_was_trained(tmp_path: Path) -> None:
     assert loaded.simulation is not None and loaded.simulation.thinness is None
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
-    acting = deploy(TASKS["antmaze-umaze"], loaded, HistoryGrounding(model), aligned)
+    acting = running(TASKS["antmaze-umaze"], loaded, HistoryGrounding(model), aligned)
     assert (acting.command_limit_m_s, acting.observed) == (0.7, "full")
     assert acting.source_encoder is model and acting.target_encoder is aligned
 

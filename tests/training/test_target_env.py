@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.training.deployment import DeployedPolicy, Observed
+from astra_data.training.running_policy import Observed, RunningPolicy
 from astra_data.training.target_env import ObservedTargetEnv, TargetStarts
 from astra_data.worlds.registry import TASKS
 
@@ -83,7 +83,7 @@ def test_a_deployed_policy_sees_what_it_saw_in_training() -> None:
     env = world("full")
     observation = env.reset()
     policy = ActorCritic(ActorCriticShape(33, 2))
-    deployed = DeployedPolicy(TASK, policy, observed="full")
+    deployed = RunningPolicy(TASK, policy, observed="full")
     assert deployed.observation_size == 33
     deployed.start(4)
     expected, _ = policy.policy(observation)

@@ -6,7 +6,7 @@ from torch import Tensor
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.deployment import DeployedPolicy
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.simulator_env import policy_observation
 from astra_data.worlds.registry import TASKS
 
@@ -15,10 +15,10 @@ STATE, GOAL = torch.randn(3, 6, 29), torch.randn(3, 2)
 GOALS = GOAL[:, None].expand(3, 6, 2)
 
 
-def run(deployed: DeployedPolicy, *, in_simulator: bool = False) -> Tensor:
+def run(running: RunningPolicy, *, in_simulator: bool = False) -> Tensor:
     """Return the actions (B, T, A) for the states above, or for φ of them."""
-    deployed.start(3)
-    act = deployed.act_in_simulator if in_simulator else deployed.act
+    running.start(3)
+    act = running.act_in_simulator if in_simulator else running.act
     states = TASK.abstraction(STATE) if in_simulator else STATE
     return torch.stack([act(states[:, step], GOAL) for step in range(6)], dim=1)
 
@@ -39,8 +39,8 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)  # actions of some size
-    deployed = DeployedPolicy(TASK, policy, model, target if aligned else None)
-    actions = run(deployed, in_simulator=in_simulator)
+    running = RunningPolicy(TASK, policy, model, target if aligned else None)
+    actions = run(running, in_simulator=in_simulator)
     abstract = STATE[..., [0, 1, 15, 16]]
     if aligned and not in_simulator:
         latent, _ = target.encoder(target.encoder_input(STATE, GOALS, previous(actions)))
@@ -50,8 +50,7 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
     assert (
-        deployed.observation_size == 16
-        and DeployedPolicy(TASK, policy, observed="full").observation_size == 33
+        running.observation_size == 16 and RunningPolicy(TASK, policy, observed="full").observation_size == 33
     )
 
 
@@ -59,22 +58,22 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
 def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> None:
     torch.manual_seed(0)
     policy = ActorCritic(ActorCriticShape(observation_size=8, action_size=2, memory_size=8))
-    deployed = DeployedPolicy(TASK, policy)
-    actions = run(deployed)
+    running = RunningPolicy(TASK, policy)
+    actions = run(running)
     observation = policy_observation(TASK.objective, STATE[..., [0, 1, 15, 16]], GOALS, None)
     features = policy.remember_sequence(
         observation, previous(actions), policy.initial_hidden(3), torch.zeros(3, 6)
     )
     torch.testing.assert_close(actions, policy.policy(features)[0], atol=1e-5, rtol=0)
-    assert torch.equal(run(deployed), actions)
+    assert torch.equal(run(running), actions)
     drawn = []
     for seed in (1, 1, 2):
-        deployed.start(3, torch.Generator().manual_seed(seed))
-        begun = deployed.memory
-        drawn.append(deployed.act(STATE[:, 0], GOAL))
+        running.start(3, torch.Generator().manual_seed(seed))
+        begun = running.memory
+        drawn.append(running.act(STATE[:, 0], GOAL))
     assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
-    deployed.resume(begun)
-    assert torch.equal(deployed.act(STATE[:, 0], GOAL), actions[:, 0])
+    running.resume(begun)
+    assert torch.equal(running.act(STATE[:, 0], GOAL), actions[:, 0])
 
 
 @torch.no_grad()
@@ -84,8 +83,8 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
     policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2, memory_size=8))
     for layer in policy.actor.parameters():
         layer.mul_(20)  # actions of some size
-    deployed = DeployedPolicy(TASK, policy, model, command_limit_m_s=0.2)
-    actions = run(deployed)
+    running = RunningPolicy(TASK, policy, model, command_limit_m_s=0.2)
+    actions = run(running)
     assert actions.norm(dim=-1).max() <= 0.2 + 1e-6
     abstract = STATE[..., [0, 1, 15, 16]]
     latent, _ = model.encoder(model.encoder_input(abstract, GOALS, previous(actions)))
@@ -103,9 +102,9 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
 
 def test_commands_are_actions_in_their_units() -> None:
     policy = ActorCritic(ActorCriticShape(observation_size=2, action_size=1))
-    deployed = DeployedPolicy(RAIL_CART, policy)
+    running = RunningPolicy(RAIL_CART, policy)
     state, goal = torch.rand(4, 2), torch.rand(4, 1)
-    deployed.start(4)
-    action = deployed.act(state, goal)
-    deployed.start(4)
-    torch.testing.assert_close(deployed.command(state, goal), 1.5 + 2.5 * action)
+    running.start(4)
+    action = running.act(state, goal)
+    running.start(4)
+    torch.testing.assert_close(running.command(state, goal), 1.5 + 2.5 * action)

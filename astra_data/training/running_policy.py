@@ -42,7 +42,7 @@ class Memory(NamedTuple):
 
 
 @dataclass
-class DeployedPolicy:
+class RunningPolicy:
     """A policy that acts on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them.
 
     Attributes:
