@@ -42,7 +42,7 @@ _LONGEST = 300
 """Characters of an error message of a library that are shown."""
 
 
-def first_sentence(error: Exception) -> str:
+def in_short(error: Exception) -> str:
     """Return the first sentence of an error message, of bounded length and printable."""
     line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
     shown = "".join(sign if sign.isprintable() else "\ufffd" for sign in line)

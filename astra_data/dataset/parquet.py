@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from astra_data.core.errors import CorruptDatasetError, first_sentence
+from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import CHUNK_SIZE, COMPRESSIONS, DATA_FILE_SIZE_MB
 
@@ -102,7 +102,7 @@ def read_blocks(
                         groups, masks, rows = [], [], 0
         except UNREADABLE as error:
             name = f"{path.parent.name}/{path.name}"
-            raise CorruptDatasetError(f"{name} cannot be read ({first_sentence(error)})") from error
+            raise CorruptDatasetError(f"{name} cannot be read ({in_short(error)})") from error
 
 
 def read_arrays(

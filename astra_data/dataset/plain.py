@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from astra_data.core.errors import CorruptDatasetError, first_sentence
+from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import STATS_PATH, TASKS_PATH
@@ -142,7 +142,7 @@ def read_small_table(path: Path) -> pa.Table | str:
     except FileNotFoundError:
         return "is missing"
     except UNREADABLE as error:
-        return f"cannot be read ({first_sentence(error)})"
+        return f"cannot be read ({in_short(error)})"
 
 
 def read_footer(path: Path) -> tuple[int, pa.Schema] | str:
@@ -153,7 +153,7 @@ def read_footer(path: Path) -> tuple[int, pa.Schema] | str:
     except FileNotFoundError:
         return "is missing"
     except UNREADABLE as error:
-        return f"is truncated or no parquet file ({first_sentence(error)})"
+        return f"is truncated or no parquet file ({in_short(error)})"
 
 
 def data_files(root: Path) -> list[Path]:
@@ -179,7 +179,7 @@ def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
                 for batch in file.iter_batches(EPISODES_AT_ONCE):
                     yield from batch.to_pylist()
         except UNREADABLE as error:
-            raise CorruptDatasetError(f"{path.name} cannot be read ({first_sentence(error)})") from error
+            raise CorruptDatasetError(f"{path.name} cannot be read ({in_short(error)})") from error
 
 
 def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn]) -> Iterator[Run]:

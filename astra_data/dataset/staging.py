@@ -17,13 +17,7 @@ import pyarrow as pa
 
 from astra_data.core.disk import writing
 from astra_data.core.durable import discard, make_folder, move, remove_empty, sweep, sync, write_file
-from astra_data.core.errors import (
-    AstraDataError,
-    BadInputError,
-    CorruptDatasetError,
-    DiskError,
-    first_sentence,
-)
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
@@ -267,7 +261,7 @@ class StagedWriter:
                 values = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in self._columns}
         except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
             raise CorruptDatasetError(
-                f"{path} is no whole episode ({first_sentence(error)}); delete it and resume the recording."
+                f"{path} is no whole episode ({in_short(error)}); delete it and resume the recording."
             ) from error
         return Episode(metadata["uid"], values, metadata["metadata"])
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from astra_data.core.errors import BadInputError, first_sentence
+from astra_data.core.errors import BadInputError, in_short
 from astra_data.exchange.importers.csv import SUFFIXES
 
 Floats = NDArray[np.float64]
@@ -197,7 +197,7 @@ def _numbers(path: Path) -> dict[str, Floats]:
     except FileNotFoundError:
         raise BadInputError(f"{path}: there is no such file") from None
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path}: expected CSV with a header ({first_sentence(error)})") from None
+        raise BadInputError(f"{path}: expected CSV with a header ({in_short(error)})") from None
     fields = list(zip(table.column_names, table.columns, strict=True))
     for name, values in fields:
         if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):

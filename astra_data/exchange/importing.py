@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from astra_data.core.config import did_you_mean, load_recipe, validated
-from astra_data.core.errors import AstraDataError, BadInputError, first_sentence
+from astra_data.core.errors import AstraDataError, BadInputError, in_short
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
 from astra_data.dataset.versions import place
@@ -226,7 +226,7 @@ def _in_memory(episodes: Iterator[Cut]) -> Iterator[Cut]:
         yield from episodes
     except MemoryError as error:
         raise BadInputError(
-            f"an episode does not fit into memory ({first_sentence(error)}): cut it by [split] in the mapping"
+            f"an episode does not fit into memory ({in_short(error)}): cut it by [split] in the mapping"
         ) from error
 
 
@@ -243,7 +243,7 @@ def _explained(source: Source, file_format: str) -> Iterator[None]:
     except AstraDataError:
         raise
     except Exception as error:
-        message = first_sentence(error) or type(error).__name__
+        message = in_short(error) or type(error).__name__
         raise BadInputError(f"{source} cannot be read as {file_format}: {message}") from error
 
 

@@ -10,7 +10,7 @@ from typing import IO
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.digest import file_digest
-from astra_data.core.errors import BadInputError, first_sentence
+from astra_data.core.errors import BadInputError, in_short
 from astra_data.dataset.columns import Array
 
 BLOCK_ROWS = 2**13
@@ -141,7 +141,7 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
         with tarfile.open(archive) as opened:
             members = [member for member in opened if not member.isdir()]
     except (tarfile.TarError, OSError, EOFError, ValueError, ArithmeticError) as error:
-        raise BadInputError(f"{archive} cannot be read as an archive: {first_sentence(error)}") from error
+        raise BadInputError(f"{archive} cannot be read as an archive: {in_short(error)}") from error
     faults = []
     for member in members:
         path = PurePosixPath(member.name)

@@ -1,14 +1,14 @@
 import pytest
 
-from astra_data.core.errors import first_sentence
+from astra_data.core.errors import in_short
 
 
 def test_the_first_line_of_an_error_is_short_and_printable() -> None:
-    shown = first_sentence(ValueError(f"Expected 2 columns, got 1: \x1b[2J\0{'x' * 5000}\nand more"))
+    shown = in_short(ValueError(f"Expected 2 columns, got 1: \x1b[2J\0{'x' * 5000}\nand more"))
     assert shown.startswith("Expected 2 columns, got 1: ")
     assert shown.isprintable() and len(shown) < 400
 
 
 @pytest.mark.parametrize("message", ["One two. Three", "One two\nthree", "One two.", "One two:\nthree. Four"])
 def test_only_the_first_sentence_is_shown(message: str) -> None:
-    assert first_sentence(ValueError(message)) == "One two"
+    assert in_short(ValueError(message)) == "One two"
