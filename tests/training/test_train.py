@@ -148,8 +148,8 @@ class Counting:
     def state_dict(self) -> dict[str, Tensor]:
         return {"steps": torch.tensor(self.steps)}
 
-    def load_state_dict(self, state: dict[str, Tensor], observation: Tensor) -> None:
-        self.steps, self.observation = int(state["steps"]), observation
+    def load_state_dict(self, state: dict[str, Tensor], observation: Tensor, *, goes_on: bool) -> None:
+        self.steps, self.observation, self.goes_on = int(state["steps"]), observation, goes_on
 
 
 WHOLE = Ramp()
@@ -215,7 +215,7 @@ def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     again = Counting(env, lambda step: {"success": 0.5})
     again.total_steps = 12
     curve = optimise(cast(Learner, again), env, WHOLE, given)
-    assert again.scales == [1.0, 1.0]
+    assert again.scales == [1.0, 1.0] and again.goes_on
     assert torch.equal(again.observation, first.env.observe())
     assert [point["steps"] for point in curve["points"]] == list(range(1, 13))
     assert curve["simulator_steps_per_second"] == pytest.approx(2 / 0.5)
@@ -223,6 +223,16 @@ def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     ended.total_steps = 12
     curve = optimise(cast(Learner, ended), env, WHOLE, given)
     assert len(curve["points"]) == 12 and curve["simulator_steps_per_second"] is None
+
+
+def test_the_episodes_of_robots_do_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ToyWorld, "state_dict", lambda world: {})
+    monkeypatch.setattr(ToyWorld, "load_state_dict", lambda world, state: world.observe())
+    given = training(tmp_path)
+    counted(given, WHOLE, lambda step: {"success": 0.5})
+    again = Counting(ToyWorld(2), lambda step: {"success": 0.5})
+    optimise(cast(Learner, again), again.env, WHOLE, given)
+    assert again.steps == 10 and not again.goes_on
 
 
 def test_a_recipe_decides_the_reward_before_the_method(tmp_path: Path) -> None:
