@@ -203,9 +203,9 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
     score = first.headline
     rows = {
         method: {
-            size.percent: size.results.methods[method]
+            size.percent: _scored(row, score)
             for size in found.sizes
-            if method in size.results.methods
+            if (row := size.results.methods.get(method))
         }
         for method in found.methods()
     }
@@ -219,10 +219,7 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
     return data_efficiency(
         score,
         [size.percent for size in found.sizes],
-        {
-            method: {percent: _scored(row, score) for percent, row in of.items()}
-            for method, of in rows.items()
-        },
+        rows,
         covered,
         where(first),
     )

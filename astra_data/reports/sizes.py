@@ -8,12 +8,13 @@ from pydantic import Field
 
 from astra_data.reports.choice_page import named
 from astra_data.reports.cost_and_origin import provenance
+from astra_data.reports.costs import DATASET_STAGES
 from astra_data.reports.formatting import fill, interval, spread
 from astra_data.reports.schema import MethodResults, Results, Section
 from astra_data.reports.tested import warning, where
 from astra_data.worlds.score import Score
 
-SHARED_BY_SIZES = ("collect", "pair", "select")
+SHARED_BY_SIZES = (*(stage for stage in DATASET_STAGES if stage != "subset"), "select")
 """Stages that run once for all sizes."""
 
 

@@ -90,6 +90,7 @@ def report(
     read = _read(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
     percents = _made(recipe, root, known)
+    sized = [percent for percent in percents if percent is not None]
     sizes = [
         assemble(
             recipe.name,
@@ -117,10 +118,9 @@ def report(
             command=command,
             sizes=[
                 SizeResults(percent=percent, results=results)
-                for percent, results in zip(percents, sizes, strict=True)
-                if percent is not None
+                for percent, results in zip(sized, sizes, strict=True)
             ],
-            unfinished=[percent for percent in recipe.percents if percent not in percents],
+            unfinished=[percent for percent in recipe.percents if percent not in sized],
         )
         page, figures = partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
     else:
@@ -142,7 +142,6 @@ def report(
             )
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
-    sized = [percent for percent in percents if percent is not None]
     groundings = dict.fromkeys(grounding for results in sizes for grounding in results.gaps())
     foreseen = (root, list(groundings), recipe.seeds)
     rates = failure_rates(*foreseen, max(sized, default=None))

@@ -111,7 +111,7 @@ def _maps(panels: Sequence[Axes], visits: Sequence[Visits], label: str) -> None:
 def _band(axes: Axes, sizes: Mapping[int, Scored], method: str) -> None:
     percents = sorted(sizes)
     scored = [sizes[percent] for percent in percents]
-    low, high = (np.array([getattr(one, end) for one in scored]) for end in ("low", "high"))
+    low, high = [one.low for one in scored], [one.high for one in scored]
     colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
     if np.isfinite(low).all():
         axes.fill_between(percents, low, high, color=colour, alpha=0.18, lw=0)
