@@ -30,7 +30,6 @@ data_start_share = 0.5
 updates = 10
 batch_windows = 4
 window = 20
-held_out_share = 0.25
 
 [evaluate]
 episodes = 3

@@ -27,7 +27,6 @@ memory_size = 4
 updates = 2
 batch_windows = 2
 window = 5
-held_out_share = 0.25
 [evaluate]
 episodes = 3
 """

@@ -17,7 +17,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
 from astra_data.experiments.own_methods import OwnMethod, add_all
-from astra_data.experiments.recipe_tables import method_field, stage_field
+from astra_data.experiments.recipe_tables import method_field, plus_field, stage_field
 from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
 from astra_data.stages.registry import STAGES, Stage
@@ -104,16 +104,6 @@ class Recipe(Config):
         if tables.get("collect") is not None:
             raise ValueError("data: it takes the place of [collect]: leave out one of them")
         return tables | {"collect": None}
-
-    @field_validator("plus", mode="before", check_fields=False)
-    @classmethod
-    def _lay_over_train(cls, overrides: Any, info: ValidationInfo) -> Any:  # noqa: ANN401 - checked next
-        train = info.data.get("train")
-        if train is None or not isinstance(overrides, dict):
-            return overrides
-        if (asked := overrides.get("learner", train.learner)) != train.learner:
-            raise ValueError(f"learner: expected that of [train], '{train.learner}', got '{asked}'")
-        return train.model_dump() | overrides
 
     @field_validator("task")
     @classmethod
@@ -288,7 +278,7 @@ def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[T
     about = "The recipe of the settings that are not given here, and of the artefacts that do not change."
     fields["based_on"] = (str | None, Field(default=None, description=about))
     fields["sweep"] = (SweepConfig, SweepConfig())
-    fields["plus"] = fields["train"]
+    fields["plus"] = plus_field(*fields["train"])
     fields |= {table.name: method_field(table) for table in methods}
     return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import BeforeValidator, Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator
 
 from astra_data.core.errors import BadInputError
 from astra_data.methods.method import Table
@@ -18,9 +18,16 @@ def stage_field(stage: Stage) -> tuple[Any, Any]:
     """Return the type and the default of a stage's table."""
     if stage.name == "collect":
         return stage.config | None, _FILLED
+    if stage.name == "align":
+        return Annotated[stage.config, BeforeValidator(_held_out_as_in_ground)], _FILLED
     if stage.name == "select":
         return stage.config | None, Field(default=None, exclude_if=lambda table: table is None)
     return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
+
+
+def plus_field(train: Any, default: Any) -> tuple[Any, Any]:  # noqa: ANN401 - a type and a pydantic field
+    """Return the type and the default of the training of `_plus` rows, which is laid over `train`."""
+    return Annotated[train, BeforeValidator(_laid_over_train)], default
 
 
 def method_field(table: Table) -> tuple[Any, Any]:
@@ -28,6 +35,25 @@ def method_field(table: Table) -> tuple[Any, Any]:
     if table.ranges is None:
         return table.model, table.usual
     return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
+
+
+def _laid_over_train(overrides: object, info: ValidationInfo) -> object:
+    train = info.data.get("train")
+    if train is None or not isinstance(overrides, dict):
+        return overrides
+    if (asked := overrides.get("learner", train.learner)) != train.learner:
+        raise ValueError(f"learner: expected that of [train], '{train.learner}', got '{asked}'")
+    return train.model_dump() | overrides
+
+
+def _held_out_as_in_ground(align: object, info: ValidationInfo) -> object:
+    """Let alignment hold out the episodes that grounding does: it would be judged on what that trained on."""
+    ground = info.data.get("ground")
+    if ground is None or not isinstance(align, dict):
+        return align
+    if (asked := align.get("held_out_share", ground.held_out_share)) != ground.held_out_share:
+        raise ValueError(f"held_out_share: expected that of [ground], {ground.held_out_share}, got {asked}")
+    return {"held_out_share": ground.held_out_share} | align
 
 
 def _laid_over(ranges: Literal["randomized", "wide"]) -> Callable[..., Any]:

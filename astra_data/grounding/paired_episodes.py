@@ -54,6 +54,7 @@ class PairedEpisodes:
         commands: the bounds of the commands, where these are not ±1 in their own units.
         has_rewards: whether rewards were recorded; otherwise they are 0 here.
         uids: of the episodes, (E,) int64; None if they are from no dataset.
+        recordings: the number of the recording that each is, or is a copy of, (E,) int64; None: each its own.
     """
 
     target_state: Tensor
@@ -67,6 +68,7 @@ class PairedEpisodes:
     commands: Commands | None = None
     has_rewards: bool = True
     uids: Tensor | None = None
+    recordings: Tensor | None = None
 
     @property
     def named(self) -> dict[str, str]:
@@ -90,12 +92,12 @@ class PairedEpisodes:
         names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
         columns = dataset.columns(names)
         lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
-        uids = dataset.uids
+        uids, recordings = dataset.uids, _recordings(dataset)
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0
             held_out = held_out[left] if len(held_out) else held_out
-            uids, lengths = uids[left], lengths[left]
+            uids, lengths, recordings = uids[left], lengths[left], recordings[left]
         bounds = dataset.description["simulator"].get("commands")
         commands = Commands({name: tuple(ends) for name, ends in bounds.items()}) if bounds else None
         padded = {}
@@ -133,6 +135,7 @@ class PairedEpisodes:
             commands=commands,
             has_rewards=REWARD in padded,
             uids=torch.tensor(uids, device=device),
+            recordings=torch.tensor(recordings, device=device),
         )
 
     def check(self, commands: Commands) -> None:
@@ -166,12 +169,13 @@ class PairedEpisodes:
             windows=_gather(self.windows, episodes),
             held_out=None if self.held_out is None else self.held_out[episodes],
             uids=None if self.uids is None else self.uids[episodes],
+            recordings=None if self.recordings is None else self.recordings[episodes],
         )
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
         """Split into training and held-out episodes, as the dataset marks them, else at random.
 
-        Augmented datasets mark them: with a random split, copies of held-out episodes would be trained on.
+        At random, `held_out_share` of the recordings are held out, each with its copies.
 
         Raises:
             BadInputError: there are too few episodes, or all are held out.
@@ -183,17 +187,19 @@ class PairedEpisodes:
                     "held out: take a larger subset"
                 )
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
-        training, held_out = held_out_episodes(len(self), held_out_share, seed)
+        each = torch.arange(len(self)) if self.recordings is None else self.recordings
+        names, each = each.unique(return_inverse=True)
+        training, held_out = held_out_episodes(len(names), held_out_share, seed)
         if not len(training):
             raise BadInputError(
-                f"{self.reference} has {len(self)} episodes, of which {len(held_out)} would be held out: "
-                "expected more episodes, or a smaller held_out_share"
+                f"{self.reference} has {len(names)} recorded episodes, of which {len(held_out)} would be "
+                "held out: expected more episodes, or a smaller held_out_share"
             )
-        device = self.target_state.device
-        return (
-            self.select(torch.from_numpy(training).to(device)),
-            self.select(torch.from_numpy(held_out).to(device)),
-        )
+        return self._of_recordings(each, training), self._of_recordings(each, held_out)
+
+    def _of_recordings(self, each: Tensor, chosen: NDArray[np.intp]) -> "PairedEpisodes":
+        """Return the episodes whose recordings, of which `each` (E,) has the number, are `chosen` (n,)."""
+        return self.select(torch.cat([(each == recording).nonzero()[:, 0] for recording in chosen]))
 
     def steps(self, values: Tensor) -> Tensor:
         """Return the real steps of `values` (E, T, ...), one after another, (N, ...)."""
@@ -220,6 +226,14 @@ def _made_up(dataset: Dataset, columns: Mapping[str, Array]) -> NDArray[np.bool_
         after = after[dataset.lengths[ended].cumsum() - 1]
         made_up[ended] = [*map(stands_still, columns[STATE][last[ended]], after)]
     return made_up
+
+
+def _recordings(dataset: Dataset) -> NDArray[np.int64]:
+    """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
+    sources = dataset.metadata.get("source_episode", [None] * len(dataset))
+    numbers: dict[int, int] = {}
+    recorded = [uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True)]
+    return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
 
 
 def _merged(

@@ -40,7 +40,7 @@ class AlignConfig(DescentConfig):
     """Weight of the direct distance between paired latents; 0 is the paper's loss."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Share of the episodes that are held out to measure the agreement, unless the dataset sets some aside
-    itself; the same ones as in `ground`."""
+    itself. In a recipe that of `[ground]`, for these were not trained on there."""
 
 
 def align(

@@ -39,7 +39,6 @@ memory_size = 4
 updates = 2
 batch_windows = 4
 window = 5
-held_out_share = 0.25
 [evaluate]
 episodes = 3
 [report]

@@ -59,7 +59,6 @@ residual_noise = 1.0
 updates = 2
 batch_windows = 4
 window = 5
-held_out_share = 0.25
 [evaluate]
 episodes = 3
 """

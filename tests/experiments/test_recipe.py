@@ -79,6 +79,16 @@ def test_settings_are_those_of_the_rows_method_for_the_stage_that_takes_them() -
     assert recipe.settings_of("target", "ground") is recipe.settings_of("astra", "train") is None
 
 
+def test_alignment_holds_out_what_grounding_does() -> None:
+    assert read().align.held_out_share == read().ground.held_out_share
+    assert read(ground={"held_out_share": 0.3}).align.held_out_share == 0.3
+    both = {"held_out_share": 0.25}
+    assert read(ground=both, align=both | {"updates": 7}).align.updates == 7
+    message = r"align: held_out_share: expected that of \[ground\], 0.3, got 0.1"
+    with pytest.raises(RecipeError, match=message):
+        read(ground={"held_out_share": 0.3}, align={"held_out_share": 0.1})
+
+
 def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
     recipe = read(
         train={"num_envs": 8},

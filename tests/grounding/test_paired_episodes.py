@@ -41,7 +41,12 @@ SIZES = {STATE: 3, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
 
 
 def write(
-    folder: Path, sizes: dict[str, int], held_out: tuple[int, ...] | None = None, *, made_up: bool = False
+    folder: Path,
+    sizes: dict[str, int],
+    held_out: tuple[int, ...] | None = None,
+    *,
+    made_up: bool = False,
+    sources: dict[int, int] | None = None,
 ) -> Path:
     columns = [*(Column(name, size=size) for name, size in sizes.items()), *OUTCOME_COLUMNS]
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
@@ -60,7 +65,8 @@ def write(
                 values[NEXT_STATE] = values[STATE] + (~ended if made_up else np.ones(length))[:, None].astype(
                     np.float32
                 )
-            metadata = {} if held_out is None else {"held_out": episode in held_out}
+            metadata: dict[str, int] = {} if held_out is None else {"held_out": episode in held_out}
+            metadata |= {"source_episode": sources[episode]} if sources and episode in sources else {}
             writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}, metadata))
     return folder
 
@@ -168,8 +174,23 @@ def test_a_split_is_as_the_dataset_marks_it(tmp_path: Path) -> None:
     assert none.held_out is None
 
 
+def test_copies_are_held_out_with_their_recording(tmp_path: Path) -> None:
+    folder = write(tmp_path / "copies", SIZES, held_out=(), sources={1: 3, 2: 9, 4: 9})
+    episodes = PairedEpisodes.load(folder)
+    recorded = [{0}, {1, 3}, {2, 4}]
+    splits = [episodes.split(0.34, seed) for seed in range(9)]
+    numbers = [
+        [{int(start) // 100 - 1 for start in part.target_state[:, 0, 0]} for part in split]
+        for split in splits
+    ]
+    assert all(
+        held_out in recorded and training == {0, 1, 2, 3, 4} - held_out for training, held_out in numbers
+    )
+    assert {min(held_out) for _, held_out in numbers} == {0, 1, 2}
+
+
 def test_too_few_episodes_are_not_split(episodes: PairedEpisodes) -> None:
-    with pytest.raises(BadInputError, match="has 5 episodes, of which 5 would be held out"):
+    with pytest.raises(BadInputError, match="has 5 recorded episodes, of which 5 would be held out"):
         episodes.split(0.95, seed=0)
     one = episodes.select(torch.tensor([2]))
     assert len(one) == 1

@@ -78,7 +78,6 @@ policy_updates = 3
 updates = 5
 batch_windows = 4
 window = 20
-held_out_share = 0.25
 
 [evaluate]
 episodes = 2
