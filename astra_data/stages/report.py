@@ -1,7 +1,7 @@
 """Report: the results of all rows and seeds of a recipe, as results.json, .md, .html and figures."""
 
 import json
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,14 @@ from astra_data.reports.assembly import assemble
 from astra_data.reports.choice import SELECTED
 from astra_data.reports.command_replay import can_replay, replay_commands
 from astra_data.reports.eval_info import eval_info
-from astra_data.reports.files import Found, publish_results, published_figures, read_published, write_results
+from astra_data.reports.files import (
+    Found,
+    Page,
+    publish_results,
+    published_figures,
+    read_published,
+    write_results,
+)
 from astra_data.reports.held_out import failure_rates, foresight_lines
 from astra_data.reports.html_page import HTML, render_html
 from astra_data.reports.page import render
@@ -34,6 +41,8 @@ from astra_data.worlds.score import SUCCESS
 from astra_data.worlds.task import Task
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from astra_data.reports.drawing import Camera
 
 
@@ -82,19 +91,17 @@ def report(
             seeds.
         BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
-    from astra_data.reports.drawing import figure_of_sizes, figures_of
-    from astra_data.reports.figures import dynamics_mismatch, png, reliability
+    from astra_data.reports.figures import png, reliability
 
     for row in (*config.trajectory_methods, *config.paper_success):
         method_named(row)
     read = _read(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
-    percents = _made(recipe, root, known)
-    sized = [percent for percent in percents if percent is not None]
-    sizes = [
-        assemble(
+    task = task_named(recipe.task)
+    sizes = {
+        percent: assemble(
             recipe.name,
-            task_named(recipe.task).name,
+            task.name,
             tuple(recipe.methods),
             tuple(recipe.seeds),
             root=root,
@@ -103,59 +110,76 @@ def report(
             settings=recipe.settings,
             groundings=recipe.groundings,
             percent=percent,
-            scores=task_named(recipe.task).objective.scores,
+            scores=task.objective.scores,
             paper_success=config.paper_success,
             published=known.get(percent),
         )
-        for percent in percents
-    ]
-    progress(0.5, f"{len(sizes[0].methods)} rows, {len(sizes[0].seeds)} seeds")
+        for percent in _made(recipe, root, known)
+    }
+    first, last = next(iter(sizes.values())), next(reversed(sizes.values()))
+    progress(0.5, f"{len(first.methods)} rows, {len(first.seeds)} seeds")
+    sized = {percent: results for percent, results in sizes.items() if percent is not None}
     found: Found
     if recipe.percents:
-        found = SizesResults(
-            recipe=recipe.name,
-            task=task_named(recipe.task).name,
-            command=command,
-            sizes=[
-                SizeResults(percent=percent, results=results)
-                for percent, results in zip(sized, sizes, strict=True)
-            ],
-            unfinished=[percent for percent in recipe.percents if percent not in sized],
-        )
-        page, figures = partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
+        found, page, figures = _of_sizes(recipe, sized, task, command, root)
     else:
-        task = task_named(recipe.task)
-        found = sizes[0].model_copy(update={"stand_in": task.facts.get("stand_in")})
-        page = partial(render, found)
-        figures = figures_of(
-            found,
-            root,
-            maze=None if task.plane is None else task.maze,
-            camera=_camera(task),
-            trajectory_methods=config.trajectory_methods,
-            trajectory_episodes=config.trajectory_episodes,
-        )
-        if can_replay(task):
-            replay = replay_commands(task)
-            figures["mismatch"] = dynamics_mismatch(
-                replay.time_s, replay.command, replay.simulated, replay.target
-            )
+        found, page, figures = _of_one(first, task, root, config)
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
-    groundings = dict.fromkeys(grounding for results in sizes for grounding in results.gaps())
+    groundings = dict.fromkeys(grounding for results in sizes.values() for grounding in results.gaps())
     foreseen = (root, list(groundings), recipe.seeds)
     rates = failure_rates(*foreseen, max(sized, default=None))
     inlined = images | ({"reliability": png(reliability(rates))} if rates else {})
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
-        write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, sized)))
+        write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, [*sized])))
         if isinstance(found, Results) and found.headline == SUCCESS:
             write_file(folder / "eval_info.json", json.dumps(eval_info(found), indent=1))
         write_manifest(folder, read)
     if publish is not None:
         kept = {} if add_to is None else published_figures(publish, recipe.name)
         publish_results(found, page, kept | images, publish)
-    progress(1.0, _headline(sizes[-1]))
+    progress(1.0, _headline(last))
+
+
+def _of_sizes(
+    recipe: Reported, sized: Mapping[int, Results], task: Task, command: str, root: Path
+) -> tuple[SizesResults, Page, dict[str, "Figure"]]:
+    """Return the results of a sweep, how its page is written, and its figures."""
+    from astra_data.reports.drawing import figure_of_sizes
+
+    found = SizesResults(
+        recipe=recipe.name,
+        task=task.name,
+        command=command,
+        sizes=[SizeResults(percent=percent, results=results) for percent, results in sized.items()],
+        unfinished=[percent for percent in recipe.percents if percent not in sized],
+    )
+    return found, partial(render_sizes, found), {"data_efficiency": figure_of_sizes(found, root)}
+
+
+def _of_one(
+    results: Results, task: Task, root: Path, config: ReportConfig
+) -> tuple[Results, Page, dict[str, "Figure"]]:
+    """Return the results of one size, how their page is written, and their figures."""
+    from astra_data.reports.drawing import figures_of
+    from astra_data.reports.figures import dynamics_mismatch
+
+    found = results.model_copy(update={"stand_in": task.facts.get("stand_in")})
+    figures = figures_of(
+        found,
+        root,
+        maze=None if task.plane is None else task.maze,
+        camera=_camera(task),
+        trajectory_methods=config.trajectory_methods,
+        trajectory_episodes=config.trajectory_episodes,
+    )
+    if can_replay(task):
+        replay = replay_commands(task)
+        figures["mismatch"] = dynamics_mismatch(
+            replay.time_s, replay.command, replay.simulated, replay.target
+        )
+    return found, partial(render, found), figures
 
 
 def _read(recipe: Reported, root: Path) -> dict[str, str]:
