@@ -135,7 +135,6 @@ def collect(
     """
     world = task_named(task)
     plan = None if config.plan is None else Plan.load(config.plan, world)
-    episodes = config.episodes if plan is None else min(config.episodes, len(plan.episodes))
     description = _description(world, config, seed, name)
     folder = out or place(description)
     with StagedWriter(
@@ -158,37 +157,7 @@ def collect(
         stopwatch = Stopwatch(metadata.get("spent"))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
-        steps = 0
-        for first in range(0, episodes, config.num_envs):
-            rows = range(first, min(first + config.num_envs, episodes))
-            if config.least_steps and _steps_before(first, writer) >= config.least_steps:
-                break
-            if writer.staged.keys() >= set(rows):
-                continue
-            batch_seed = derive(seed, f"episodes from {first}") if first else seed
-            env = world.target(
-                len(rows),
-                seed=derive(batch_seed, "collect"),
-                start_anywhere=config.start == "anywhere",
-                num_threads=num_threads,
-                **({} if plan is None else {"starts": plan.starts[rows.start : rows.stop]}),
-            )
-            env.reset()
-            acting: Behavior = behavior
-            if isinstance(behavior, PlannedCommands | MixedBehavior):
-                acting = behavior.of(rows)
-            acting.start(len(rows), batch_seed)
-            batch = part(recording, rows.start / episodes, rows.stop / episodes)
-            steps += record(
-                world,
-                env,
-                acting,
-                rows,
-                writer,
-                max_steps=config.max_steps if plan is None else plan.longest,
-                seed=seed,
-                progress=batch,
-            )
+        steps = _record(world, config, plan, behavior, seed, writer, num_threads, recording)
         if config.least_steps:
             _keep(config.least_steps, writer)
         rate = steps / (time.perf_counter() - trained)
@@ -219,6 +188,49 @@ def _description(world: Task, config: CollectConfig, seed: int, name: str | None
         "seeds": {"collect": seed, "subset": derive(seed, "subset")},
         "environment": {"id": world.name, "timestep_s": world.timestep_s, **world.facts},
     }
+
+
+def _record(
+    world: Task,
+    config: CollectConfig,
+    plan: Plan | None,
+    behavior: Behavior,
+    seed: int,
+    writer: StagedWriter,
+    num_threads: int | None,
+    progress: Progress,
+) -> int:
+    """Record the episodes that `writer` lacks, `num_envs` at once; return the number of their steps."""
+    episodes = config.episodes if plan is None else min(config.episodes, len(plan.episodes))
+    steps = 0
+    for first in range(0, episodes, config.num_envs):
+        rows = range(first, min(first + config.num_envs, episodes))
+        if config.least_steps and _steps_before(first, writer) >= config.least_steps:
+            break
+        if writer.staged.keys() >= set(rows):
+            continue
+        batch_seed = derive(seed, f"episodes from {first}") if first else seed
+        env = world.target(
+            len(rows),
+            seed=derive(batch_seed, "collect"),
+            start_anywhere=config.start == "anywhere",
+            num_threads=num_threads,
+            **({} if plan is None else {"starts": plan.starts[rows.start : rows.stop]}),
+        )
+        env.reset()
+        acting = behavior.of(rows) if isinstance(behavior, PlannedCommands | MixedBehavior) else behavior
+        acting.start(len(rows), batch_seed)
+        steps += record(
+            world,
+            env,
+            acting,
+            rows,
+            writer,
+            max_steps=config.max_steps if plan is None else plan.longest,
+            seed=seed,
+            progress=part(progress, rows.start / episodes, rows.stop / episodes),
+        )
+    return steps
 
 
 def _steps_before(position: int, writer: StagedWriter) -> int:

@@ -99,13 +99,8 @@ def evaluate(
         [1.0, 1.0]
     """
     refuse_finished(out)
-    world, base = task_named(task), method_named(method)
-    if base.trains and policy is None:
-        raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
-    if not (base.trains or world.has_target):
-        raise BadInputError(f"method '{method}' acts in a target, and {world.name} has none")
-    if base.grounds and grounding is None:
-        raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
+    world = task_named(task)
+    _check(world, method, policy, grounding)
     stopwatch = Stopwatch()
     files = {
         "policy": policy / POLICY if isinstance(policy, Path) else None,
@@ -138,16 +133,8 @@ def evaluate(
         results |= figures
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
-    for name, simulator in simulators.items():
-        counted = asked if name == tested_in else None
-        outcome, start_goal = in_simulator(
-            simulator, row.begin, world.objective.horizon, derive(seed, "simulated evaluation"), counted
-        )
-        if name == tested_in:
-            tensors |= start_goal
-        results[name] = outcome.to_json()
-        if name in ("simulated", tested_in):
-            tensors[f"{name}.position"] = outcome.position
+    figures, paths = _tested_in_simulators(world, row.begin, simulators, tested_in, seed, asked)
+    results, tensors = results | figures, tensors | paths
     if asked is not None:
         results["beyond_recorded"] = asked.share
     with finished_folder(out) as folder:
@@ -159,6 +146,16 @@ def evaluate(
     first = world.objective.scores[0]
     where = "target" if world.has_target else f"{tested_in} simulator"
     progress(1.0, f"{first.title} in the {where} {first.text(fmean(results[tested_in][first.measure]))}")
+
+
+def _check(task: Task, method: str, policy: Path | PolicyFile | None, grounding: Path | None) -> None:
+    row = method_named(method)
+    if row.trains and policy is None:
+        raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
+    if not (row.trains or task.has_target):
+        raise BadInputError(f"method '{method}' acts in a target, and {task.name} has none")
+    if row.grounds and grounding is None:
+        raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
 
 
 @dataclass(frozen=True)
@@ -252,6 +249,28 @@ def _tested_in_target(
     tensors = {"target.position": headline.outcome.position} | headline.start_goal
     if task.photograph is not None:
         tensors["target.state"] = headline.filmed
+    return figures, tensors
+
+
+def _tested_in_simulators(
+    task: Task,
+    begin: Begin,
+    simulators: Mapping[str, SimulatorEnv],
+    tested_in: str,
+    seed: int,
+    asked: RecordedRange | None,
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Test a row in each simulator; return the figures, and paths and starts of those that are drawn."""
+    figures: dict[str, Any] = {}
+    tensors: dict[str, Tensor] = {}
+    for name, simulator in simulators.items():
+        counted = asked if name == tested_in else None
+        outcome, start_goal = in_simulator(
+            simulator, begin, task.objective.horizon, derive(seed, "simulated evaluation"), counted
+        )
+        figures[name] = outcome.to_json()
+        tensors |= start_goal if name == tested_in else {}
+        tensors |= {f"{name}.position": outcome.position} if name in ("simulated", tested_in) else {}
     return figures, tensors
 
 
