@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from astra_data.studies.motion import chained, composed
 from astra_data.studies.planar_walker import PlanarWalker
 from astra_data.studies.recordings import Piece
+from astra_data.studies.walking import WALKER
 
 FPS = 60
 LATE_ROWS = 20
@@ -40,7 +41,7 @@ def states(
 def piece(rows: int, seed: int, **robot: object) -> Piece:
     """Return a piece of the toy robot's walk."""
     action = actions(rows, seed)
-    return Piece("toy", states(action, **robot), action, np.zeros(rows, bool))  # type: ignore[arg-type]
+    return Piece("toy", states(action, **robot), action, np.zeros(rows, bool), WALKER)  # type: ignore[arg-type]
 
 
 def log(rows: int, seed: int) -> dict[str, list[list[float]]]:

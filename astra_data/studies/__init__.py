@@ -6,7 +6,7 @@ motion       planar motions in the body's frame: composed, inverted, mirrored
 planar_walker   the abstract simulator of a walking robot
 walking      a walking body in the plane, and which rows are walking
 joints       joints that are sent to targets, and their abstract simulator
-walks        pieces → control steps, paired with the abstract simulator; stretches of them
+sequences    pieces → control steps, paired with the abstract simulator; stretches of them
 models       the models that are compared, as page and figure show them
 predictors   the interface of a model; the raw simulator, and what is identified of it
 windows      ridge regression and a feed-forward network on the last H steps

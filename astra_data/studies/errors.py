@@ -12,8 +12,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
 from astra_data.studies.predictors import Predictor
 from astra_data.studies.rollouts import predict
+from astra_data.studies.sequences import Sequences, Stretch
 from astra_data.studies.walking import AXES, BODY_AXES
-from astra_data.studies.walks import Stretch, Walks
 
 Floats = NDArray[np.float64]
 
@@ -35,32 +35,33 @@ class Trial:
     horizons: tuple[int, ...]
 
     @classmethod
-    def of(cls, walks: Walks, history: int, horizons: Sequence[int]) -> "Trial":
-        """Start at every row of `walks` with a history before it; of too many, at `MOST_STARTS` evenly.
+    def of(cls, sequences: Sequences, history: int, horizons: Sequence[int]) -> "Trial":
+        """Start at every row of `sequences` with a history before it; of too many, at `MOST_STARTS` evenly.
 
         Raises:
-            BadInputError: the robot never walks for the shortest horizon after a history.
+            BadInputError: nowhere do all steps of the shortest horizon, after a history, count.
         """
-        sequence, step = walks.starts(history, min(horizons))
+        sequence, step = sequences.starts(history, min(horizons))
         if len(step) == 0:
             raise BadInputError(
-                f"expected walking after {history} control steps in a recording to test on, found none"
+                f"expected {min(horizons)} control steps that count, after {history} of any kind, in a "
+                "recording to test on, found none"
             )
         # In order of time, so that an even spacing covers every piece.
-        order = torch.argsort(walks.piece[sequence] * 10**6 + step, stable=True)
+        order = torch.argsort(sequences.piece[sequence] * 10**6 + step, stable=True)
         order = order[torch.linspace(0, len(order) - 1, min(len(order), MOST_STARTS)).long()]
         sequence, step = sequence[order], step[order]
-        stretch = walks.stretches(sequence, step, history, max(horizons))
-        return cls(stretch, walks.piece[sequence].numpy(), tuple(horizons))
+        stretch = sequences.stretches(sequence, step, history, max(horizons))
+        return cls(stretch, sequences.piece[sequence].numpy(), tuple(horizons))
 
     @torch.no_grad()
     def squared_errors(self, model: Predictor) -> Tensor:
-        """Return squared errors (N, K, E); NaN where the robot stops walking before the horizon."""
+        """Return squared errors (N, K, E); NaN where a step before the horizon does not count."""
         stretch, chosen = self.stretch, [horizon - 1 for horizon in self.horizons]
         predicted, true = predict(model, stretch)[:, chosen], stretch.body.chained(stretch.motion)[:, chosen]
         errors = stretch.body.wrong(predicted, true, stretch.heading).square()
-        walked = stretch.is_walking.long().cumprod(1)[:, chosen].bool()
-        return errors.masked_fill(~walked[..., None], torch.nan)
+        all_count = stretch.counts.long().cumprod(1)[:, chosen].bool()
+        return errors.masked_fill(~all_count[..., None], torch.nan)
 
 
 def summary(

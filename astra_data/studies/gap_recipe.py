@@ -7,8 +7,8 @@ from pydantic import Field, field_validator
 from astra_data.core.config import Config, Positive, did_you_mean
 from astra_data.studies.joints import JointsConfig
 from astra_data.studies.rollouts import FITS, FitConfig
+from astra_data.studies.sequences import StepsConfig
 from astra_data.studies.walking import WalkingConfig
-from astra_data.studies.walks import StepsConfig
 
 
 class GapRecipe(Config):

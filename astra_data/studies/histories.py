@@ -9,8 +9,7 @@ from astra_data.learning.networks.grounding import GroundingModel, GroundingShap
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.studies.body import Body
 from astra_data.studies.predictors import LEAST_DEVIATION, Predictor
-from astra_data.studies.walking import WALKER
-from astra_data.studies.walks import Stretch
+from astra_data.studies.sequences import Stretch
 from astra_data.studies.windows import WindowModel
 
 
@@ -27,7 +26,7 @@ class HistoryModel(Predictor):
         latent_size: int,
         head_sizes: tuple[int, ...],
         weights: LossWeights,
-        body: Body = WALKER,
+        body: Body,
         base: WindowModel | None = None,
     ) -> None:
         super().__init__()
@@ -47,9 +46,9 @@ class HistoryModel(Predictor):
         self.given_std: Tensor
 
     def set_scales(self, stretch: Stretch) -> None:
-        """Set the input scales from the histories, and the correction's from the future steps of walking."""
-        walked = stretch.is_walking
-        correction = (stretch.motion - stretch.simulated)[walked]
+        """Set the input scales from the histories, and the correction's from the future steps that count."""
+        counts = stretch.counts
+        correction = (stretch.motion - stretch.simulated)[counts]
         if self.base is not None:
             correction = self.base.residuals(stretch)
         nearer = self._nearer(stretch)
@@ -109,7 +108,7 @@ class HistoryModel(Predictor):
             reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
             goes_on=torch.ones_like(nearer),
             topples_soon=torch.zeros_like(nearer),
-            # Where the robot did not walk, the simulator's motion stands in: nothing to learn.
+            # Where steps do not count, the simulator's motion stands in: nothing to learn.
             mask=(motion != simulated)[:, 1:].any(-1).float(),
         )
         total, _ = self.grounding.losses(windows, replace(self.weights, state=0.0))

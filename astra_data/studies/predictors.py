@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.studies.motion import chained
-from astra_data.studies.walks import Stretch
+from astra_data.studies.sequences import Stretch
 
 LEAST_DEVIATION = 1e-6
 """Least deviation that inputs and corrections are divided by."""

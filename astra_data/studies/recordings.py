@@ -23,7 +23,6 @@ from astra_data.exchange.importing import import_dataset, log_suffixes
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import find_sources, is_archive
 from astra_data.studies.body import Body, Floats, Reading
-from astra_data.studies.walking import WALKER
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +35,14 @@ class Piece:
             and rad, of joints their positions.
         action: in each row, (N, A): of a walk (turn, forward, left, kick), of joints their targets; A is 0
             where no targets were recorded.
-        broken: rows that are not walking, (N,). body: what they are of.
+        broken: rows that do not count, (N,). body: what they are of.
     """
 
     recording: str
     state: Floats
     action: Floats
     broken: NDArray[np.bool_]
-    body: Body = WALKER
+    body: Body
 
     def __len__(self) -> int:
         """Return N."""
@@ -76,7 +75,7 @@ class Recording:
 
     @property
     def broken_share(self) -> float:
-        """Share of the rows that are not walking."""
+        """Share of the rows that do not count."""
         return float(sum(piece.broken.sum() for piece in self.pieces) / self.rows)
 
 

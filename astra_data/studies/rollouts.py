@@ -16,7 +16,7 @@ from astra_data.learning.networks.grounding import LossWeights
 from astra_data.studies.histories import HistoryModel
 from astra_data.studies.joints import Joints
 from astra_data.studies.predictors import Gains, Predictor, Response
-from astra_data.studies.walks import Stretch, Walks
+from astra_data.studies.sequences import Sequences, Stretch
 from astra_data.studies.windows import WindowModel
 
 STRENGTHS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -75,72 +75,76 @@ def rollout(model: Predictor, stretch: Stretch) -> Tensor:
     return torch.stack(places, dim=1)
 
 
-def fit(name: str, walks: Walks, history: int, config: FitConfig, seed: int, progress: Progress) -> Predictor:
-    """Fit the model `name` of `FITS` to `walks`, with a history of `history` steps.
+def fit(
+    name: str, sequences: Sequences, history: int, config: FitConfig, seed: int, progress: Progress
+) -> Predictor:
+    """Fit the model `name` of `FITS` to `sequences`, with a history of `history` steps.
 
     Raises:
-        BadInputError: there are too few steps of walking.
+        BadInputError: there are too few steps that count.
     """
     torch.manual_seed(derive(seed, f"walk model {name}"))
-    return FITS[name](walks, history, config, progress)
+    return FITS[name](sequences, history, config, progress)
 
 
-def _raw(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    return Gains(walks.body.motion_size)
+def _raw(sequences: Sequences, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    return Gains(sequences.body.motion_size)
 
 
-def _gains(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    model = Response(walks.body.motion_size) if isinstance(walks.body, Joints) else Gains()
-    model.fit(_sample(walks, history, config.steps))
+def _gains(sequences: Sequences, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    model = Response(sequences.body.motion_size) if isinstance(sequences.body, Joints) else Gains()
+    model.fit(_sample(sequences, history, config.steps))
     return model
 
 
-def _ridge(walks: Walks, history: int, config: FitConfig, progress: Progress) -> WindowModel:
+def _ridge(sequences: Sequences, history: int, config: FitConfig, progress: Progress) -> WindowModel:
     """Solve ridge regression with the penalty that is best on the last quarter of each sequence."""
-    sequence, step = _starts(walks, history, 1)
-    is_late = step > 0.75 * walks.lengths[sequence]
+    sequence, step = _starts(sequences, history, 1)
+    is_late = step > 0.75 * sequences.lengths[sequence]
     everything, early = (
-        walks.stretches(sequence[chosen], step[chosen], history, 1)
+        sequences.stretches(sequence[chosen], step[chosen], history, 1)
         for chosen in (torch.ones_like(is_late), ~is_late)
     )
-    late_sequence, late_step = walks.starts(history, config.steps)
-    is_late = late_step > 0.75 * walks.lengths[late_sequence]
-    test = walks.stretches(late_sequence[is_late], late_step[is_late], history, config.steps)
-    end = walks.body.chained(test.motion)[:, -1]
+    late_sequence, late_step = sequences.starts(history, config.steps)
+    is_late = late_step > 0.75 * sequences.lengths[late_sequence]
+    test = sequences.stretches(late_sequence[is_late], late_step[is_late], history, config.steps)
+    end = sequences.body.chained(test.motion)[:, -1]
     spread = end.std(0).clamp_min(_LEAST)
 
     def error(strength: float) -> float:
         model.solve(early, strength)
         return float(((predict(model, test)[:, -1] - end) / spread).square().mean())
 
-    model = WindowModel(history, body=walks.body).requires_grad_(False)
+    model = WindowModel(history, sequences.body).requires_grad_(False)
     model.set_scales(everything)
     can_choose = len(early) > 0 and len(test) > 1
     model.solve(everything, min(STRENGTHS, key=error) if can_choose else STRENGTHS[-1])
     return model
 
 
-def _mlp(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-    model = WindowModel(history, config.hidden_sizes, walks.body, _base(walks, history, config, progress))
-    model.set_scales(_sample(walks, history, 1))
-    return _descend(model, lambda stretch: torch.zeros(()), walks, history, config, progress)
+def _mlp(sequences: Sequences, history: int, config: FitConfig, progress: Progress) -> Predictor:
+    model = WindowModel(
+        history, sequences.body, config.hidden_sizes, _base(sequences, history, config, progress)
+    )
+    model.set_scales(_sample(sequences, history, 1))
+    return _descend(model, lambda stretch: torch.zeros(()), sequences, history, config, progress)
 
 
-def _base(walks: Walks, history: int, config: FitConfig, progress: Progress) -> WindowModel | None:
-    return _ridge(walks, history, config, progress) if config.start == "ridge" else None
+def _base(sequences: Sequences, history: int, config: FitConfig, progress: Progress) -> WindowModel | None:
+    return _ridge(sequences, history, config, progress) if config.start == "ridge" else None
 
 
-def _history_model(weights: LossWeights) -> Callable[[Walks, int, FitConfig, Progress], Predictor]:
-    def fitted(walks: Walks, history: int, config: FitConfig, progress: Progress) -> Predictor:
-        base = _base(walks, history, config, progress)
-        model = HistoryModel(config.latent_size, config.head_sizes, weights, walks.body, base)
-        model.set_scales(_sample(walks, history, 1))
-        return _descend(model, model.loss, walks, history, config, progress)
+def _history_model(weights: LossWeights) -> Callable[[Sequences, int, FitConfig, Progress], Predictor]:
+    def fitted(sequences: Sequences, history: int, config: FitConfig, progress: Progress) -> Predictor:
+        base = _base(sequences, history, config, progress)
+        model = HistoryModel(config.latent_size, config.head_sizes, weights, sequences.body, base)
+        model.set_scales(_sample(sequences, history, 1))
+        return _descend(model, model.loss, sequences, history, config, progress)
 
     return fitted
 
 
-FITS: dict[str, Callable[[Walks, int, FitConfig, Progress], Predictor]] = {
+FITS: dict[str, Callable[[Sequences, int, FitConfig, Progress], Predictor]] = {
     "raw": _raw,
     "gains": _gains,
     "ridge": _ridge,
@@ -148,29 +152,29 @@ FITS: dict[str, Callable[[Walks, int, FitConfig, Progress], Predictor]] = {
     "nas": _history_model(LossWeights(0.0, 0.0, 1.0)),
     "astra": _history_model(LossWeights(0.1, 1.0, 1.0)),
 }
-"""Name → fitting of the model to walks. λ of ASTRA as in the maze recipes."""
+"""Name → fitting of the model to sequences. λ of ASTRA as in the maze recipes."""
 
 _SAMPLE = 20_000
 
 
-def _sample(walks: Walks, history: int, steps: int) -> Stretch:
-    """Return at most `_SAMPLE` stretches with `steps` steps of walking, evenly spaced over all."""
-    sequence, step = _starts(walks, history, steps)
+def _sample(sequences: Sequences, history: int, steps: int) -> Stretch:
+    """Return at most `_SAMPLE` stretches with `steps` steps that count, evenly spaced over all."""
+    sequence, step = _starts(sequences, history, steps)
     chosen = torch.linspace(0, len(sequence) - 1, min(len(sequence), _SAMPLE)).long()
-    return walks.stretches(sequence[chosen], step[chosen], history, steps)
+    return sequences.stretches(sequence[chosen], step[chosen], history, steps)
 
 
-def _starts(walks: Walks, history: int, steps: int) -> tuple[Tensor, Tensor]:
-    """Return the starts of stretches to fit to, as `Walks.starts` does.
+def _starts(sequences: Sequences, history: int, steps: int) -> tuple[Tensor, Tensor]:
+    """Return the starts of stretches to fit to, as `Sequences.starts` does.
 
     Raises:
         BadInputError: there are fewer than two.
     """
-    sequence, step = walks.starts(history, steps)
+    sequence, step = sequences.starts(history, steps)
     if len(sequence) < 2:
         raise BadInputError(
-            f"expected stretches of {history} + {steps} steps of walking to fit to, found {len(sequence)}: "
-            "take longer recordings"
+            f"expected stretches of {history} + {steps} steps to fit to, the last of which count, found "
+            f"{len(sequence)}: take longer recordings"
         )
     return sequence, step
 
@@ -178,22 +182,22 @@ def _starts(walks: Walks, history: int, steps: int) -> tuple[Tensor, Tensor]:
 def _descend[M: (WindowModel, HistoryModel)](
     model: M,
     own_loss: Callable[[Stretch], Tensor],
-    walks: Walks,
+    sequences: Sequences,
     history: int,
     config: FitConfig,
     progress: Progress,
 ) -> M:
     """Fit by gradients: open-loop errors after 1, 2, ... steps in units of their spread, plus `own_loss`."""
-    chained = walks.body.chained
-    spread = chained(_sample(walks, history, config.steps).motion).std(0).clamp_min(_LEAST)
-    sequence, step = walks.starts(history, 1)
+    chained = sequences.body.chained
+    spread = chained(_sample(sequences, history, config.steps).motion).std(0).clamp_min(_LEAST)
+    sequence, step = sequences.starts(history, 1)
     descent = Descent(model, config, weight_decay=config.weight_decay)
     while not descent.is_over:
         chosen = torch.randint(len(sequence), (config.batch,))
-        stretch = walks.stretches(sequence[chosen], step[chosen], history, config.steps)
+        stretch = sequences.stretches(sequence[chosen], step[chosen], history, config.steps)
         stretch = stretch.mirrored(torch.rand(config.batch) < 0.5)
         # Errors after a jump within a stretch are undefined.
-        judged = stretch.is_walking.long().cumprod(1)[..., None].bool().expand_as(stretch.motion)
+        judged = stretch.counts.long().cumprod(1)[..., None].bool().expand_as(stretch.motion)
         error = (rollout(model, _noisy(stretch, config.noise)) - chained(stretch.motion)) / spread
         missed = error[judged].square().mean()
         descent.update(missed + own_loss(stretch))

@@ -21,7 +21,7 @@ from astra_data.studies.errors import Trial, summary
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import Piece, Recording
 from astra_data.studies.rollouts import fit
-from astra_data.studies.walks import Walks
+from astra_data.studies.sequences import Sequences
 
 LEARNED = ("mlp", "nas", "astra")
 """Models that depend on the seed even with all the data."""
@@ -185,25 +185,25 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     rounded = [max(1, round(seconds / step_s)) for seconds in recipe.horizons_s]
     horizons = tuple(dict.fromkeys([1, *rounded]))
     horizons_s = [horizon * step_s for horizon in horizons]
-    trial = Trial.of(Walks.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
+    trial = Trial.of(Sequences.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
     body = trial.stretch.body
     fits = list(_fits(recipe, case, fps))
     squared: dict[float, dict[str, list[Any]]] = {}
-    walks: dict[tuple[float, int], Walks] = {}
+    drawn_once: dict[tuple[float, int], Sequences] = {}
     cpu_seconds = 0.0
     for number, (minutes, name, seed) in enumerate(fits):
         size = "all" if minutes == fits[0][0] else f"{minutes:g}_min"
         path = folder / name / size / f"seed_{seed}.safetensors"
         if not path.exists():
             drawn = (minutes, recipe.seeds[0] if size == "all" else seed)
-            if drawn not in walks:
+            if drawn not in drawn_once:
                 rows = max(1, round(minutes * 60 * fps))
                 pieces = case.training if size == "all" else shortened(case.training, rows, seed)
-                walks[drawn] = Walks.of_pieces(pieces, fps, steps_config)
+                drawn_once[drawn] = Sequences.of_pieces(pieces, fps, steps_config)
             share = part(progress, number / len(fits), (number + 1) / len(fits))
             _fit_one(
                 name,
-                walks[drawn],
+                drawn_once[drawn],
                 recipe,
                 seed,
                 trial,
@@ -227,14 +227,14 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         }
         for minutes, models in sorted(squared.items())
     ]
-    walked = trial.stretch.is_walking.long().cumprod(1)[:, [horizon - 1 for horizon in horizons]]
+    all_count = trial.stretch.counts.long().cumprod(1)[:, [horizon - 1 for horizon in horizons]]
     return {
         "name": case.name,
         "title": case.title,
         "axes": list(body.axes),
         "judged": list(body.judged),
         "horizons_s": horizons_s,
-        "starts": walked.sum(0).tolist(),
+        "starts": all_count.sum(0).tolist(),
         "pieces": len(np.unique(trial.piece)),
         "test_minutes": sum(map(len, case.test)) / fps / 60,
         "fit_cpu_seconds": cpu_seconds,
@@ -246,11 +246,17 @@ _ERRORS = "squared_error"
 
 
 def _fit_one(
-    name: str, walks: Walks, recipe: GapRecipe, seed: int, trial: Trial, path: Path, progress: Progress
+    name: str,
+    sequences: Sequences,
+    recipe: GapRecipe,
+    seed: int,
+    trial: Trial,
+    path: Path,
+    progress: Progress,
 ) -> None:
     """Fit a model, test it, and write both its weights and its errors to `path`."""
     stopwatch = Stopwatch()
-    model = fit(name, walks, recipe.steps.history, recipe.fit, seed, progress)
+    model = fit(name, sequences, recipe.steps.history, recipe.fit, seed, progress)
     tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"model": name, "seed": seed, **stopwatch.spent()}

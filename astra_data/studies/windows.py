@@ -6,8 +6,7 @@ from torch import Tensor, nn
 from astra_data.learning.networks.history import mlp
 from astra_data.studies.body import Body
 from astra_data.studies.predictors import LEAST_DEVIATION, Predictor
-from astra_data.studies.walking import WALKER
-from astra_data.studies.walks import Stretch
+from astra_data.studies.sequences import Stretch
 
 
 class WindowModel(Predictor):
@@ -20,8 +19,8 @@ class WindowModel(Predictor):
     def __init__(
         self,
         history: int,
+        body: Body,
         hidden_sizes: tuple[int, ...] = (),
-        body: Body = WALKER,
         base: "WindowModel | None" = None,
     ) -> None:
         super().__init__()
@@ -46,8 +45,8 @@ class WindowModel(Predictor):
         self.seen_std: Tensor
 
     def set_scales(self, stretch: Stretch) -> None:
-        """Set the scales from the future steps of walking."""
-        motion, simulated = (values[stretch.is_walking] for values in (stretch.motion, stretch.simulated))
+        """Set the scales from the future steps that count."""
+        motion, simulated = (values[stretch.counts] for values in (stretch.motion, stretch.simulated))
         self.motion_std.copy_(motion.std(0).clamp_min(LEAST_DEVIATION))
         self.motion_mean.copy_(motion.mean(0) * motion.new_tensor(self.body.usual_motion))
         self.correction_std.copy_((motion - simulated).std(0).clamp_min(LEAST_DEVIATION))

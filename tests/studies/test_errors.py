@@ -5,8 +5,8 @@ from toy_walks import FPS, piece
 
 from astra_data.studies.errors import Trial, summary
 from astra_data.studies.predictors import Gains
+from astra_data.studies.sequences import Sequences, StepsConfig
 from astra_data.studies.walking import AXES
-from astra_data.studies.walks import StepsConfig, Walks
 
 CONFIG = StepsConfig(rows=10, history=4)
 
@@ -14,7 +14,7 @@ CONFIG = StepsConfig(rows=10, history=4)
 def test_errors_are_taken_in_the_bodys_and_the_fields_frame() -> None:
     walk = piece(400, 0)
     walk.broken[200] = True
-    trial = Trial.of(Walks.of_pieces([walk], FPS, CONFIG), 4, (1, 3))
+    trial = Trial.of(Sequences.of_pieces([walk], FPS, CONFIG), 4, (1, 3))
     errors = trial.squared_errors(Gains()).double()
     assert errors.shape[1:] == (2, 5)
     torch.testing.assert_close(errors[..., :2].sum(-1), errors[..., 3:].sum(-1), equal_nan=True)
@@ -24,11 +24,11 @@ def test_errors_are_taken_in_the_bodys_and_the_fields_frame() -> None:
 
 
 def test_of_too_many_starts_an_even_share_of_all_pieces_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    walks = Walks.of_pieces([piece(400, seed) for seed in range(3)], FPS, CONFIG)
-    every = Trial.of(walks, 4, (1,))
+    sequences = Sequences.of_pieces([piece(400, seed) for seed in range(3)], FPS, CONFIG)
+    every = Trial.of(sequences, 4, (1,))
     assert len(every.piece) > 300
     monkeypatch.setattr("astra_data.studies.errors.MOST_STARTS", 30)
-    some = Trial.of(walks, 4, (1,))
+    some = Trial.of(sequences, 4, (1,))
     assert len(some.piece) == 30 and np.bincount(some.piece).min() >= 9
 
 

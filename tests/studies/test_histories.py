@@ -6,30 +6,30 @@ from toy_walks import FPS, piece
 
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.studies.histories import HistoryModel
-from astra_data.studies.walking import bounded
-from astra_data.studies.walks import StepsConfig, Stretch, Walks
+from astra_data.studies.sequences import Sequences, StepsConfig, Stretch
+from astra_data.studies.walking import WALKER, bounded
 
 HISTORY = 5
 
 
 @pytest.fixture(scope="module")
 def stretch() -> Stretch:
-    walks = Walks.of_pieces([piece(600, 0)], FPS, StepsConfig(rows=10, history=HISTORY))
-    return walks.stretches(*walks.starts(HISTORY, 3), HISTORY, 3)
+    sequences = Sequences.of_pieces([piece(600, 0)], FPS, StepsConfig(rows=10, history=HISTORY))
+    return sequences.stretches(*sequences.starts(HISTORY, 3), HISTORY, 3)
 
 
 def model_of(stretch: Stretch, weights: LossWeights | None = None) -> HistoryModel:
     torch.manual_seed(0)
-    model = HistoryModel(8, (16,), weights or LossWeights(0.1, 1.0, 1.0))
+    model = HistoryModel(8, (16,), weights or LossWeights(0.1, 1.0, 1.0), WALKER)
     model.set_scales(stretch)
     return model
 
 
 def test_scales_come_from_histories_and_from_steps_of_walking_ahead(stretch: Stretch) -> None:
-    walking = torch.ones_like(stretch.is_walking)
+    walking = torch.ones_like(stretch.counts)
     walking[::3] = False
     wild = torch.where(walking[..., None], stretch.motion, torch.full_like(stretch.motion, 50.0))
-    model = model_of(replace(stretch, motion=wild, is_walking=walking)).grounding
+    model = model_of(replace(stretch, motion=wild, counts=walking)).grounding
     torch.testing.assert_close(model.state_std, stretch.past_motion.flatten(0, 1).std(0).clamp_min(1e-3))
     correction = (stretch.motion - stretch.simulated)[walking]
     torch.testing.assert_close(model.correction_std, correction.std(0).clamp_min(1e-3))

@@ -16,7 +16,7 @@ from astra_data.studies.joints import ALL, Joints, JointsConfig
 from astra_data.studies.predictors import Response
 from astra_data.studies.recordings import read_recordings
 from astra_data.studies.rollouts import FitConfig, fit, predict
-from astra_data.studies.walks import StepsConfig, Stretch, Walks
+from astra_data.studies.sequences import Sequences, StepsConfig, Stretch
 
 CONFIG = StepsConfig(rows=4, history=6)
 QUICK = FitConfig(
@@ -30,12 +30,12 @@ QUICK = FitConfig(
     head_sizes=(16,),
     hidden_sizes=(16,),
 )
-WALKS = Walks.of_pieces([piece(1600, seed) for seed in range(2)], FPS, CONFIG)
-TEST = Trial.of(Walks.of_pieces([piece(1200, 7)], FPS, CONFIG), 6, (1, 10))
+SEQUENCES = Sequences.of_pieces([piece(1600, seed) for seed in range(2)], FPS, CONFIG)
+TEST = Trial.of(Sequences.of_pieces([piece(1200, 7)], FPS, CONFIG), 6, (1, 10))
 
 
 def error(name: str, config: FitConfig = QUICK) -> float:
-    errors = TEST.squared_errors(fit(name, WALKS, 6, config, 0, silent))
+    errors = TEST.squared_errors(fit(name, SEQUENCES, 6, config, 0, silent))
     return float(errors[:, 1, 0].nanmean().sqrt())
 
 
@@ -54,7 +54,7 @@ def exact(weights: tuple[float, float, float]) -> Stretch:
         action=target,
         simulated=target - seen,
         motion=motion,
-        is_walking=torch.ones(200, 1, dtype=torch.bool),
+        counts=torch.ones(200, 1, dtype=torch.bool),
         heading=torch.zeros(200),
         body=joints,
     )
@@ -88,7 +88,7 @@ def test_steps_hold_mean_targets_and_the_change_of_position() -> None:
 def test_predictions_know_nothing_of_the_positions_to_come() -> None:
     """Commands of later steps are relative to where the joint was recorded; open loop it is elsewhere."""
     stretch = TEST.stretch
-    model = fit("gains", WALKS, 6, QUICK, 0, silent)
+    model = fit("gains", SEQUENCES, 6, QUICK, 0, silent)
     found = predict(model, stretch)
     elsewhere = replace(stretch, motion=stretch.motion + 1, simulated=stretch.simulated + 1)
     torch.testing.assert_close(predict(model, elsewhere), found)
@@ -140,10 +140,10 @@ def test_networks_begin_with_ridge_regression_and_learn_what_it_lacks(name: str)
 @pytest.mark.parametrize("name", ["raw", "gains", "ridge", "mlp", "nas", "astra"])
 def test_joints_without_targets_are_predicted_from_their_past(name: str) -> None:
     pieces = [piece(800, seed, has_targets=False) for seed in range(2)]
-    walks = Walks.of_pieces(pieces, FPS, CONFIG)
+    sequences = Sequences.of_pieces(pieces, FPS, CONFIG)
     short = FitConfig(**{**QUICK.model_dump(), "updates": 2})
-    errors = Trial.of(walks, 6, (1,)).squared_errors(fit(name, walks, 6, short, 0, silent))
-    still = float(walks.motion.square().mean())
+    errors = Trial.of(sequences, 6, (1,)).squared_errors(fit(name, sequences, 6, short, 0, silent))
+    still = float(sequences.motion.square().mean())
     assert float(errors[..., 0].mean()) <= (1.05 if name == "raw" else 0.3) * still
 
 
@@ -173,7 +173,7 @@ def test_a_single_joint_and_a_log_without_joints(tmp_path: Path) -> None:
     mapping.write_text(f'{head}[columns."observation.state"]\nfields = ["dof_pos"]\ntake = [1]\n')
     [one] = read_recordings(tmp_path / "log.pt", mapping, tmp_path / "home", JointsConfig())
     assert one.pieces[0].state.shape == (len(one.pieces[0]) + 1, 1)
-    found = Walks.of_pieces(one.pieces, one.fps, CONFIG)
+    found = Sequences.of_pieces(one.pieces, one.fps, CONFIG)
     assert found.motion.shape[-1] == 1
     mapping.write_text(f'{head}[columns.action]\nfields = ["des_dof_pos"]\n')
     with pytest.raises(BadInputError, match=r"expected joints in observation\.state, found no such column"):
@@ -183,6 +183,6 @@ def test_a_single_joint_and_a_log_without_joints(tmp_path: Path) -> None:
 def test_joints_that_respond_late_cover_the_share_of_a_control_step() -> None:
     """Not that of a row, nor of a second: 4 rows at 400 Hz are 10 ms, a tenth of the time constant."""
     slow = replace(piece(400, 0), body=Joints.named(NAMES, has_targets=True, time_constant_s=0.1))
-    walks = Walks.of_pieces([slow], FPS, CONFIG)
-    away = walks.action - walks.seen[:, :-1]
-    torch.testing.assert_close(walks.simulated[:, :99], (1 - math.exp(-0.1)) * away[:, :99])
+    sequences = Sequences.of_pieces([slow], FPS, CONFIG)
+    away = sequences.action - sequences.seen[:, :-1]
+    torch.testing.assert_close(sequences.simulated[:, :99], (1 - math.exp(-0.1)) * away[:, :99])

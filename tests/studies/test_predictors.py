@@ -7,16 +7,16 @@ from toy_walks import FPS, piece
 
 from astra_data.studies.motion import chained
 from astra_data.studies.predictors import Gains
-from astra_data.studies.walking import HALF_SEEN_M, bounded
-from astra_data.studies.walks import StepsConfig, Stretch, Walks
+from astra_data.studies.sequences import Sequences, StepsConfig, Stretch
+from astra_data.studies.walking import HALF_SEEN_M, WALKER, bounded
 
 CONFIG = StepsConfig(rows=10, history=4)
 
 
 @pytest.fixture(scope="module")
 def stretch() -> Stretch:
-    walks = Walks.of_pieces([piece(400, 0)], FPS, CONFIG)
-    return walks.stretches(*walks.starts(4, 3), 4, 3)
+    sequences = Sequences.of_pieces([piece(400, 0)], FPS, CONFIG)
+    return sequences.stretches(*sequences.starts(4, 3), 4, 3)
 
 
 def test_a_ball_is_seen_in_its_direction_and_nearer_than_one() -> None:
@@ -77,8 +77,9 @@ def test_gains_that_the_walk_was_made_with_are_found() -> None:
         action=blank,
         simulated=simulated,
         motion=simulated * gains,
-        is_walking=torch.ones(50, 3, dtype=torch.bool),
+        counts=torch.ones(50, 3, dtype=torch.bool),
         heading=torch.full((50,), math.pi),
+        body=WALKER,
     )
     model = Gains()
     model.fit(made)

@@ -7,7 +7,7 @@ from astra_data.studies.errors import Trial
 from astra_data.studies.motion import MIRROR
 from astra_data.studies.predictors import Gains
 from astra_data.studies.rollouts import FITS, FitConfig, fit, predict
-from astra_data.studies.walks import StepsConfig, Walks
+from astra_data.studies.sequences import Sequences, StepsConfig
 
 CONFIG = StepsConfig(rows=10, history=4)
 QUICK = FitConfig(
@@ -20,24 +20,24 @@ QUICK = FitConfig(
     head_sizes=(16,),
     hidden_sizes=(32,),
 )
-TEST = Trial.of(Walks.of_pieces([piece(900, 10)], FPS, CONFIG), 4, (1, 6))
-WALKS = Walks.of_pieces([piece(1200, seed) for seed in range(2)], FPS, CONFIG)
+TEST = Trial.of(Sequences.of_pieces([piece(900, 10)], FPS, CONFIG), 4, (1, 6))
+SEQUENCES = Sequences.of_pieces([piece(1200, seed) for seed in range(2)], FPS, CONFIG)
 
 
 def error(name: str) -> torch.Tensor:
-    model = fit(name, WALKS, 4, QUICK, 0, silent)
+    model = fit(name, SEQUENCES, 4, QUICK, 0, silent)
     return TEST.squared_errors(model)[:, 1, :3].nanmean(0).sqrt()
 
 
 def test_the_raw_simulator_predicts_a_robot_that_follows_commands_at_once() -> None:
-    walks = Walks.of_pieces([piece(300, 0, gains=(1.0, 1.0, 1.0), late_rows=0)], FPS, CONFIG)
-    errors = Trial.of(walks, 4, (1, 5)).squared_errors(Gains())
+    sequences = Sequences.of_pieces([piece(300, 0, gains=(1.0, 1.0, 1.0), late_rows=0)], FPS, CONFIG)
+    errors = Trial.of(sequences, 4, (1, 5)).squared_errors(Gains())
     assert errors.nan_to_num().max() < 1e-8
 
 
 def test_gains_are_found() -> None:
-    walks = Walks.of_pieces([piece(1200, 0, late_rows=0)], FPS, CONFIG)
-    model = fit("gains", walks, 4, QUICK, 0, silent)
+    sequences = Sequences.of_pieces([piece(1200, 0, late_rows=0)], FPS, CONFIG)
+    model = fit("gains", sequences, 4, QUICK, 0, silent)
     assert isinstance(model, Gains)
     # The toy scales what the simulator does in a row, in which an arc is nearly straight.
     torch.testing.assert_close(model.gains, torch.tensor(GAINS), atol=0.02, rtol=0)
@@ -58,7 +58,7 @@ def test_networks_learn_that_the_robot_is_late(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(FITS))
 def test_left_and_right_are_alike(name: str) -> None:
     short = FitConfig(**{**QUICK.model_dump(), "updates": 3})
-    model = fit(name, WALKS, 4, short, 0, silent)
+    model = fit(name, SEQUENCES, 4, short, 0, silent)
     stretch = TEST.stretch
     torch.testing.assert_close(
         predict(model, stretch) * torch.tensor(MIRROR), predict(model, stretch.mirrored()), atol=1e-5, rtol=0
@@ -67,5 +67,5 @@ def test_left_and_right_are_alike(name: str) -> None:
 
 def test_one_seed_gives_one_model() -> None:
     short = FitConfig(**{**QUICK.model_dump(), "updates": 5})
-    first, second = (fit("astra", WALKS, 4, short, 1, silent).state_dict() for _ in range(2))
+    first, second = (fit("astra", SEQUENCES, 4, short, 1, silent).state_dict() for _ in range(2))
     assert all(torch.equal(first[key], second[key]) for key in first)

@@ -14,8 +14,8 @@ from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.predictors import Gains
 from astra_data.studies.recordings import Piece, Recording
 from astra_data.studies.rollouts import FitConfig
+from astra_data.studies.sequences import Sequences, StepsConfig
 from astra_data.studies.study import cases, run_study, shortened
-from astra_data.studies.walks import StepsConfig, Walks
 
 STEPS = StepsConfig(rows=10, history=4)
 
@@ -95,7 +95,7 @@ def test_errors_are_those_of_the_fitted_models_and_fits_are_kept(tmp_path: Path)
     (case,) = found["cases"]
     small, whole = case["sizes"]
     assert (small["minutes"], whole["minutes"]) == pytest.approx((0.1, 1200 / FPS / 60))
-    trial = Trial.of(Walks.of_pieces(A.pieces, FPS, STEPS), 4, (1, 3))
+    trial = Trial.of(Sequences.of_pieces(A.pieces, FPS, STEPS), 4, (1, 3))
     raw = trial.squared_errors(Gains()).double().numpy()
     cell = whole["models"]["raw"]["0.5"]["forward_m"]
     assert cell["rmse"] == pytest.approx(np.sqrt(np.nanmean(raw[:, 1, 0])), abs=1e-5)
@@ -148,9 +148,9 @@ def test_a_horizon_below_a_control_step_is_one_step(tmp_path: Path) -> None:
 def test_recordings_without_walking_are_refused(tmp_path: Path) -> None:
     pieces = tuple(replace(piece, broken=np.ones(len(piece), bool)) for piece in A.pieces)
     still = replace(A, pieces=pieces)
-    with pytest.raises(BadInputError, match="expected walking after 4 control steps in a recording to test"):
+    with pytest.raises(BadInputError, match="expected 1 control steps that count, after 4 of any kind"):
         run_study(recipe(models=("raw",)), [still], [B], tmp_path / "a", silent)
-    with pytest.raises(BadInputError, match=r"expected stretches of 4 \+ 1 steps of walking to fit to"):
+    with pytest.raises(BadInputError, match=r"expected stretches of 4 \+ 1 steps to fit to"):
         run_study(recipe(models=("ridge",)), [B], [still], tmp_path / "b", silent)
 
 

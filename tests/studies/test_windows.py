@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from toy_walks import FPS, piece
 
-from astra_data.studies.walking import bounded
-from astra_data.studies.walks import StepsConfig, Stretch, Walks
+from astra_data.studies.sequences import Sequences, StepsConfig, Stretch
+from astra_data.studies.walking import WALKER, bounded
 from astra_data.studies.windows import WindowModel
 
 HISTORY = 4
@@ -15,8 +15,8 @@ HISTORY = 4
 
 @pytest.fixture(scope="module")
 def stretch() -> Stretch:
-    walks = Walks.of_pieces([piece(600, 0)], FPS, StepsConfig(rows=10, history=HISTORY))
-    return walks.stretches(*walks.starts(HISTORY, 2), HISTORY, 2)
+    sequences = Sequences.of_pieces([piece(600, 0)], FPS, StepsConfig(rows=10, history=HISTORY))
+    return sequences.stretches(*sequences.starts(HISTORY, 2), HISTORY, 2)
 
 
 def step(stretch: Stretch) -> tuple[Tensor, Tensor, Tensor]:
@@ -24,23 +24,23 @@ def step(stretch: Stretch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def linear(stretch: Stretch) -> WindowModel:
-    model = WindowModel(HISTORY).requires_grad_(False)
+    model = WindowModel(HISTORY, WALKER).requires_grad_(False)
     model.set_scales(stretch)
     return model
 
 
 def test_before_fitting_the_correction_is_zero(stretch: Stretch) -> None:
     for hidden in ((), (8,)):
-        model = WindowModel(HISTORY, hidden)
+        model = WindowModel(HISTORY, WALKER, hidden)
         model.set_scales(stretch)
         assert torch.equal(model.motion(model.begin(stretch), *step(stretch)), stretch.simulated[:, 0])
 
 
 def test_scales_are_those_of_walked_steps(stretch: Stretch) -> None:
     wild = torch.full_like(stretch.motion, 100.0)
-    walking = torch.ones_like(stretch.is_walking)
+    walking = torch.ones_like(stretch.counts)
     walking[::2] = False
-    part = replace(stretch, motion=torch.where(walking[..., None], stretch.motion, wild), is_walking=walking)
+    part = replace(stretch, motion=torch.where(walking[..., None], stretch.motion, wild), counts=walking)
     model = linear(part)
     walked, simulated = stretch.motion[1::2].flatten(0, 1), stretch.simulated[1::2].flatten(0, 1)
     torch.testing.assert_close(model.motion_std, walked.std(0))

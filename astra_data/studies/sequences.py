@@ -12,7 +12,6 @@ from astra_data.core.config import Config, Count
 from astra_data.core.errors import BadInputError
 from astra_data.studies.body import Body
 from astra_data.studies.recordings import Piece
-from astra_data.studies.walking import WALKER
 
 _KINDS = {"action": "action", "given": "action", "seen": "seen"}
 """What of `Body.mirror` the columns follow; all others are motions."""
@@ -32,12 +31,12 @@ class Stretch:
     """B stretches of a recording: H steps of history, then F steps to predict; sizes as in `Body`.
 
     Attributes:
-        past_motion: of each past step, (B, H, M); the simulator's where the robot did not walk.
+        past_motion: of each past step, (B, H, M); the simulator's where it does not count.
         past_action: the command in each, (B, H, G). past_seen: what is seen after each, (B, H, S).
         past_simulated: the simulator's motion in each, (B, H, M).
         action: mean action in each future step, as recorded, (B, F, A).
         simulated: the simulator's motion from each recorded state, (B, F, M).
-        motion: the robot's motion, (B, F, M). is_walking: (B, F) bool, for joints wherever there is a step.
+        motion: the robot's motion, (B, F, M). counts: whether it does, (B, F): see `Body.broken`.
         heading: in the field at the start of the prediction, (B,). body: what moves.
     """
 
@@ -48,9 +47,9 @@ class Stretch:
     action: Tensor
     simulated: Tensor
     motion: Tensor
-    is_walking: Tensor
+    counts: Tensor
     heading: Tensor
-    body: Body = WALKER
+    body: Body
 
     def __len__(self) -> int:
         """Return B."""
@@ -77,7 +76,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Walks:
+class Sequences:
     """E sequences of control steps, padded at the end to T.
 
     A piece gives as many sequences as a control step has rows, each starting one row later, so that a step
@@ -86,7 +85,7 @@ class Walks:
     Attributes:
         motion: of each step, (E, T, M). simulated: the abstract simulator's, (E, T, M).
         action: mean action of the rows, (E, T, A). seen: what is seen before each step and after the last,
-        (E, T + 1, S). heading: before each step, (E, T). is_walking: (E, T) bool, False in the padding.
+        (E, T + 1, S). heading: before each step, (E, T). counts: whether a step does, (E, T); padding never.
         piece: index of the piece of each sequence, (E,). lengths: steps of each, (E,). body: what moves.
     """
 
@@ -95,13 +94,13 @@ class Walks:
     action: Tensor
     seen: Tensor
     heading: Tensor
-    is_walking: Tensor
+    counts: Tensor
     piece: Tensor
     lengths: Tensor
-    body: Body = WALKER
+    body: Body
 
     @classmethod
-    def of_pieces(cls, pieces: Sequence[Piece], fps: int, config: StepsConfig) -> "Walks":
+    def of_pieces(cls, pieces: Sequence[Piece], fps: int, config: StepsConfig) -> "Sequences":
         """Cut `pieces`, recorded at `fps` rows per second, into steps; replay each in the abstract simulator.
 
         Raises:
@@ -119,7 +118,7 @@ class Walks:
             raise BadInputError(f"expected pieces of more than {seconds:.1f} s without a split, found none")
         columns = {
             name: pad_sequence([sequence[name] for sequence in sequences], batch_first=True)
-            for name in ("motion", "simulated", "action", "seen", "heading", "is_walking")
+            for name in ("motion", "simulated", "action", "seen", "heading", "counts")
         }
         return cls(
             **columns,
@@ -129,11 +128,11 @@ class Walks:
         )
 
     def starts(self, history: int, steps: int) -> tuple[Tensor, Tensor]:
-        """Return sequences (N,) and steps (N,) with `history` steps before and `steps` of walking after."""
-        length = self.is_walking.shape[1]
+        """Return sequences (N,) and steps (N,) with `history` steps before and `steps` that count after."""
+        length = self.counts.shape[1]
         if length < history + steps:
             return torch.empty(0, dtype=torch.long), torch.empty(0, dtype=torch.long)
-        ahead = self.is_walking[:, history:].unfold(1, steps, 1).all(-1)
+        ahead = self.counts[:, history:].unfold(1, steps, 1).all(-1)
         sequence, step = ahead.nonzero(as_tuple=True)
         return sequence, step + history
 
@@ -143,17 +142,17 @@ class Walks:
         past = step[:, None] + torch.arange(-history, 0)
         simulated, before = self.simulated[row, past], self.seen[row, past]
         ahead = step[:, None] + torch.arange(steps)
-        inside = ahead < self.is_walking.shape[1]
-        ahead = ahead.clamp_max(self.is_walking.shape[1] - 1)
+        inside = ahead < self.counts.shape[1]
+        ahead = ahead.clamp_max(self.counts.shape[1] - 1)
         return Stretch(
-            past_motion=torch.where(self.is_walking[row, past][..., None], self.motion[row, past], simulated),
+            past_motion=torch.where(self.counts[row, past][..., None], self.motion[row, past], simulated),
             past_action=self.body.command(self.action[row, past], simulated, before)[0],
             past_seen=self.seen[row, past + 1],
             past_simulated=simulated,
             action=self.action[row, ahead],
             simulated=self.simulated[row, ahead],
             motion=self.motion[row, ahead],
-            is_walking=self.is_walking[row, ahead] & inside,
+            counts=self.counts[row, ahead] & inside,
             heading=self.heading[sequence, step],
             body=self.body,
         )
@@ -165,4 +164,4 @@ def _steps(body: Body, piece: Piece, number: int, first: int, fps: int, rows: in
     last = first + count * rows
     broken = piece.broken[first:last].reshape(count, rows).any(axis=1)
     columns = body.steps(piece.state[first : last + 1], piece.action[first:last], rows, fps)
-    return columns | {"is_walking": torch.from_numpy(~broken), "piece": torch.tensor(number)}
+    return columns | {"counts": torch.from_numpy(~broken), "piece": torch.tensor(number)}
