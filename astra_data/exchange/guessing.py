@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.exchange.importers.csv import SUFFIXES
+from astra_data.exchange.importers.csv import SUFFIXES, delimiter_of
 
 Floats = NDArray[np.float64]
 Role = Literal["time", "episode", "state", "command", "failure", "success", "reward", "left out"]
@@ -191,7 +191,7 @@ def _files(folder: Path) -> list[Path]:
 
 def _numbers(path: Path) -> dict[str, Floats]:
     """Return the fields of a file that are numbers, or true and false."""
-    delimiter, mark = ("\t", "tabs") if path.suffix == ".tsv" else (",", "commas")
+    delimiter, mark = delimiter_of(path.name)
     try:
         table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
     except FileNotFoundError:

@@ -17,6 +17,11 @@ _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
 _LONGEST_HEADER = 2**20
 
 
+def delimiter_of(name: str) -> tuple[str, str]:
+    """Return what parts the fields of the file `name`, and what it is called."""
+    return ("\t", "tabs") if name.endswith(".tsv") else (",", "commas")
+
+
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows; fields are whole numbers, numbers, or true and false, and an empty cell is NaN.
 
@@ -27,7 +32,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
             stream,
-            parse_options=csv.ParseOptions(delimiter="\t" if str(source).endswith(".tsv") else ","),
+            parse_options=csv.ParseOptions(delimiter=delimiter_of(str(source))[0]),
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(mapping.all_fields, pa.string()),
                 strings_can_be_null=True,
@@ -48,7 +53,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def _checked(source: Source, mapping: ImportMapping) -> list[str]:
-    delimiter, mark = ("\t", "tabs") if str(source).endswith(".tsv") else (",", "commas")
+    delimiter, mark = delimiter_of(str(source))
     with source.open() as stream:
         first = stream.readline(_LONGEST_HEADER).decode("utf-8", "replace")
     if delimiter not in first and (others := [name for part, name in _MARKS.items() if part in first]):
