@@ -38,8 +38,8 @@ def progress_text(points: Collection[RunPoint], means: Mapping[RunPoint, float])
 
 
 def _cell(points: Collection[RunPoint], means: Mapping[RunPoint, float], score: Score) -> str:
-    """Return the score of a point; of several, how many are done, and their mean score."""
+    """Return the score of a point; of several, how many are done, and their mean score; nothing of none."""
     done = [means[point] for point in points if point in means]
-    count = "" if len(points) == 1 else f"{len(done)} of {len(points)} "
+    count = "" if len(points) < 2 else f"{len(done)} of {len(points)} "
     mean = f" {score.text(sum(done) / len(done))}" if done else ""
     return f"{count}done{mean}" if count or done else ""
