@@ -1,6 +1,7 @@
 """The condition of artefacts that fake stages made, with real manifests."""
 
 import json
+import re
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -76,6 +77,36 @@ def test_an_emptied_file_is_found_and_made_again(
     ]
     assert (aside / TRAIN / "policy.safetensors").read_bytes() == b""
     assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}"]
+    assert not (aside / "report").exists(), "every run makes it"
+
+
+def test_each_artefact_is_made_again_for_its_own_damage_first(
+    recipe: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for key in (GROUND, ALIGN):
+        for file in ("asked.json", "metrics.json"):
+            (folder / key / file).unlink()
+    capsys.readouterr()
+    run(recipe, root=recipe.parent, jobs=1)
+    told = dict(re.findall(r"(\S+) is made again: (.*);", capsys.readouterr().out))
+    assert told[GROUND] == told[ALIGN] == "damaged (asked.json is missing; metrics.json is missing)"
+    assert told[TRAIN] == f"made from {GROUND}"
+
+
+def test_damage_of_a_policy_is_none_of_its_grounding(recipe: Path, folder: Path) -> None:
+    policy = folder / TRAIN / "policy.safetensors"
+    policy.write_bytes(b"x" + policy.read_bytes()[1:])
+    shutil.rmtree(folder / EVALUATE)
+    run(recipe, root=recipe.parent, jobs=1)
+    assert made_again(folder) == [f"1/{TRAIN}"]
+
+
+def test_what_a_stage_reads_but_does_not_make_stays_where_it_is(recipe: Path, folder: Path) -> None:
+    altered = folder / "pair/seed_0/altered"
+    altered.touch()
+    shutil.rmtree(folder / "ground")
+    run_stage(recipe, "ground", root=recipe.parent, jobs=1)
+    assert altered.exists() and not (folder / "set_aside").exists()
 
 
 def test_what_is_set_aside_twice_is_there_twice(recipe: Path, folder: Path) -> None:
@@ -167,6 +198,22 @@ def test_a_damaged_manifest_is_damage(recipe: Path, folder: Path) -> None:
     assert state == "damaged" and why.startswith("manifest.json cannot be read")
 
 
+def test_without_a_manifest_a_result_is_compared_by_its_bytes(recipe: Path, folder: Path) -> None:
+    (folder / TRAIN / MANIFEST).unlink()
+    policy = folder / TRAIN / "policy.safetensors"
+    assert EVALUATE not in states(recipe)
+    policy.write_text("another")
+    assert states(recipe)[EVALUATE] == ("stale", f"made from another {TRAIN}")
+    policy.unlink()
+    assert states(recipe)[TRAIN][0] == "damaged" and EVALUATE not in states(recipe)
+
+
+def test_a_manifest_without_the_result_is_compared_with_nothing(recipe: Path, folder: Path) -> None:
+    manifest = folder / TRAIN / MANIFEST
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"files": {}}))
+    assert EVALUATE not in states(recipe)
+
+
 def test_a_damaged_dataset_that_no_stage_made_is_not_replaced(recipe: Path, folder: Path) -> None:
     description = folder / "collect/seed_0/dataset.json"
     description.write_text("{")
@@ -174,6 +221,16 @@ def test_a_damaged_dataset_that_no_stage_made_is_not_replaced(recipe: Path, fold
         run(recipe, root=recipe.parent)
     assert description.read_text() == "{"
     assert not (folder / "set_aside").exists()
+
+
+def test_a_damaged_dataset_of_another_origin_is_not_replaced(recipe: Path, folder: Path) -> None:
+    description = folder / COLLECT / "dataset.json"
+    description.write_text(json.dumps(json.loads(description.read_text()) | {"stage": "import"}))
+    (folder / COLLECT / "altered").touch()
+    shutil.rmtree(folder / "pair")
+    with pytest.raises(BadInputError, match=r"collect/seed_0 is damaged .* and was not made by this recipe"):
+        run(recipe, root=recipe.parent)
+    assert (folder / COLLECT / "altered").exists()
 
 
 def test_the_command_lists_what_is_wrong_and_fails(recipe: Path, folder: Path) -> None:
@@ -229,5 +286,15 @@ def test_a_choice_is_asked_for_by_its_table_which_changes_nothing_else(tmp_path:
         run(recipe, root=tmp_path, jobs=1)
 
 
-def test_the_result_of_every_stage_is_read_as_others_read_it() -> None:
+def test_whole_files_that_no_stage_can_read_are_damage(recipe: Path, folder: Path) -> None:
+    found = states(recipe, verify=True)
+    for key in (GROUND, TRAIN, ALIGN):  # whose fakes are no networks
+        assert found[key][0] == "damaged" and found[key][1].endswith(", after removing this")
+
+
+def test_the_result_of_every_stage_is_read_as_others_read_it(tmp_path: Path) -> None:
     assert LOADERS.keys() == {stage.name for stage in STAGES.values() if stage.result}
+    (tmp_path / "result").write_text("{}")
+    for load in LOADERS.values():
+        with pytest.raises(AstraDataError):
+            load(tmp_path / "result")
