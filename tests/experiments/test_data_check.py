@@ -37,6 +37,7 @@ def recipe(tmp_path: Path) -> Path:
     [
         (-1.0, 4.0, ""),
         (-0.9, 3.9, ""),  # within 5 % of what was recorded
+        (-0.75, 4.0, "v may be -1 to 4, recorded is -0.75 to 4"),  # just beyond these 5 %
         (-1.5, 4.5, ""),
         (-0.5, 4.0, "v may be -1 to 4, recorded is -0.5 to 4: narrow the bounds of the commands, or rec"),
         (-1.0, 3.0, "v may be -1 to 4, recorded is -1 to 3"),

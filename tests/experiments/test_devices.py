@@ -29,6 +29,7 @@ def test_items_that_step_physics_share_the_cores(monkeypatch: pytest.MonkeyPatch
     assert [item.call() for item in share_cores(two[1:], 4)] == [8, 1]
     many = items(*(f"collect/seed_{seed}" for seed in range(20)))
     assert {item.call() for item in share_cores(many, 16)} == {1}
+    assert {item.call() for item in share_cores(many, 2)} == {4}
 
 
 @pytest.mark.parametrize(
@@ -51,6 +52,7 @@ def test_without_a_gpu_there_is_no_first_one(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(BadInputError, match="device 'cuda' is not available: torch finds 0 CUDA devices"):
         check_device("cuda", None)
+    check_device("cpu", None)
 
 
 def test_devices_that_are_there_pass(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from astra_data.experiments.display import display
+from astra_data.experiments.display import display, shown
 
 
 def test_without_a_terminal_there_are_plain_lines() -> None:
@@ -50,3 +50,13 @@ def test_an_item_may_fail_before_it_has_begun(is_terminal: bool) -> None:
     console = Console(file=StringIO(), force_terminal=is_terminal)
     with display(1, console) as watch:
         watch.failed("train/nas/seed_0")
+
+
+def test_one_job_is_shown_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with shown("push") as progress:
+        progress(0.5, "3 of 6 files")
+    told = capsys.readouterr()
+    assert told.out == ""
+    *lines, last = told.err.splitlines()
+    assert lines == ["push  started", "push  50 %  3 of 6 files"]
+    assert last.startswith("push  finished in 0.") and last.endswith(" s  (1 of 1)")
