@@ -287,7 +287,8 @@ def evaluate(
         "seed": seed,
         "num_threads": num_threads,
     }
-    outcomes = {name: [0.0, 1.0] for name in ("success", "failed", "wall_contact", "steps", "return")}
+    outcomes = {name: [0.0, 1.0] for name in ("success", "failed", "wall_contact")}
+    outcomes |= {"steps": [10.0, 30.0], "return": [2.0, 3.0]}
     evaluation = {
         "task": task,
         "method": method,

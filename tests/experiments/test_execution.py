@@ -68,15 +68,15 @@ def test_what_an_item_prints_is_in_its_log_and_an_empty_log_is_removed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     work = pickled(Item("a", (), partial(touch, tmp_path / "made", ())), None)
-    seconds = run_item("a", work, tmp_path / "logs/a.txt", lambda note: None)
+    seconds = run_item("a", work, tmp_path / "logs/x/y/a.txt", lambda note: None)
     assert isinstance(seconds, float)
     assert 0 < seconds < 60
     assert (tmp_path / "made").exists()
-    assert not (tmp_path / "logs/a.txt").exists()
-    error = run_item("b", pickled(Item("b", (), crash), prepared), tmp_path / "logs/b.txt", lambda note: None)
-    log = (tmp_path / "logs/b.txt").read_text()
-    assert str(error) == f"b crashed: ValueError: a bug (traceback: {tmp_path / 'logs/b.txt'})"
-    assert log == "prepared\nwith care\n"
+    assert not (tmp_path / "logs/x/y/a.txt").exists()
+    log = tmp_path / "logs/b/c.txt"
+    error = run_item("b/c", pickled(Item("b/c", (), crash), prepared), log, lambda note: None)
+    assert str(error) == f"b/c crashed: ValueError: a bug (traceback: {log})"
+    assert log.read_text() == "prepared\nwith care\n"
     os.write(1, b"ours again\n")
     os.write(2, b"and ours\n")
     shown = capfd.readouterr()
@@ -108,6 +108,14 @@ def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> 
     error = run_item("a/b", pickled(Item("a/b", (), fail), None), tmp_path / "log", lambda note: None)
     assert type(error) is MissingStageError
     assert str(error) == "a/b: nothing to eat"
+    assert not (tmp_path / "log").exists(), "no traceback of what is expected"
+
+
+def test_an_item_leaves_no_file_open(tmp_path: Path) -> None:
+    work, open_files = pickled(Item("a", (), fail), None), Path("/proc/self/fd")
+    before = len(list(open_files.iterdir()))
+    run_item("a", work, tmp_path / "log", lambda note: None)
+    assert len(list(open_files.iterdir())) == before
 
 
 def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,11 +129,18 @@ def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) ->
     assert [fraction for fraction, _ in sent] == [0.0, 0.4, 0.8]
 
 
-def test_a_full_disk_is_no_crash_and_a_full_log_hides_no_error(tmp_path: Path) -> None:
+def err(*, progress: object) -> None:
+    raise ValueError("a bug")
+
+
+def test_a_full_disk_is_no_crash_and_a_full_log_hides_no_error(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     log = tmp_path / "logs/a.txt"
     error = run_item("a", pickled(Item("a", (), fill_the_disk), None), log, lambda note: None)
     assert isinstance(error, DiskError)
     assert str(error).startswith("a: a file cannot be read or written: the disk is full.")
     (tmp_path / "full").symlink_to("/dev/full")
-    error = run_item("b", pickled(Item("b", (), crash), None), tmp_path / "full", lambda note: None)
+    with capfd.disabled():  # so that the traceback reaches the log
+        error = run_item("b", pickled(Item("b", (), err), None), tmp_path / "full", lambda note: None)
     assert "b crashed: ValueError: a bug" in str(error)

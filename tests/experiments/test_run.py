@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_runs import bare_results, write_json
 
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
@@ -114,6 +115,27 @@ def test_few_items_at_a_time_hold_a_context_of_a_gpu(
     assert told == [jobs, 3]
 
 
+def test_networks_compute_on_the_device_that_is_asked_for(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(recipe, root=tmp_path, jobs=1, until="pair")
+    told: list[tuple[str, str]] = []
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr(
+        "astra_data.experiments.run.execute",
+        lambda items, **_: told.extend((item.key, item.device) for item in items),
+    )
+    run(recipe, root=tmp_path, device="cuda:0", until="ground")
+    run_stage(recipe, "ground", root=tmp_path, device="cuda:0")
+    assert told == [("ground/astra/seed_0", "cuda:0")] * 2
+
+
+@pytest.mark.parametrize("stage", ["ground", "align"])
+def test_a_row_is_grounded_and_aligned_as_its_method(recipe: Path, tmp_path: Path, stage: str) -> None:
+    with pytest.raises(MissingStageError, match="pair/seed_0 is missing"):
+        run_stage(recipe, stage, method="astra_plus", root=tmp_path)
+
+
 def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
     text = recipe.read_text()
     recipe.write_text(text + "[pair]\nfails = true\n")
@@ -169,6 +191,27 @@ def test_moved_copies_are_made_by_running_the_recipe(recipe: Path, tmp_path: Pat
 def test_a_report_does_not_wait_for_every_seed(recipe: Path, tmp_path: Path) -> None:
     run_stage(recipe, "report", root=tmp_path)
     assert asked(tmp_path / "r/report")["seeds"] == [0]
+
+
+def test_a_report_is_published_beside_the_recipe_and_added_to_what_is_there(
+    recipe: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results"
+    run_stage(recipe, "report", root=tmp_path, jobs=1, publish=True)
+    told = asked(tmp_path / "r/report")
+    assert (told["publish"], told["add_to"]) == (str(results), None)
+    with pytest.raises(BadInputError, match=r"expected published results in .*, found none"):
+        run_stage(recipe, "report", root=tmp_path, add=True)
+    settings = load_experiment(recipe, tmp_path).recipe.settings
+    write_json(
+        results / "r.json", bare_results("r", {"astra": [0]}, settings).model_dump(mode="json", by_alias=True)
+    )
+    run_stage(recipe, "report", root=tmp_path, jobs=1, add=True)
+    told = asked(tmp_path / "r/report")
+    assert (told["publish"], told["add_to"]) == (None, str(results / "r.json"))
+    recipe.write_text(recipe.read_text() + "[evaluate]\nsteps = 7\n")
+    with pytest.raises(RecipeError, match=r"^evaluate changed in .* since its results in"):
+        run_stage(recipe, "report", root=tmp_path, add=True)
 
 
 def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, tmp_path: Path) -> None:
