@@ -41,6 +41,7 @@ def test_independent_items_run_at_the_same_time(tmp_path: Path) -> None:
 def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
     with pytest.raises(MissingStageError, match=r"^a/b: nothing to eat$"):
         execute([Item("a/b", (), fail)], jobs=1, logs=tmp_path, watch=Record())
+    assert not (tmp_path / "a/b.txt").exists(), "it has no traceback"
 
 
 def test_a_crash_tells_its_last_line_and_where_its_traceback_is(tmp_path: Path) -> None:
