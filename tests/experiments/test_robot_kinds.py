@@ -36,6 +36,9 @@ def test_a_position_a_heading_and_two_commands_are_a_unicycle(tmp_path: Path) ->
     assert (values["commands"], values["command"]) == ("turn, speed", "[0.0, 1.0]")
     assert values["goal"] == "(49.0, 98.0)" and values["lows"] == values["highs"] == "[0.0, 0.0, 0.0]"
     assert float(values["close"]) == pytest.approx(np.hypot(49, 98) / 10, rel=0.05)
+    assert values["phi"] == "[0.0, 0.0, 1.0, 0.0]"  # x, y, cosine and sine
+    # Towards y for a tenth of a second at a speed of 1.
+    assert (values["before"], values["after"]) == ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.1, 0.0, 1.0]")
 
 
 def test_a_heading_may_be_a_unit_vector(tmp_path: Path) -> None:
@@ -44,6 +47,32 @@ def test_a_heading_may_be_a_unit_vector(tmp_path: Path) -> None:
     assert kind is not None
     assert kind.values()["abstraction"] == "return state[..., [2, 3, 0, 1]]"
     assert kind.values()["lows"] == "[0.0, 0.0, 3.1416]"
+
+
+def test_the_second_command_turns_where_no_name_says_which(tmp_path: Path) -> None:
+    found = logs(tmp_path, x=T, y=T % 9, yaw=T % 3, cmd_a=T % 5, cmd_b=T % 2)
+    kind = Planar.of(found)
+    assert kind is not None
+    assert (kind.values()["commands"], kind.values()["command"]) == ("speed, turn", "[1.0, 0.0]")
+
+
+def test_a_unit_vector_goes_before_an_angle(tmp_path: Path) -> None:
+    vector = {"heading_x": np.cos(T), "heading_y": np.sin(T)}
+    kind = Planar.of(logs(tmp_path, x=T, y=T % 9, yaw=T % 3, **vector, cmd_v=T % 5, cmd_w=T % 2))
+    assert kind is not None and [field.short for field in kind.heading] == ["heading_x", "heading_y"]
+
+
+def test_starts_and_the_goal_are_those_of_the_episodes(tmp_path: Path) -> None:
+    episode = np.repeat([0, 1, 2], [10, 25, 15])  # the last one goes as far as the median
+    pose = {"x": 2 * T, "y": -T, "yaw": T % 5 / 9}
+    planar = Planar.of(logs(tmp_path, episode=episode, **pose, cmd_v=T % 5, cmd_w=T % 2))
+    assert planar is not None
+    values = planar.values()
+    assert (values["lows"], values["highs"]) == ("[0.0, -35.0, 0.0]", "[70.0, 0.0, 0.0]")
+    assert values["goal"] == "(98.0, -49.0)" and values["close"] == f"{np.hypot(28, 14) / 10:.2g}"
+    values = Direct.of(logs(tmp_path, episode=episode, a=2 * T, cmd_a=T % 5)).values()
+    assert (values["lows"], values["highs"], values["goal"]) == ("[0.0]", "[70.0]", "(98.0,)")
+    assert (values["range"], values["close"]) == ("(98.0,)", f"{28 / 98 / 10:.2g}")  # of the range
 
 
 def test_others_are_no_unicycle(tmp_path: Path) -> None:
@@ -63,12 +92,30 @@ def test_commands_move_the_states_of_their_names_or_the_first(tmp_path: Path) ->
     assert [field.short for field in named.moved] == ["q1", "q2"] and named.is_rate
     assert named.values()["indices"] == "[2, 1]"
     assert named.values()["step"] == "self.state + TIMESTEP_S * command"
+    assert (named.values()["names"], named.values()["command"]) == ('("q1", "q2")', "[1.0, 1.0]")
     assert (named.values()["before"], named.values()["after"]) == ("[0.0, 1.0]", "[0.1, 1.1]")
     first = Direct.of(logs(tmp_path, vel_a=T % 4, a=slow, cmd_1=T % 5))
     assert [field.short for field in first.moved] == ["a"]
     assert (
         first.values()["names"] == '("a",)' and first.values()["lows"] == first.values()["highs"] == "[0.0]"
     )
+
+
+def test_each_command_moves_a_state_of_its_own(tmp_path: Path) -> None:
+    for columns, expected in (
+        ({"a": T, "b": 2 * T, "cmd_1": T % 5, "cmd_2": T % 3}, ["a", "b"]),
+        ({"x": T, "y": 2 * T, "cmd_uy": T % 5, "cmd_ux": T % 3}, ["y", "x"]),
+        ({"a": T, "cmd_w_rad_s": T % 3}, ["a"]),  # in a unit that is not known
+        ({"x_m": T, "cmd_1": T % 3}, ["x"]),
+    ):
+        assert [field.short for field in Direct.of(logs(tmp_path, **columns)).moved] == expected
+
+
+def test_states_are_moved_by_the_first_commands(tmp_path: Path) -> None:
+    columns = {"x_m": T, "cmd_x_m_s": T % 3, "cmd_w_rad_s": T % 2}
+    assert [field.short for field in Direct.of(logs(tmp_path, **columns)).moved] == ["x"]
+    with pytest.raises(BadInputError, match="found no state that a command could move"):
+        Direct.of(logs(tmp_path, x_m=T, cmd_w_rad_s=T % 2, cmd_x_m_s=T % 3))
 
 
 def test_no_command_moves_a_state_of_another_unit(tmp_path: Path) -> None:
