@@ -224,6 +224,21 @@ def test_a_stage_that_is_borrowed_no_more_is_made_here(base: Path, longer: Path,
     )
 
 
+def test_a_link_of_the_user_s_own_is_a_folder_like_any(base: Path, tmp_path: Path) -> None:
+    collected = tmp_path / "disk/collect/seed_0"
+    collected.mkdir(parents=True)
+    folder = tmp_path / "base"
+    folder.mkdir()
+    (folder / "collect").symlink_to(collected.parent)
+    experiment = load_experiment(base, tmp_path)
+    assert experiment.has("collect/seed_0")
+    experiment.link_borrowed()
+    assert (folder / "collect").resolve() == collected.parent
+    (folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    base.write_text(BASE + "[collect]\nsteps = 7\n")
+    assert load_experiment(base, tmp_path).outdated("collect/seed_0").startswith("collect changed")
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
