@@ -188,6 +188,10 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
             "effect: leave out _plus",
         ),
         (HEAD.replace("7", "0"), "expected each of seeds once, got [0, 0]"),
+        (
+            HEAD.replace('"follower", "direct_transfer", "astra"', '"astra_plus"'),
+            "expected each of methods once, got ['astra_plus', 'astra_plus']",
+        ),
         (HEAD + "[sweep]\npercent = [5, 5]", "expected each of sweep.percent once, got [5, 5]"),
         (
             HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",

@@ -120,6 +120,10 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
             "disagreement_penalty: expected ground.correction_heads of 2 or more, or keep_member",
         ),
         ({"plus": {"keep_member": True}}, "keep_member: expected ground.members of 2 or more, got 0"),
+        (
+            {"ground": {"members": 1}, "train": {"keep_member": True}},
+            "keep_member: expected ground.members of 2 or more, got 1",
+        ),
         ({"train": 3}, "train: expected a table, got 3"),
         ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),

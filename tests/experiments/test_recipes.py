@@ -84,6 +84,8 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
     [
         (', "rma", "follower"', "", "methods: follower"),
         ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
+        ("", "[train]\nsupport_penalty = 0.1\n", "train.support_penalty, plus.support_penalty"),
+        ("", "[train]\ncommand_limit_m_s = 1.0\n", "train.command_limit_m_s, plus.command_limit_m_s"),
         ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
         ("", "[plus]\ncommand_limit_m_s = 1.0\n", "plus.command_limit_m_s"),
         ("", "[evaluate]\nleg_scale = 1.25\n", "evaluate.leg_scale"),
