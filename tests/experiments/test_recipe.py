@@ -102,6 +102,7 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
     # What is collected is the largest size.
     assert recipe.config_of("collect").episodes == 20  # type: ignore[union-attr]
     assert recipe.config_of("subset") is None
+    assert "select" not in recipe.settings, "a choice is made where a recipe asks for one"
 
 
 @pytest.mark.parametrize(
@@ -115,6 +116,7 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ({"train": SAC | {"ramp": 0.4}}, "train: ramp: expected 0 with SAC"),
         ({"plus": {"ramp_while": 0.9}}, "plus: ramp_while: expected a ramp, a share of the training"),
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
+        ({"train": SAC, "methods": ["rma_plus"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
         (
             {"train": {"disagreement_penalty": 1.0}},
             "disagreement_penalty: expected ground.correction_heads of 2 or more, or keep_member",
@@ -125,6 +127,8 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
             "keep_member: expected ground.members of 2 or more, got 1",
         ),
         ({"train": 3}, "train: expected a table, got 3"),
+        ({"domain_randomization": 3}, "domain_randomization: expected a table, got 3"),
+        ({"compass": {"ball_friction": [0.5, 2.0]}}, "compass: expected ranges of"),
         ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),
         (
@@ -157,6 +161,12 @@ def test_what_does_not_fit_the_learner_is_told_in_a_line(tables: dict[str, Any],
     with pytest.raises(RecipeError, match=f"^r.toml: .*{re.escape(message)}") as caught:
         read(**tables)
     assert "\n" not in str(caught.value)
+
+
+def test_a_method_of_ones_own_that_is_not_there_is_told_once() -> None:
+    with pytest.raises(RecipeError, match=r"own_methods: .*nothing\.py") as caught:
+        read(own_methods={"mine": "nothing.py:METHOD"}, methods=["mine"])
+    assert "unknown method" not in str(caught.value)
 
 
 def test_disagreement_is_that_of_heads_or_of_members() -> None:
