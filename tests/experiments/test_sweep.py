@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fake_runs import bare_results, write_json
 
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.sweep import sweep
@@ -73,6 +73,35 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
     ]
     assert {line["simulated_success"] for line in lines(folder) if line["method"] == "follower"} == {""}
     assert {line["wall_seconds"] for line in lines(folder) if line["method"] == "astra"} == {"24.75"}
+
+
+def test_what_the_base_makes_is_not_made_here(recipe: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text('based_on = "r"\n[evaluate]\nsteps = 3\n')
+    with pytest.raises(MissingStageError, match="r/train/nas/percent_050/seed_1 is missing"):
+        sweep(other, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+
+
+def test_without_sizes_a_point_has_all_of_the_data(
+    recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe.write_text(recipe.read_text().replace("percent = [50, 150]", ""))
+    folder = sweep(recipe, methods=["follower"], seeds=[1], root=tmp_path, jobs=1)
+    assert [(line["method"], line["percent"]) for line in lines(folder)] == [("follower", "100")]
+    assert "evaluate/follower/seed_1  finished in" in capsys.readouterr().out
+
+
+def test_networks_compute_on_the_device_that_is_asked_for(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: set[tuple[str, str]] = set()
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr(
+        "astra_data.experiments.run.execute",
+        lambda items, **_: told.update((item.key.partition("/")[0], item.device) for item in items),
+    )
+    sweep(recipe, methods=["nas"], root=tmp_path, device="cuda:0", until="train")
+    assert ("train", "cuda:0") in told and ("collect", "cpu") in told
 
 
 def test_points_outlive_what_they_were_made_of(recipe: Path, tmp_path: Path) -> None:
