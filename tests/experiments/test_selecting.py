@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
+from astra_data.core.lock import held
 from astra_data.experiments.selecting import select
 from astra_data.training.judging import Judge
 
@@ -60,6 +61,23 @@ def test_a_choice_that_is_there_is_kept_and_another_set_aside(
     (folder / "select/select.md").unlink()
     select(folder, episodes=6)
     assert (folder / "select/select.md").is_file() and (folder / "set_aside/3/select").is_dir()
+
+
+def test_a_choice_among_other_policies_is_made_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
+    assert len(select(folder, rows=["nas"]).candidates) == 3
+    shutil.rmtree(folder / "train/nas/seed_2")
+    assert len(select(folder, rows=["nas"]).candidates) == 2
+    assert (folder / "set_aside/1/select").is_dir()
+
+
+def test_a_run_in_use_and_a_judge_without_groundings_are_refused(folder: Path) -> None:
+    with held(folder) as ours, pytest.raises(BadInputError, match="is in use by another run"):
+        assert ours
+        select(folder)
+    with pytest.raises(BadInputError, match="as judge, got direct_transfer"):
+        select(folder, judge="direct_transfer")
+    assert not (folder / "select").exists()
 
 
 def test_what_is_not_there_is_asked_for(folder: Path) -> None:

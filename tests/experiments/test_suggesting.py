@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,21 @@ def test_the_same_seed_gives_the_same_bytes_and_replaces_what_was_there(folder: 
         suggest(folder, seed=1, out=tmp_path / "again", **FEW)
 
 
+def test_a_row_of_a_recipe_is_asked_at_its_largest_size(folder: Path, tmp_path: Path) -> None:
+    recipe = json.loads((folder / "recipe.json").read_text())
+    more = {"methods": ["nas", "astra_plus"], "sweep": {"percent": [50, 100]}}
+    (folder / "recipe.json").write_text(json.dumps(recipe | more))
+    for size in ("050", "100"):
+        shutil.copytree(folder / "ground/nas", folder / f"ground/astra/percent_{size}")
+    place, _, _ = suggest(
+        tmp_path / "rail.toml", row="astra_plus", root=tmp_path / "runs", max_steps=9, **FEW
+    )
+    config = json.loads((place / "config.json").read_text())
+    assert place == folder / "suggest" and config["row"] == "astra"
+    assert config["groundings"] == [f"ground/astra/percent_100/seed_{seed}" for seed in range(3)]
+    assert config["suggest"]["max_steps"] == 9  # not as the recipe collects
+
+
 def test_from_logs_alone_it_says_what_to_do_on_the_robot(folder: Path) -> None:
     recipe = json.loads((folder / "recipe.json").read_text())
     alone = {"task": recipe["task"].replace(":TASK", ":LOGS_ALONE"), "data": "logs", "collect": None}
@@ -91,6 +107,9 @@ def test_what_cannot_disagree_is_refused_and_nothing_is_written(folder: Path) ->
     with pytest.raises(
         BadInputError, match=r"expected groundings, .*seed_7 .*: run the recipe until ground first"
     ):
+        suggest(folder)
+    (folder / "recipe.json").write_text(json.dumps(recipe | {"methods": ["astra", "nas"], "seeds": [7]}))
+    with pytest.raises(BadInputError, match="ground/nas/seed_7"):  # the reference goes before others
         suggest(folder)
     (folder / "recipe.json").write_text(json.dumps(recipe | {"methods": ["direct_transfer"]}))
     with pytest.raises(BadInputError, match="expected a row that grounds its simulator"):

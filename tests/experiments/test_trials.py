@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
+from astra_data.core.lock import held
 from astra_data.core.manifest import read_manifest
 from astra_data.core.seeding import derive
 from astra_data.experiments import trials as module
@@ -145,6 +146,23 @@ def test_what_trials_cannot_be_made_of_is_refused(folder: Path, tries: Tries) ->
         choose_by_trials(folder, 13)
     shown = CliRunner().invoke(app, ["select", str(folder), "--field", "3"])
     assert isinstance(shown.exception, BadInputError) and "give that too" in str(shown.exception)
+
+
+def test_trials_keep_others_out_and_go_on_only_as_they_began(folder: Path, tries: Tries) -> None:
+    held_once: list[bool] = []
+
+    def told(fraction: float, note: str) -> None:
+        with held(folder) as ours:
+            held_once.append(ours)
+        notes.append(note)
+
+    notes: list[str] = []
+    found = choose_by_trials(folder, 20, field=4, progress=told)
+    assert held_once and not any(held_once), "nobody else may work there"
+    first = found.rounds[0].tried[0]
+    assert f"{first.row}, seed {first.seed}: 2 of 2" in notes
+    with pytest.raises(BadInputError, match=r"with field = 3, found 20 made with 4: give the same again"):
+        choose_by_trials(folder, 20, field=3)
 
 
 def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
