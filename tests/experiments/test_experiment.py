@@ -279,6 +279,13 @@ def test_a_table_that_the_folder_s_recipe_did_not_have_is_no_change(base: Path, 
     kept["collect"].pop("episodes")
     record.write_text(json.dumps(kept))
     assert check(base, root=tmp_path)["train/astra/seed_0"].is_finished
+    kept = load_experiment(base, tmp_path).recipe.settings
+    record.write_text(json.dumps(kept | {"gone": {"rate": 1.0}}))
+    assert check(base, root=tmp_path)["train/astra/seed_0"].is_finished
+    base.write_text(BASE + "[report]\nsteps = 9\n")
+    assert check(base, root=tmp_path)["report"].is_finished, "every run makes it"
+    record.write_text(json.dumps(kept | {"task": "moon"}))
+    assert check(base, root=tmp_path)["train/astra/seed_0"].why.startswith("report and task changed")
 
 
 def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_path: Path) -> None:

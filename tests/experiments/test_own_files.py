@@ -90,6 +90,15 @@ def test_rows_are_outdated_by_other_settings(made: Path) -> None:
     assert experiment.outdated("ground/nas/seed_0") == ""
 
 
+def test_a_method_that_the_recipe_has_no_more_outdates_nothing(made: Path) -> None:
+    edit(made / "rail.toml", '"nas", "mine"', '"nas"')
+    edit(made / "rail.toml", '[own_methods]\nmine = "mine.py:METHOD"\n', "[iql]\ndiscount = 0.9\n")
+    experiment = load(made)
+    (experiment.folder / "train/gone/seed_0").mkdir(parents=True)
+    experiment.check_unchanged()
+    assert experiment.outdated("train/gone/seed_0") == ""
+
+
 def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
     (load(made).folder / CODE).unlink()
