@@ -16,7 +16,10 @@ def refuse_others(root: Path) -> None:
     if versions:
         raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
     if not (root / "meta").is_dir():
-        raise BadInputError(f"{root}: no dataset there; check the path or run the stage that writes it.")
+        raise BadInputError(
+            f"{root}: no dataset there; check the path (`astra-data list` says where names are) "
+            "or run the stage that writes it."
+        )
 
 
 @contextmanager

@@ -276,6 +276,8 @@ class Dataset(Contents):
         Raises:
             BadInputError: one does not exist.
         """
+        if isinstance(names, str):
+            raise BadInputError(f"expected a list of columns, got the text '{names}': write ['{names}']")
         unknown = [name for name in names if name not in self.features]
         if unknown:
             known = ", ".join(self.features)

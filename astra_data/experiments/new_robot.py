@@ -4,6 +4,7 @@ import json
 import keyword
 import math
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib.resources import files
@@ -52,7 +53,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
         kind = Planar.of(found) or Direct.of(found)
         values = _common(name, found) | kind.values()
         values["simulator"] = kind.simulator
-        values["logs"] = " ".join(map(str, places)) or "logs"
+        values["logs"] = shlex.join(map(str, places)) or "logs"
         for template, written in {
             kind.template: f"{name}.py",
             "recipe.toml": f"{name}.toml",

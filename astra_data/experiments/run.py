@@ -195,6 +195,8 @@ def make(
     """
     check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
+    if any(stage_of(item) == "label" and not finished(item, experiment) for item in items):
+        data_condition(recipe)
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder) as ours:
         if not ours:

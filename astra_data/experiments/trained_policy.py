@@ -12,6 +12,7 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named
 from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.running_policy import RunningPolicy
+from astra_data.worlds.own_code import found_near
 from astra_data.worlds.registry import task_named
 
 
@@ -54,6 +55,8 @@ def task_of(run: str | Path) -> str:
 def settings_of(run: str | Path) -> dict[str, Any]:
     """Return the settings of a run's recipe, as it recorded them.
 
+    Files of the user's that it names are looked up here, and else in the run's folder and those above it.
+
     Raises:
         BadInputError: it is not the folder of a run.
     """
@@ -66,6 +69,11 @@ def settings_of(run: str | Path) -> dict[str, Any]:
         settings: dict[str, Any] = json.loads(recipe.read_text())
     except ValueError as error:
         raise BadInputError(f"{recipe}: expected the settings of a run, in JSON: {error}") from None
+    folder = Path(run)
+    if isinstance(task := settings.get("task"), str):
+        settings["task"] = found_near(task, folder)
+    for own in settings.get("own_methods", {}).values():
+        own["method"] = found_near(own["method"], folder)
     return settings
 
 

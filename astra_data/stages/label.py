@@ -175,9 +175,15 @@ def check_fits(source: Dataset, task: Task) -> None:
     """Check that a dataset has the states and actions of a task.
 
     Raises:
-        BadInputError: it lacks some, or theirs are of another size, in another order or in other units.
+        BadInputError: it lacks some, or theirs are of another size, in another order, in other units or at
+            another rate.
     """
     faults = []
+    if (fps := source.info["fps"]) != task.fps:
+        faults.append(
+            f"has {fps} steps per second, expected the {task.fps} of {task.name}, whose timestep_s is "
+            f"{task.timestep_s:g}"
+        )
     for expected in (task.state, task.action):
         if expected.name not in source.features:
             faults.append(f"has no column {expected.name}")

@@ -3,13 +3,19 @@
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.history import LatentEncoder
 from astra_data.learning.networks.policy import Policy
 from astra_data.training.simulator_env import policy_observation
 from astra_data.worlds.task import Task
+
+Given = Tensor | NDArray[np.float32] | NDArray[np.float64]
+"""What measures and goals come in."""
 
 EncoderKind = Literal["target", "source"]
 Observed = Literal["abstract", "full"]
@@ -80,9 +86,28 @@ class RunningPolicy:
         self.memory = memory
         self._generator = None
 
-    def command(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G)."""
+    def command(self, state: Given, goal: Given) -> Tensor:
+        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G).
+
+        Raises:
+            BadInputError: `start` was not called, or the state or the goal is of another shape or not finite.
+        """
+        if not hasattr(self, "memory"):
+            raise BadInputError("expected start(count) before the first command")
+        state = self._checked("state", state, self.task.state.size)
+        goal = self._checked("goal", goal, self.task.objective.goal_size)
         return self.task.limits.in_units(self.act(state, goal))
+
+    def _checked(self, name: str, given: Given, size: int) -> Tensor:
+        values, shape = torch.as_tensor(given, dtype=torch.float32), (len(self.memory.policy), size)
+        if values.shape != shape:
+            raise BadInputError(f"{name}: expected the shape {shape}, got {tuple(values.shape)}")
+        if not values.isfinite().all():
+            row, entry = (~values.isfinite()).nonzero()[0].tolist()
+            raise BadInputError(
+                f"{name}: expected finite values, got {values[row, entry]:g} in row {row}, entry {entry}"
+            )
+        return values
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A), of ±1 along each axis, for target states (B, S) and goals (B, G)."""

@@ -34,7 +34,7 @@ class Commands(Mapping[str, tuple[float, float]]):
         """
         faults = [] if bounds else ["no axis is named"]
         for name, ends in bounds.items():
-            if len(ends) != 2 or not np.isfinite(ends).all() or not ends[0] < ends[1]:
+            if np.shape(ends) != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
                 faults.append(f"{name}: expected (least, largest), got {ends!r}")
         if faults:
             raise BadInputError(f"commands: {'; '.join(faults)}")

@@ -7,14 +7,27 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.commands import Commands
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.robot import State
 
 Env = gymnasium.Env[Any, Any]
+_SLACK = 1e-5
+"""Share of the range of an action by which rounding may carry it beyond."""
 
 
 def observed(env: Env, observation: Any) -> State:  # noqa: ANN401 - whatever the environment shows
-    """Return the observation as the robot's state; of a `GoalEnv` its entry "observation"."""
+    """Return the observation as the robot's state; of a `GoalEnv` its entry "observation".
+
+    Raises:
+        BadInputError: it has several entries, and none is called so.
+    """
+    if isinstance(observation, dict) and "observation" not in observation:
+        raise BadInputError(
+            f"the environment shows {', '.join(observation)}: give GymnasiumRobot a read_state, a function "
+            "of the environment and what it shows that returns the state (S,)"
+        )
     shown = observation["observation"] if isinstance(observation, dict) else observation
     return np.asarray(shown, dtype=np.float64)
 
@@ -48,7 +61,7 @@ class GymnasiumRobot:
     where the three functions can.
 
     Attributes:
-        env: the environment.
+        name: its id. env: the environment.
 
     Example:
         >>> from astra_data.worlds.gymnasium_robot import GymnasiumRobot
@@ -79,7 +92,7 @@ class GymnasiumRobot:
         Raises:
             BadInputError: the environment cannot be made.
         """
-        self.env = made(env_id, **options)
+        self.name, self.env = env_id, made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
 
     def reset(self, seed: int | None = None) -> State:
@@ -89,7 +102,41 @@ class GymnasiumRobot:
         return self._state
 
     def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
-        """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed."""
-        observation, _, terminated, _, _ = self.env.step(self._command(command, self._state))
+        """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed.
+
+        Raises:
+            BadInputError: it makes no action of the environment.
+        """
+        observation, _, terminated, _, _ = self.env.step(self._action(command))
         self._state = self._read_state(self.env, observation)
         return self._state, bool(self._failed(self._state, terminated))
+
+    def check_commands(self, limits: Commands) -> None:
+        """Reset, and check that the least and the largest commands make actions of the environment.
+
+        Raises:
+            BadInputError: one does not.
+        """
+        self.reset(seed=0)
+        for command in np.array([*limits.values()]).T:
+            self._action(command)
+
+    def _action(self, command: NDArray[np.float64]) -> Any:  # noqa: ANN401 - whatever the environment takes
+        action, space = self._command(command, self._state), self.env.action_space
+        if not isinstance(space, gymnasium.spaces.Box):
+            return action
+        advice = "give GymnasiumRobot a command, a function of a command and a state that returns an action"
+        if np.shape(action) != space.shape:
+            raise BadInputError(
+                f"{self.name} takes actions of shape {space.shape}, got {np.shape(action)}: {advice}"
+            )
+        if self._command is as_given:
+            slack = _SLACK * (space.high - space.low)
+            beyond = np.flatnonzero((action < space.low - slack) | (action > space.high + slack))
+            if len(beyond):
+                low, high, given = (float(np.ravel(of)[beyond[0]]) for of in (space.low, space.high, action))
+                raise BadInputError(
+                    f"{self.name} takes actions of {low:g} to {high:g} in entry {beyond[0]}, and the command "
+                    f"is {given:g}: narrow the task's commands, or {advice}"
+                )
+        return action

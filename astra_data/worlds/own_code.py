@@ -31,6 +31,15 @@ def place_beside(name: str, folder: Path) -> str:
     return str(folder / name) if ".py:" in name else name
 
 
+def found_near(name: str, folder: Path) -> str:
+    """Return `name` with its file, if it is one, looked up here, and else in `folder` and those above it."""
+    place = Path(name.rpartition(":")[0])
+    if place.suffix != ".py" or place.is_file():
+        return name
+    above = (folder.resolve(), *folder.resolve().parents)
+    return next((str(one / name) for one in above if (one / place).is_file()), name)
+
+
 def own_object(name: str) -> Any:  # noqa: ANN401 - any object
     """Run the file or module that `name` begins with, and return the object that it ends with.
 
@@ -90,7 +99,8 @@ def _imported(tree: ast.Module) -> set[str]:
 
 def _of_file(path: Path) -> ModuleType:
     if not path.is_file():
-        raise BadInputError(f"{path} does not exist: expected a Python file")
+        where = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise BadInputError(f"{path} does not exist{where}: expected a Python file")
     key = hashlib.sha256(f"{path.resolve()}".encode()).hexdigest()[:12]
     name = f"{_PREFIX}{path.stem}_{key}"
     if name in sys.modules:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
+from astra_data.dataset.description import NAME
 from astra_data.worlds.batched import TargetEnv
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.driven import DrivenSimulator, VariedCommands
@@ -139,16 +140,15 @@ class Task:
         ]
         bounds = self.commands
         commands = Commands.recorded(bounds) if isinstance(bounds, str | Path) else Commands(bounds)
-        if self.objective.action_size != len(commands):
-            faults.append(
-                f"objective: action_size {self.objective.action_size}, expected that of commands, "
-                f"{len(commands)}"
-            )
+        if (size := self.objective.action_size) != len(commands):
+            faults.append(f"objective: action_size {size}, expected that of commands, {len(commands)}")
+        if (horizon := self.objective.horizon) < 1:
+            faults.append(f"objective: horizon {horizon}, expected 1 step or more")
         if not 0 < self.timestep_s < 2:
-            faults.append(
-                f"timestep_s: expected above 0 and below 2 s, for datasets have a whole number of steps per "
-                f"second: got {self.timestep_s}"
-            )
+            expected = "expected above 0 and below 2 s, for datasets have a whole number of steps per second"
+            faults.append(f"timestep_s: {expected}: got {self.timestep_s}")
+        if not NAME.fullmatch(self.name):
+            faults.append("name: expected letters, digits, '.', '_' and '-': datasets are named after it")
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
@@ -215,7 +215,7 @@ class Task:
     def without_maze(self) -> BadInputError:
         """Return the error for settings that need a maze."""
         return BadInputError(
-            f"expected a task in a maze, got '{self.name}', which has none: leave out the settings that need "
+            f"expected a task in a maze, got '{self.name}', which has none: leave out what needs "
             "one (augment, follower, support_penalty, command_limit_m_s, "
             "clearance_m, start 'anywhere')"
         )

@@ -87,6 +87,8 @@ def _robot(task: Task) -> None:
         env = task.target(1, seed=0)
         env.reset()
         abstract = task.abstraction(env.state)
+        if check := getattr(task.robot(), "check_commands", None):
+            check(task.limits)
     expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
 
 

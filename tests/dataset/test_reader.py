@@ -125,6 +125,10 @@ def test_success_is_taken_from_the_metadata_or_else_from_the_column(tmp_path: Pa
 def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
     with pytest.raises(BadInputError, match=r"has no column reward; it has observation\.state, action"):
         fake.columns(["reward"])
+    with pytest.raises(
+        BadInputError, match=r"expected a list of columns, got the text 'action': write \['act"
+    ):
+        fake.columns("action")
 
 
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:

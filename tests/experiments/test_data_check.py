@@ -20,7 +20,7 @@ def write_logs(folder: Path, least: float, largest: float, *, state_size: int = 
     columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
-    with writer(folder, columns=columns) as logs:
+    with writer(folder, columns=columns, fps=10) as logs:
         logs.add(Episode(0, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
 
 
@@ -59,6 +59,19 @@ def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest
     monkeypatch.setenv("ASTRA_DATA_HOME", str(recipe.parent / "home"))
     with pytest.raises(BadInputError, match=r"data: no dataset 'logs' in .*: import or pull it first"):
         check(recipe, root=recipe.parent / "runs")
+    with pytest.raises(BadInputError, match=r"data: no dataset 'logs' in .*: import or pull it first"):
+        run(recipe, root=recipe.parent / "runs")
+    assert not (recipe.parent / "runs").exists()
+
+
+def test_data_are_not_asked_for_once_they_are_labelled(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home, runs = recipe.parent / "home", recipe.parent / "runs"
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(home))
+    write_logs(home / "logs/data-1.0.0", -1.0, 4.0)
+    run(recipe, root=runs, until="label", jobs=1)
+    shutil.rmtree(home)
+    run(recipe, root=runs, until="pair", jobs=1)
+    assert (runs / "rail/pair/seed_0").is_dir()
 
 
 def test_data_that_were_paired_are_refused(recipe: Path) -> None:

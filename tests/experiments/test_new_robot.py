@@ -1,4 +1,5 @@
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -121,6 +122,18 @@ def test_a_twist_of_six_fields_is_a_unicycle(tmp_path: Path) -> None:
     assert check_task(task) == [] and task.timestep_s == 0.05
     assert list(task.limits) == ["vel_linear_x", "vel_angular_z"]
     assert "data" in check(Path("rover/rover.toml"))
+
+
+def test_the_page_s_commands_take_folders_with_spaces(tmp_path: Path) -> None:
+    logs = tmp_path / "my logs"
+    logs.mkdir()
+    write_robot("first", tmp_path / "first")
+    shutil.copytree(tmp_path / "first/logs", logs, dirs_exist_ok=True)
+    write_robot("rover", tmp_path / "rover", [logs])
+    line = next(
+        line for line in (tmp_path / "rover/README.md").read_text().splitlines() if " import " in line
+    )
+    assert shlex.split(line)[2] == str(logs)
 
 
 def test_what_is_guessed_is_marked(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.experiments.trained_policy import load_policy
+from astra_data.experiments.trained_policy import load_policy, settings_of, task_of
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.stages.align import align
 from astra_data.stages.collect import collect
@@ -52,6 +52,21 @@ def test_it_acts_as_the_artefacts_put_together_by_hand(row: str, run: Path) -> N
         action = loaded.act(state, goal)
         assert action.shape == (2, 2)
         assert torch.equal(action, by_hand.act(state, goal))
+
+
+def test_files_of_the_users_are_found_from_everywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "runs/cart"
+    run.mkdir(parents=True)
+    own = {"damped": {"method": "damped.py:METHOD", "gain": 2.0}}
+    (run / "recipe.json").write_text(json.dumps({"task": "cart.py:TASK", "own_methods": own}))
+    for name in ("cart.py", "damped.py"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(run)
+    found = settings_of(run)
+    assert found["task"] == task_of(run) == f"{tmp_path}/cart.py:TASK"
+    assert found["own_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
 
 
 def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> None:

@@ -179,6 +179,16 @@ def test_states_in_another_order_or_other_units_are_refused(
             check_fits(logs, task)
 
 
+def test_a_dataset_of_another_rate_is_refused(tmp_path: Path) -> None:
+    logs = Dataset.open(write(tmp_path / "logs", [drive(0.1, 3)]))
+    task = task_named(CART)
+    check_fits(logs, task)
+    with pytest.raises(
+        BadInputError, match=r"has 10 steps per second, expected the 5 of .*timestep_s is 0.2"
+    ):
+        check_fits(logs, replace(task, timestep_s=0.2))
+
+
 @pytest.mark.parametrize(
     ("name", "call"),
     [

@@ -1,8 +1,10 @@
+import numpy as np
 import pytest
 import torch
 from small_cart import TASK as RAIL_CART
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
@@ -108,3 +110,22 @@ def test_commands_are_actions_in_their_units() -> None:
     action = running.act(state, goal)
     running.start(4)
     torch.testing.assert_close(running.command(state, goal), 1.5 + 2.5 * action)
+
+
+def test_states_and_goals_come_as_arrays_too_and_are_looked_at_first() -> None:
+    running = RunningPolicy(RAIL_CART, ActorCritic(ActorCriticShape(observation_size=2, action_size=1)))
+    state, goal = np.random.default_rng(0).uniform(size=(4, 2)), np.zeros((4, 1))
+    with pytest.raises(BadInputError, match=r"expected start\(count\) before the first command"):
+        running.command(state, goal)
+    running.start(4)
+    expected = running.command(torch.tensor(state, dtype=torch.float32), torch.zeros(4, 1))
+    assert torch.equal(running.command(state, goal), expected)
+    with pytest.raises(BadInputError, match=r"state: expected the shape \(4, 2\), got \(4, 3\)"):
+        running.command(np.zeros((4, 3)), goal)
+    with pytest.raises(BadInputError, match=r"state: expected the shape \(4, 2\), got \(2,\)"):
+        running.command(state[0], goal)
+    with pytest.raises(BadInputError, match=r"goal: expected the shape \(4, 1\), got \(4, 0\)"):
+        running.command(state, np.zeros((4, 0)))
+    state[2, 1] = np.nan
+    with pytest.raises(BadInputError, match="state: expected finite values, got nan in row 2, entry 1"):
+        running.command(state, goal)

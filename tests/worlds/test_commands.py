@@ -41,6 +41,7 @@ def test_they_are_a_mapping_of_names_to_bounds() -> None:
     ("bounds", "told"),
     [
         ({}, "no axis is named"),
+        ({"v": 1.5}, r"v: expected \(least, largest\), got 1.5"),
         ({"v": (1.0, 1.0)}, r"v: expected \(least, largest\), got \(1.0, 1.0\)"),
         ({"v": (0.0, 1.0), "w": (0.0, float("inf")), "u": (2.0, 1.0)}, r"w: expected .*inf\); u: expected"),
         ({"v": (1.0,)}, r"v: expected \(least, largest\)"),

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.gymnasium_robot import Env, GymnasiumRobot
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.gymnasium_robot import Env, GymnasiumRobot, observed
 from astra_data.worlds.robot import State
 
 
@@ -65,3 +66,31 @@ def test_an_environment_that_cannot_be_made_is_named() -> None:
         GymnasiumRobot("no_such_package:X-v0")
     with pytest.raises(BadInputError, match=r"gymnasium.make\('Pendulum-v77'\) fails with "):
         GymnasiumRobot("Pendulum-v77")
+
+
+def test_commands_that_are_no_actions_are_refused() -> None:
+    robot = GymnasiumRobot("Pendulum-v1")
+    robot.check_commands(Commands({"torque": (-2.0, 2.0)}))
+    with pytest.raises(
+        BadInputError, match=r"-2 to 2 in entry 0, and the command is -2\.1: narrow the task's"
+    ):
+        robot.check_commands(Commands({"torque": (-2.1, 2.0)}))
+    with pytest.raises(BadInputError, match=r"-2 to 2 in entry 0, and the command is 2\.1"):
+        robot.check_commands(Commands({"torque": (-2.0, 2.1)}))
+    two = Commands({"v": (-1.0, 1.0), "w": (-1.0, 1.0)})
+    with pytest.raises(BadInputError, match=r"Pendulum-v1 takes actions of shape \(1,\), got \(2,\): give"):
+        robot.check_commands(two)
+    robot.reset(seed=0)
+    robot.step(np.array([2.0 + 1e-6]))  # what rounding does
+    with pytest.raises(BadInputError, match="the command is 3"):
+        robot.step(np.array([3.0]))
+
+
+def test_a_function_of_commands_may_go_beyond_what_the_environment_clips() -> None:
+    robot = GymnasiumRobot("Pendulum-v1", command=torque)
+    robot.check_commands(Commands({"torque": (-9.0, 9.0)}))
+
+
+def test_an_observation_of_several_entries_needs_a_function_that_reads_it() -> None:
+    with pytest.raises(BadInputError, match="the environment shows place, speed: give GymnasiumRobot a read"):
+        observed(GymnasiumRobot("Pendulum-v1").env, {"place": np.zeros(2), "speed": np.zeros(1)})

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.own_code import code_digest, explained, file_of, is_own_code, own_object
+from astra_data.worlds.own_code import code_digest, explained, file_of, found_near, is_own_code, own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -80,6 +80,28 @@ def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
         own_object(f"{file}:TAKS")
     with pytest.raises(BadInputError, match=r"none.py does not exist: expected a Python file"):
         own_object(f"{tmp_path}/none.py:TASK")
+    with pytest.raises(
+        BadInputError, match=f"none.py does not exist in {Path.cwd()}: expected a Python file"
+    ):
+        own_object("none.py:TASK")
+
+
+def test_a_file_is_looked_up_here_and_then_above_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, project = tmp_path / "here", tmp_path / "project"
+    run = project / "runs/cart"
+    for folder in (here, run):
+        folder.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    assert found_near("cart.py:TASK", run) == "cart.py:TASK"
+    (project / "cart.py").touch()
+    assert found_near("cart.py:TASK", run) == f"{project}/cart.py:TASK"
+    (project / "runs/cart.py").touch()
+    assert found_near("cart.py:TASK", run) == f"{project}/runs/cart.py:TASK"
+    (here / "cart.py").touch()
+    assert found_near("cart.py:TASK", run) == "cart.py:TASK"
+    assert found_near("antmaze-umaze", run) == "antmaze-umaze"
 
 
 def test_a_file_is_known_by_its_digest() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from fake_dataset import COLUMNS, write_fake
-from small_cart import GIVEN, LOGS_ALONE, TASK, Rail
+from small_cart import GIVEN, LOGS_ALONE, TASK, Rail, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
@@ -169,6 +169,8 @@ def test_a_task_without_a_target_says_so() -> None:
         ({"commands": {"v": (1.0, 0.0)}}, "commands: v: expected"),
         ({"timestep_s": 0.0}, "timestep_s: expected above 0 and below 2 s.*: got 0.0"),
         ({"timestep_s": 2.0}, "timestep_s: expected above 0 and below 2 s.*: got 2.0"),
+        ({"name": "my rail"}, "name: expected letters, digits"),
+        ({"objective": Reach(horizon=0)}, "objective: horizon 0, expected 1 step or more"),
         ({"make_simulator": dict}, "dict has no abstraction.*; make_simulator: dict has no abstract_state"),
     ],
 )
