@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.exchange.importers.csv import SUFFIXES, delimiter_of
+from astra_data.exchange.importers.csv import csv_files, delimiter_of
 
 Floats = NDArray[np.float64]
 Role = Literal["time", "episode", "state", "command", "failure", "success", "reward", "left out"]
@@ -124,17 +124,17 @@ def guess(paths: Sequence[Path]) -> Logs:
     """Read CSV logs, and guess what their fields are.
 
     Args:
-        paths: files with the same header; a folder stands for the CSV files in it.
+        paths: files with the same fields; a folder stands for the CSV files in it.
 
     Raises:
         BadInputError: there is no such file, it is no CSV, files differ, a time or command is not finite, two
             fields come to the same name, or there are no commands, no states or no episodes of two rows.
     """
-    files = [file for path in paths for file in (_files(path) if path.is_dir() else [path])]
+    files = [file for path in paths for file in csv_files(path)]
     tables = {file: _numbers(file) for file in files}
     header = list(next(iter(tables.values())))
     for file, table in tables.items():
-        if list(table) != header:
+        if table.keys() != set(header):
             raise BadInputError(f"{file}: expected the fields of {files[0]}, {header}: got {list(table)}")
     joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
     try:
@@ -180,13 +180,6 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
                 f"{other} and {field.name} are both taken for {field.taken_for}: rename one, or leave it out"
             )
     return tuple(fields)
-
-
-def _files(folder: Path) -> list[Path]:
-    found = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
-    if not found:
-        raise BadInputError(f"{folder}: expected files that end in {' or '.join(SUFFIXES)}, found none")
-    return found
 
 
 def _numbers(path: Path) -> dict[str, Floats]:

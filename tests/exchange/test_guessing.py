@@ -176,6 +176,9 @@ def test_what_is_of_no_use_is_told(tmp_path: Path, text: str, expected: str) -> 
 def test_files_have_to_be_there_and_alike(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected files that end in \.csv or \.tsv, found none"):
         guess([tmp_path])
+    (tmp_path / "log.h5").write_bytes(b"\x89HDF")
+    with pytest.raises(BadInputError, match=r"log\.h5: expected files that end in .*: `import` takes others"):
+        guess([tmp_path / "log.h5"])
     with pytest.raises(BadInputError, match="there is no such file"):
         guess([tmp_path / "log.csv"])
     one = write(tmp_path / "one.csv", {"x": RAMP, "cmd": RAMP})
@@ -184,6 +187,17 @@ def test_files_have_to_be_there_and_alike(tmp_path: Path) -> None:
         BadInputError, match=r"two\.csv: expected the fields of .*one\.csv, \['x', 'cmd'\]: got"
     ):
         guess([one, two])
+    more = write(tmp_path / "more.csv", {"x": RAMP, "cmd": RAMP, "y": RAMP})
+    with pytest.raises(BadInputError, match=r"more\.csv: expected the fields of .*: got \['x', 'cmd', 'y'\]"):
+        guess([one, more])
+
+
+def test_fields_may_be_in_another_order_from_file_to_file(tmp_path: Path) -> None:
+    one = write(tmp_path / "one.csv", {"x": RAMP, "cmd": -RAMP})
+    two = write(tmp_path / "two.csv", {"cmd": -2 * RAMP, "x": 2 * RAMP})
+    logs = guess([one, two])
+    assert [values[:, 0].tolist() for values in logs.values(logs.of("state"))] == [[*RAMP], [*(2 * RAMP)]]
+    assert [values[:, 0].tolist() for values in logs.values(logs.of("command"))] == [[*-RAMP], [*(-2 * RAMP)]]
 
 
 def test_rows_without_a_number_are_left_out_and_told(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """CSV: one row per step, a header with the fields' names; read block by block."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +21,22 @@ _LONGEST_HEADER = 2**20
 def delimiter_of(name: str) -> tuple[str, str]:
     """Return what parts the fields of the file `name`, and what it is called."""
     return ("\t", "tabs") if name.endswith(".tsv") else (",", "commas")
+
+
+def csv_files(place: Path) -> list[Path]:
+    """Return the CSV files in a folder, or the one that `place` is.
+
+    Raises:
+        BadInputError: there is none.
+    """
+    inside = sorted(place.iterdir()) if place.is_dir() else [place]
+    found = [path for path in inside if path.suffix in SUFFIXES]
+    if not found:
+        raise BadInputError(
+            f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: `import` takes "
+            "others, by a mapping"
+        )
+    return found
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:

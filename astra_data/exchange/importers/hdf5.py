@@ -27,6 +27,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
+        if mapping.episodes is None:
+            _refuse_groups(stored_datasets(h5py, file), mapping, source)
         for origin, datasets in _episodes(h5py, file, mapping.episodes, str(source)):
             order = slice(None, None, -1 if mapping.transposed else 1)
             shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
@@ -100,6 +102,18 @@ def layout(source: Source) -> dict[str, Any]:
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
         fps = env_args.get("env_kwargs", {}).get("control_freq")
         return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
+
+
+def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, source: Source) -> None:
+    """Raise BadInputError where the fields are not in the file itself, but all in each of some groups."""
+    groups = {name.removesuffix(f"/{field}") for field in mapping.all_fields for name in stored} - {*stored}
+    whole = [group for group in groups if all(f"{group}/{field}" in stored for field in mapping.all_fields)]
+    if whole and not stored.keys() & set(mapping.all_fields):
+        pattern = re.sub("[0-9]+", "*", min(whole, key=natural))
+        raise BadInputError(
+            f"{source}: the fields are in {len(whole)} groups, such as {min(whole, key=natural)}: give the "
+            f'mapping episodes = "{pattern}", and each is an episode'
+        )
 
 
 def _episodes(

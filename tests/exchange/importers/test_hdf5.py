@@ -159,6 +159,24 @@ def test_groups_that_do_not_exist_are_told(tmp_path: Path) -> None:
         imported(tmp_path, tmp_path / "log.h5", 'episodes = "demos/*"\n' + MAPPING)
 
 
+def test_a_file_of_groups_asks_for_their_pattern(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        for trial in range(12):
+            for name, values in rows(trial).items():
+                file[f"flights/trial_{trial}/{name}"] = values
+        file["notes/x"] = np.zeros(3)
+    told = r"the fields are in 12 groups, such as flights/trial_0: give .* episodes = \"flights/trial_\*\""
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path)
+    dataset, _ = imported(tmp_path, path, 'episodes = "flights/trial_*"\n' + MAPPING)
+    assert len(dataset) >= 12
+    with h5py.File(path, "a") as file:
+        file["x"] = np.zeros(3)  # some of the fields
+    with pytest.raises(BadInputError, match="no field"):
+        imported(tmp_path / "again", path)
+
+
 def test_dones_that_stay_set_end_an_episode_once(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "lift.hdf5", "w") as file:
         for demo in ("demo_0", "demo_1"):
