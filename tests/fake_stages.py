@@ -39,6 +39,7 @@ class FakeConfig(Config):
     disagreement_penalty: float = 0.0
     keep_member: bool = False
     ramp_while: float = 0.0
+    held_out_share: float = 0.1
     reward: str | None = None
     correction_heads: int = 1
     members: int = 0

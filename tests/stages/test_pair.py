@@ -132,7 +132,7 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
         (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),
         (f"{MINE}:Gilder", r"has no 'Gilder'; it has .*Glider"),
         (f"{MINE}", r"expected the class after a colon"),
-        ("nowhere.py:Glider", r"nowhere.py does not exist: expected a Python file"),
+        ("nowhere.py:Glider", r"nowhere.py does not exist in .*: expected a Python file"),
         ("antmaze-umase", r"unknown task 'antmaze-umase': did you mean 'antmaze-umaze'"),
     ],
 )
