@@ -195,13 +195,13 @@ def make(
     """
     check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
-    if any(stage_of(item) == "label" and not finished(item, experiment) for item in items):
-        data_condition(recipe)
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
+        if any(stage_of(item) == "label" and not finished(item, experiment) for item in items):
+            data_condition(recipe)
         if is_own_code(recipe.task):
             _check_task(experiment)
         clean(folder)

@@ -61,7 +61,7 @@ def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest
         check(recipe, root=recipe.parent / "runs")
     with pytest.raises(BadInputError, match=r"data: no dataset 'logs' in .*: import or pull it first"):
         run(recipe, root=recipe.parent / "runs")
-    assert not (recipe.parent / "runs").exists()
+    assert not (recipe.parent / "runs/rail/recipe.json").exists()
 
 
 def test_data_are_not_asked_for_once_they_are_labelled(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -270,13 +270,13 @@ def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
 
 
 def test_a_recipe_with_data_is_labelled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text('data = "walks"\n' + recipe.read_text())
-    with pytest.raises(BadInputError, match=r"r\.toml has data, walks: there is nothing to collect"):
+    recipe.write_text('data = "me/walks"\n' + recipe.read_text())
+    with pytest.raises(BadInputError, match=r"r\.toml has data, me/walks: there is nothing to collect"):
         run_stage(recipe, "collect", root=tmp_path)
     folder = run(recipe, root=tmp_path, jobs=1, until="pair")
-    assert asked(folder / "label/seed_0")["data"] == "walks"
+    assert asked(folder / "label/seed_0")["data"] == "me/walks"
     assert asked(folder / "pair/seed_0")["dataset"] == str(folder / "label/seed_0")
-    recipe.write_text(recipe.read_text().replace('"walks"', '"runs"'))
+    recipe.write_text(recipe.read_text().replace('"me/walks"', '"runs"'))
     with pytest.raises(RecipeError, match="data changed in the recipe since"):
         run(recipe, root=tmp_path, jobs=1, until="pair")
     (tmp_path / "runs/meta").mkdir(parents=True)
