@@ -19,7 +19,8 @@ def stage_field(stage: Stage) -> tuple[Any, Any]:
     if stage.name == "collect":
         return stage.config | None, _FILLED
     if stage.name == "align":
-        return Annotated[stage.config, BeforeValidator(_held_out_as_in_ground)], _FILLED
+        # It would be judged on what grounding trained on.
+        return Annotated[stage.config, _agreeing("ground", "held_out_share", {"held_out_share"})], _FILLED
     if stage.name == "select":
         return stage.config | None, Field(default=None, exclude_if=lambda table: table is None)
     return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
@@ -27,7 +28,7 @@ def stage_field(stage: Stage) -> tuple[Any, Any]:
 
 def plus_field(train: Any, default: Any) -> tuple[Any, Any]:  # noqa: ANN401 - a type and a pydantic field
     """Return the type and the default of the training of `_plus` rows, which is laid over `train`."""
-    return Annotated[train, BeforeValidator(_laid_over_train)], default
+    return Annotated[train, _agreeing("train", "learner", None)], default
 
 
 def method_field(table: Table) -> tuple[Any, Any]:
@@ -37,23 +38,19 @@ def method_field(table: Table) -> tuple[Any, Any]:
     return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
 
 
-def _laid_over_train(overrides: object, info: ValidationInfo) -> object:
-    train = info.data.get("train")
-    if train is None or not isinstance(overrides, dict):
-        return overrides
-    if (asked := overrides.get("learner", train.learner)) != train.learner:
-        raise ValueError(f"learner: expected that of [train], '{train.learner}', got '{asked}'")
-    return train.model_dump() | overrides
+def _agreeing(table: str, key: str, taken: set[str] | None) -> BeforeValidator:
+    """Return what lays a table over the settings `taken`, or all, of `table`, and refuses another `key`."""
 
+    def read(overrides: object, info: ValidationInfo) -> object:
+        other = info.data.get(table)
+        if other is None or not isinstance(overrides, dict):
+            return overrides
+        expected = getattr(other, key)
+        if (asked := overrides.get(key, expected)) != expected:
+            raise ValueError(f"{key}: expected that of [{table}], {expected!r}, got {asked!r}")
+        return other.model_dump(include=taken) | overrides
 
-def _held_out_as_in_ground(align: object, info: ValidationInfo) -> object:
-    """Let alignment hold out the episodes that grounding does: it would be judged on what that trained on."""
-    ground = info.data.get("ground")
-    if ground is None or not isinstance(align, dict):
-        return align
-    if (asked := align.get("held_out_share", ground.held_out_share)) != ground.held_out_share:
-        raise ValueError(f"held_out_share: expected that of [ground], {ground.held_out_share}, got {asked}")
-    return {"held_out_share": ground.held_out_share} | align
+    return BeforeValidator(read)
 
 
 def _laid_over(ranges: Literal["randomized", "wide"]) -> Callable[..., Any]:

@@ -200,8 +200,6 @@ def make(
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
-        if any(stage_of(item) == "label" and not finished(item, experiment) for item in items):
-            data_condition(recipe)
         if is_own_code(recipe.task):
             _check_task(experiment)
         clean(folder)
@@ -213,6 +211,8 @@ def make(
                     "a copy, save its whole episodes with `astra-data repair`, or remove it"
                 )
         items = [item for item in items if item.key in again or not finished(item, experiment)]
+        if any(stage_of(item) == "label" for item in items):
+            data_condition(recipe)
         _check_inputs(experiment, items)
         experiment.link_borrowed()
         console = Console()

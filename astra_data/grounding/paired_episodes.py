@@ -199,7 +199,10 @@ class PairedEpisodes:
 
     def _of_recordings(self, each: Tensor, chosen: NDArray[np.intp]) -> "PairedEpisodes":
         """Return the episodes whose recordings, of which `each` (E,) has the number, are `chosen` (n,)."""
-        return self.select(torch.cat([(each == recording).nonzero()[:, 0] for recording in chosen]))
+        place = each.new_full((int(each.max()) + 1,), len(chosen))
+        place[torch.from_numpy(chosen).to(each.device)] = torch.arange(len(chosen), device=each.device)
+        places, order = place[each].sort(stable=True)
+        return self.select(order[places < len(chosen)])
 
     def steps(self, values: Tensor) -> Tensor:
         """Return the real steps of `values` (E, T, ...), one after another, (N, ...)."""

@@ -15,6 +15,7 @@ from astra_data.worlds.robot import State
 Env = gymnasium.Env[Any, Any]
 _SLACK = 1e-5
 """Share of the range of an action by which rounding may carry it beyond."""
+_ADVICE = "give GymnasiumRobot a command, a function of a command and a state that returns an action"
 
 
 def observed(env: Env, observation: Any) -> State:  # noqa: ANN401 - whatever the environment shows
@@ -94,6 +95,9 @@ class GymnasiumRobot:
         """
         self.name, self.env = env_id, made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
+        if isinstance(space := self.env.action_space, gymnasium.spaces.Box):
+            slack = _SLACK * (space.high - space.low)
+            self._least, self._largest = space.low - slack, space.high + slack
 
     def reset(self, seed: int | None = None) -> State:
         """Start an episode of the environment, at random by `seed`; return the state (S,)."""
@@ -125,18 +129,16 @@ class GymnasiumRobot:
         action, space = self._command(command, self._state), self.env.action_space
         if not isinstance(space, gymnasium.spaces.Box):
             return action
-        advice = "give GymnasiumRobot a command, a function of a command and a state that returns an action"
         if np.shape(action) != space.shape:
             raise BadInputError(
-                f"{self.name} takes actions of shape {space.shape}, got {np.shape(action)}: {advice}"
+                f"{self.name} takes actions of shape {space.shape}, got {np.shape(action)}: {_ADVICE}"
             )
         if self._command is as_given:
-            slack = _SLACK * (space.high - space.low)
-            beyond = np.flatnonzero((action < space.low - slack) | (action > space.high + slack))
+            beyond = np.flatnonzero((action < self._least) | (action > self._largest))
             if len(beyond):
                 low, high, given = (float(np.ravel(of)[beyond[0]]) for of in (space.low, space.high, action))
                 raise BadInputError(
                     f"{self.name} takes actions of {low:g} to {high:g} in entry {beyond[0]}, and the command "
-                    f"is {given:g}: narrow the task's commands, or {advice}"
+                    f"is {given:g}: narrow the task's commands, or {_ADVICE}"
                 )
         return action

@@ -36,7 +36,8 @@ def found_near(name: str, folder: Path) -> str:
     place = Path(name.rpartition(":")[0])
     if place.suffix != ".py" or place.is_file():
         return name
-    above = (folder.resolve(), *folder.resolve().parents)
+    folder = folder.resolve()
+    above = (folder, *folder.parents)
     return next((str(one / name) for one in above if (one / place).is_file()), name)
 
 

@@ -103,6 +103,15 @@ class RobotEnv:
         """Restart the random numbers at `seed`."""
         self._seed, self._episodes = seed, 0
 
+    def check_commands(self) -> None:
+        """Let a robot that has `check_commands` check the bounds of its commands; no robot moves.
+
+        Raises:
+            BadInputError: they are not its own.
+        """
+        if check := getattr(self._robots[0], "check_commands", None):
+            check(self._commands)
+
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Restart the robots in `mask` (B,), by default all; return observations (B, O)."""
         rows = range(self.num_envs) if mask is None else mask.nonzero().squeeze(1).tolist()

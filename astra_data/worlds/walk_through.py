@@ -11,6 +11,7 @@ from astra_data.core.seeding import generator
 from astra_data.worlds.expecting import expect, first, judged, paid
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
+from astra_data.worlds.robot import RobotEnv
 from astra_data.worlds.task import Task
 
 _COUNT = 3
@@ -87,8 +88,8 @@ def _robot(task: Task) -> None:
         env = task.target(1, seed=0)
         env.reset()
         abstract = task.abstraction(env.state)
-        if check := getattr(task.robot(), "check_commands", None):
-            check(task.limits)
+        if isinstance(env, RobotEnv):
+            env.check_commands()
     expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
 
 

@@ -27,9 +27,9 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     h5py = optional("h5py", "hdf5")
     with h5py.File(source.path, "r") as file:
-        if mapping.episodes is None:
-            _refuse_groups(stored_datasets(h5py, file), mapping, source)
         for origin, datasets in _episodes(h5py, file, mapping.episodes, str(source)):
+            if mapping.episodes is None:
+                _refuse_groups(datasets, mapping, origin)
             order = slice(None, None, -1 if mapping.transposed else 1)
             shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
             single = [name for name, shape in shapes.items() if not shape and mapping.episodes == NUMBERED]
@@ -104,15 +104,16 @@ def layout(source: Source) -> dict[str, Any]:
         return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
 
 
-def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, source: Source) -> None:
+def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, origin: str) -> None:
     """Raise BadInputError where the fields are not in the file itself, but all in each of some groups."""
     groups = {name.removesuffix(f"/{field}") for field in mapping.all_fields for name in stored} - {*stored}
     whole = [group for group in groups if all(f"{group}/{field}" in stored for field in mapping.all_fields)]
     if whole and not stored.keys() & set(mapping.all_fields):
-        pattern = re.sub("[0-9]+", "*", min(whole, key=natural))
+        first = min(whole, key=natural)
+        pattern = re.sub("[0-9]+", "*", first)
         raise BadInputError(
-            f"{source}: the fields are in {len(whole)} groups, such as {min(whole, key=natural)}: give the "
-            f'mapping episodes = "{pattern}", and each is an episode'
+            f"{origin}: the fields are in {len(whole)} groups, such as {first}: give the mapping episodes = "
+            f'"{pattern}", and each is an episode'
         )
 
 
