@@ -38,6 +38,9 @@ class Admission:
         Raises:
             BadInputError: it does not fit; lists every fault.
         """
+        if not isinstance(episode, Episode):
+            kind = type(episode).__name__
+            raise BadInputError(f"expected an Episode, made with Episode(uid, columns), got a {kind}")
         faults = self._faults(episode)
         if faults:
             raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")

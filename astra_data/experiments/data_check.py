@@ -8,6 +8,8 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.experiments.condition import Condition
 from astra_data.experiments.recipe import Recipe
+from astra_data.grounding.paired_episodes import divided, recordings_of
+from astra_data.methods import METHODS, base_method
 from astra_data.stages.label import check_fits, is_address
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import task_named
@@ -22,7 +24,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
     """Return the condition of a recipe's `data`; None if it has none, or has yet to pull it.
 
     Raises:
-        BadInputError: there are no such data, their columns are not those of the task, or they were paired.
+        BadInputError: there are no such data, their columns are not those of the task, they were paired, or
+            none is left to train on where some are held out.
     """
     if recipe.data is None or is_address(recipe.data):
         return None
@@ -37,6 +40,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
         )
     task = task_named(recipe.task)
     check_fits(source, task)
+    if any(METHODS[base_method(row)].grounds for row in recipe.methods) and "held_out" not in source.metadata:
+        divided(source.reference, len(set(recordings_of(source))), recipe.ground.held_out_share, seed=0)
     return Condition("finished", "; ".join(differing_bounds(task.limits, source)))
 
 

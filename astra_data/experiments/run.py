@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 
 from astra_data.core.config import did_you_mean
-from astra_data.core.durable import clean, make_folder, move, write_file
+from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import held
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
@@ -195,8 +195,7 @@ def make(
     """
     check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    with held(folder) as ours:
+    with folder_for(folder / "recipe.json"), held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()

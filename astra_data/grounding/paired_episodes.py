@@ -92,7 +92,7 @@ class PairedEpisodes:
         names = [*_COLUMNS, *({GOAL, REWARD, SUCCESS} & dataset.features.keys())]
         columns = dataset.columns(names)
         lengths, held_out = dataset.lengths, np.array(dataset.metadata.get("held_out", ()), dtype=bool)
-        uids, recordings = dataset.uids, _recordings(dataset)
+        uids, recordings = dataset.uids, recordings_of(dataset)
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0
@@ -189,12 +189,7 @@ class PairedEpisodes:
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
         each = torch.arange(len(self)) if self.recordings is None else self.recordings
         names, each = each.unique(return_inverse=True)
-        training, held_out = held_out_episodes(len(names), held_out_share, seed)
-        if not len(training):
-            raise BadInputError(
-                f"{self.reference} has {len(names)} recorded episodes, of which {len(held_out)} would be "
-                "held out: expected more episodes, or a smaller held_out_share"
-            )
+        training, held_out = divided(self.reference, len(names), held_out_share, seed)
         return self._of_recordings(each, training), self._of_recordings(each, held_out)
 
     def _of_recordings(self, each: Tensor, chosen: NDArray[np.intp]) -> "PairedEpisodes":
@@ -219,6 +214,23 @@ class PairedEpisodes:
         return replace(windows, mask=windows.mask * is_drawn), self.target_state[episodes, steps]
 
 
+def divided(
+    reference: str, recordings: int, held_out_share: float, seed: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the numbers of the recordings of the dataset `reference` to train on, and of those held out.
+
+    Raises:
+        BadInputError: none is left to train on.
+    """
+    training, held_out = held_out_episodes(recordings, held_out_share, seed)
+    if not len(training):
+        raise BadInputError(
+            f"{reference}: recorded episodes: {recordings}, of which {len(held_out)} would be held out, and "
+            "none is left to train on: record more, or make held_out_share smaller"
+        )
+    return training, held_out
+
+
 def _made_up(dataset: Dataset, columns: Mapping[str, Array]) -> NDArray[np.bool_]:
     """Return which episodes (E,) end with a terminated step whose next state is its own, to the bit."""
     last = dataset.lengths.cumsum() - 1
@@ -231,7 +243,7 @@ def _made_up(dataset: Dataset, columns: Mapping[str, Array]) -> NDArray[np.bool_
     return made_up
 
 
-def _recordings(dataset: Dataset) -> NDArray[np.int64]:
+def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
     """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
     sources = dataset.metadata.get("source_episode", [None] * len(dataset))
     numbers: dict[int, int] = {}

@@ -217,6 +217,8 @@ def _check(source: Dataset, pairing: Pairing) -> None:
     faults = [f"no column {name}" for name in (STATE, ACTION, NEXT_STATE) if name not in source.features]
     if ABSTRACT_STATE in source.features:
         faults.append(f"{ABSTRACT_STATE} already: it has been paired")
+    if pairing.fps not in (None, source.info["fps"]):
+        faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")
     if faults:
         raise BadInputError(f"{source.root} has {' and '.join(faults)}; expected a dataset to be paired")
 

@@ -32,6 +32,7 @@ class Pairing:
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
         simulator: builds B simulators.
         commands: the bounds of the task's commands; None for a simulator without a task.
+        fps: the task's steps per second; None for a simulator without a task.
     """
 
     id: str
@@ -41,6 +42,7 @@ class Pairing:
     abstraction: Callable[[Array], Array]
     simulator: Callable[[int], AbstractSimulator]
     commands: Commands | None = None
+    fps: int | None = None
 
 
 def pairing_named(name: str) -> Pairing:
@@ -66,6 +68,7 @@ def pairing_named(name: str) -> Pairing:
             abstraction=made.abstraction,
             simulator=made.own_simulator,
             commands=None if made.limits.are_normal else made.limits,
+            fps=made.fps,
         )
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]

@@ -34,6 +34,13 @@ def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_no_episode_is_refused() -> None:
+    with pytest.raises(
+        BadInputError, match=r"expected an Episode, made with Episode\(uid, columns\), got a dict"
+    ):
+        Admission(COLUMNS).admit(fake_columns(4, seed=1))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("name", "frame", "value", "fault"),
     [

@@ -15,13 +15,14 @@ from astra_data.stages.pair import pair
 ROOT = Path(__file__).parents[2]
 
 
-def write_logs(folder: Path, least: float, largest: float, *, state_size: int = 2) -> None:
+def write_logs(folder: Path, least: float, largest: float, *, state_size: int = 2, episodes: int = 2) -> None:
     """Write pushes of the small cart, whose bounds are -1 and 4."""
     columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
     with writer(folder, columns=columns, fps=10) as logs:
-        logs.add(Episode(0, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
+        for uid in range(episodes):
+            logs.add(Episode(uid, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
 
 
 @pytest.fixture
@@ -61,7 +62,7 @@ def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest
         check(recipe, root=recipe.parent / "runs")
     with pytest.raises(BadInputError, match=r"data: no dataset 'logs' in .*: import or pull it first"):
         run(recipe, root=recipe.parent / "runs")
-    assert not (recipe.parent / "runs/rail/recipe.json").exists()
+    assert not (recipe.parent / "runs").exists()
 
 
 def test_data_are_not_asked_for_once_they_are_labelled(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,6 +90,22 @@ def test_data_that_were_paired_are_refused(recipe: Path) -> None:
 def test_data_of_another_robot_are_refused(recipe: Path) -> None:
     write_logs(recipe.parent / "logs", -1.0, 4.0, state_size=3)
     with pytest.raises(BadInputError, match=r"state has 3 values, expected those of rail-cart: 2"):
+        check(recipe, root=recipe.parent / "runs")
+
+
+def test_data_of_which_none_is_left_to_train_on_are_refused(recipe: Path) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0, episodes=1)
+    told = r"fake@data-1.0.0: recorded episodes: 1, of which 1 would be held out, and none is left"
+    with pytest.raises(BadInputError, match=told):
+        check(recipe, root=recipe.parent / "runs")
+    recipe.write_text(recipe.read_text().replace("nas", "direct_transfer"))
+    assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
+
+
+def test_data_are_divided_as_the_recipe_says(recipe: Path) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0)
+    recipe.write_text(recipe.read_text() + "[ground]\nheld_out_share = 0.9\n")
+    with pytest.raises(BadInputError, match=r"recorded episodes: 2, of which 2 would be held out"):
         check(recipe, root=recipe.parent / "runs")
 
 

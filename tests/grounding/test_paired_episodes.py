@@ -190,7 +190,7 @@ def test_copies_are_held_out_with_their_recording(tmp_path: Path) -> None:
 
 
 def test_too_few_episodes_are_not_split(episodes: PairedEpisodes) -> None:
-    with pytest.raises(BadInputError, match="has 5 recorded episodes, of which 5 would be held out"):
+    with pytest.raises(BadInputError, match="recorded episodes: 5, of which 5 would be held out"):
         episodes.split(0.95, seed=0)
     one = episodes.select(torch.tensor([2]))
     assert len(one) == 1

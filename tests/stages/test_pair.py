@@ -7,7 +7,7 @@ import pytest
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -143,6 +143,19 @@ def test_a_simulator_that_does_not_fit_is_refused(
         pair(simulator, PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> None:
+    source = Dataset.open(collected)
+    description = {"name": "slow", "stage": "import", "environment": source.description["environment"]}
+    slow = tmp_path / "slow"
+    with DatasetWriter(slow, source.schema, fps=10, task="slow", description=description) as writer:
+        writer.add(next(source.episodes()))
+    told = r"slow has 10 steps per second, where point_mass makes 20; expected a dataset to be paired"
+    with pytest.raises(BadInputError, match=told):
+        pair("antmaze-umaze", PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
+    simulator = f"{MINE}:Glider"  # of no task, and of no rate
+    pair(simulator, PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
 
 
 def test_a_paired_dataset_is_not_paired_again(paired: Path, tmp_path: Path) -> None:

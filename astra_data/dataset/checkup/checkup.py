@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 from astra_data.dataset.checkup.clock import Clock, is_clock
 from astra_data.dataset.checkup.commands import GivenCommands
+from astra_data.dataset.checkup.continuity import Continuity
 from astra_data.dataset.checkup.dead import DeadChannels
 from astra_data.dataset.checkup.duplicates import Duplicates
 from astra_data.dataset.checkup.ends import EpisodeEnds
@@ -61,20 +62,21 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     fps, successes = int(dataset.info["fps"]), dataset.successes()
     columns = {column.name: column for column in dataset.schema}
     clocks = [Clock(column, fps) for column in columns.values() if is_clock(column)]
-    ends, duplicates = EpisodeEnds(successes), Duplicates()
+    ends, duplicates, continuity = EpisodeEnds(successes), Duplicates(), Continuity()
     dead = DeadChannels(list(columns.values()))
     outliers = Outliers(columns.get(STATE), successes)
     commands = GivenCommands(columns[ACTION], fps) if ACTION in columns else None
     jumps = Jumps(columns[STATE], int(dataset.lengths.sum())) if STATE in columns else None
     names = [column.name for column in columns.values() if column.name in LOOKED_AT or is_clock(column)]
-    parts: list[_Part] = [ends, duplicates, dead, outliers, *clocks]
+    parts: list[_Part] = [ends, duplicates, continuity, dead, outliers, *clocks]
     parts += [part for part in (commands, jumps) if part is not None]
     for episode in dataset.episodes(names or list(columns)):
         for part in parts:
             part.add(episode)
     findings = [finding for clock in clocks for finding in clock.findings(called)]
     findings += jumps.findings(dataset, called) if jumps else []
-    findings += duplicates.findings(called) + dead.findings(called) + outliers.findings(called)
+    findings += continuity.findings() + duplicates.findings(called)
+    findings += dead.findings(called) + outliers.findings(called)
     findings += (commands.findings() if commands else []) + ends.findings()
     rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no column of times to compare it with"]
     summary = [f"endings: {ends}"]

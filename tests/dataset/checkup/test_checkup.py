@@ -71,6 +71,11 @@ def short(uid: int, columns: Columns) -> Columns | None:
     return toy_columns(uid, 12) if uid == 6 else None
 
 
+def torn(uid: int, columns: Columns) -> None:
+    if uid == 2:
+        columns[NEXT_STATE][60, 0] += 0.001
+
+
 def rewarded(uid: int, columns: Columns) -> None:
     if uid == 8:
         columns["next.reward"] += 5.0
@@ -109,6 +114,7 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (unused, "note", (), "constant in all steps: w of action", "its effect cannot be learned"),
     (copied, "warning", (11, 12), "11 has the states and actions of 2", "--episode 11 --episode 12"),
     (short, "note", (6,), "6 by length 12 steps, median 100", "delete walks --episode 6"),
+    (torn, "warning", (2,), "not the state of the row after: 1 of 2970", "rows are missing"),
     (rewarded, "note", (8,), "8 by return 59", "delete walks --episode 8"),
     (far, "note", (1,), "1 by y of observation.state, which reaches -4", "delete walks --episode 1"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
