@@ -72,7 +72,7 @@ def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows())
     path.write_text(path.read_text().replace("True", "perhaps"))
     with pytest.raises(
-        BadInputError, match=r"log.csv row \d+: field 'fell': expected numbers.*got 'perhaps'"
+        BadInputError, match=r"log.csv line \d+: field 'fell': expected numbers.*got 'perhaps'"
     ):
         imported(tmp_path, path)
 
@@ -80,14 +80,14 @@ def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
 def test_the_text_among_numbers_is_quoted(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows() | {"x": np.array(["0.5", "abc"] + ["1.5"] * 18)})
     with pytest.raises(
-        BadInputError, match=r"row 1: field 'x': expected numbers, or true and false, got 'abc'"
+        BadInputError, match=r"line 3: field 'x': expected numbers, or true and false, got 'abc'"
     ):
         imported(tmp_path, path)
 
 
 def test_flags_among_numbers_are_no_numbers(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows() | {"x": np.array(["0.5"] * 7 + ["true"] + ["1.5"] * 12)})
-    with pytest.raises(BadInputError, match=r"row 7: field 'x': expected .*, got 'true'"):
+    with pytest.raises(BadInputError, match=r"line 9: field 'x': expected .*, got 'true'"):
         imported(tmp_path, path)
 
 
