@@ -130,7 +130,7 @@ class Direct:
         left = {field.short: field for field in logs.of("state")}
         moved: list[Field | None] = []
         for command in logs.of("command"):
-            names = (command.short, _SPEED.sub("", command.short), command.short.lstrip("u"))
+            names = (_SPEED.sub("", command.short), command.short, command.short.lstrip("u"))
             moved.append(next((left.pop(name) for name in names if name in left), None))
         rest = [field for short, field in left.items() if not _SPEED.match(short)]
         filled = []

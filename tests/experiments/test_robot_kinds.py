@@ -107,6 +107,8 @@ def test_each_command_moves_a_state_of_its_own(tmp_path: Path) -> None:
         ({"x": T, "y": 2 * T, "cmd_uy": T % 5, "cmd_ux": T % 3}, ["y", "x"]),
         ({"a": T, "cmd_w_rad_s": T % 3}, ["a"]),  # in a unit that is not known
         ({"x_m": T, "cmd_1": T % 3}, ["x"]),
+        ({"x": T, "z": 2 * T, "vx": T % 4, "vz": T % 5, "cmd_vx": T % 3, "cmd_vz": T % 2}, ["x", "z"]),
+        ({"vx": T % 4, "cmd_vx": T % 3}, ["vx"]),  # of no position
     ):
         assert [field.short for field in Direct.of(logs(tmp_path, **columns)).moved] == expected
 
