@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.checkup.clock import Clock
 from astra_data.dataset.checkup.jumps import full_turns, shortest
 from astra_data.dataset.columns import (
     DONE,
@@ -54,6 +55,7 @@ class Tally:
         short_rows: rows of episodes that were too short.
         rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
         endings: how the episodes end.
+        clock: the recorded rate, gaps and jitter, where the mapping names the times.
     """
 
     rows: int = 0
@@ -69,6 +71,7 @@ class Tally:
     short_rows: int = 0
     rows_after_end: int = 0
     endings: Endings = field(default_factory=Endings)
+    clock: str = ""
 
 
 class Cutter:
@@ -90,6 +93,7 @@ class Cutter:
         self._metadata: dict[str, Scalar] = {}
         self._ended = False
         self._seconds, self._usual_seconds, self._steps = 0.0, 0.0, 0
+        self._clock = Clock(mapping.time or "", mapping.fps)
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -169,7 +173,9 @@ class Cutter:
         return kept | {NEXT_STATE: state[1:]}
 
     def check_rate(self) -> None:
-        """Compare fps to the rates measured from the times: the mean one, and the usual one without pauses.
+        """Compare fps to the rates measured from the times, and tally what the clock tells.
+
+        They are the mean rate, and the usual one without pauses.
 
         Raises:
             BadInputError: both differ by more than `RATE_TOLERANCE`.
@@ -186,6 +192,8 @@ class Cutter:
             raise BadInputError(
                 f"'{self._mapping.time}' gives {rates[0]:.4g} rows per second, but fps is {fps}: {cure}"
             )
+        if self._steps:
+            self.tally.clock = str(self._clock)
 
     def _count(
         self, block: Block, row: int, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
@@ -233,6 +241,7 @@ class Cutter:
             self._seconds += float(regular.sum())
             self._usual_seconds += float(np.median(regular)) * len(regular)
             self._steps += len(regular)
+            self._clock.count(regular)
         return gaps
 
     def _begins(self, counters: NDArray[np.int64], kept: dict[str, Array]) -> tuple[Mask, Mask]:

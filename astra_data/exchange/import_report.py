@@ -32,11 +32,12 @@ class ImportReport:
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
+        rate = f"rate: {tally.clock}\n" if tally.clock else ""
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
             f"split points: {points}\n"
-            f"{ends}"
+            f"{ends}{rate}"
             f"rejected rows: {tally.rejected_rows}{first}\n"
             f"last rows without a next state: {_last_rows(tally)}; "
             f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}"

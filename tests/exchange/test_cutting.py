@@ -155,6 +155,19 @@ def test_no_gap_hides_behind_a_time_that_is_not_finite(block_rows: int) -> None:
     assert cutting.tally.split_points == {"gap": 1}
 
 
+@BLOCKS
+def test_gaps_that_are_not_cut_and_jitter_are_tallied(block_rows: int) -> None:
+    seconds = np.arange(200) / 10
+    seconds[1::2] += 0.004
+    seconds[70:] += 0.3
+    seconds[150:] += 3.0
+    cutting = cutter(time="t", split={"gap_s": 1.0})
+    cut(cutting, block_rows, x=np.zeros(200), t=seconds)
+    cutting.check_rate()
+    assert cutting.tally.split_points == {"gap": 1}
+    assert cutting.tally.clock == "10 Hz declared, 9.994 Hz by t; gaps: 1, jitter 4.1 % of a period"
+
+
 def test_a_rate_that_is_not_fps_is_told() -> None:
     cutting = cutter(time="t", time_scale=0.001)
     cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)

@@ -15,6 +15,12 @@ def test_what_was_dropped_is_counted_aloud() -> None:
     assert report.startswith("out: 2 episodes, 7 frames from 9 rows in 0.2 s\nsplit points: file 1\n")
 
 
+def test_the_recorded_rate_is_told_where_there_is_one() -> None:
+    tally = Tally(rows=9, clock="10 Hz declared, 9.9 Hz by t; gaps: 1, jitter 4.0 % of a period")
+    assert f"\nrate: {tally.clock}\nrejected rows" in str(ImportReport(Path("out"), 2, 7, tally, 0.25))
+    assert "rate" not in str(ImportReport(Path("out"), 2, 7, Tally(rows=9), 0.25))
+
+
 def test_a_lost_success_is_told_with_what_to_do() -> None:
     told = "3 dropped (2 succeeded, which is lost unless next.terminated is set there), in"
     assert told in losses(Tally(rows=9, last_rows=3, last_successes=2))

@@ -87,6 +87,10 @@ def test_a_pause_changes_no_rate(tmp_path: Path) -> None:
     assert not with_times(tmp_path, seconds).split_points
 
 
+def test_without_times_there_is_no_rate_to_tell(tmp_path: Path) -> None:
+    assert "rate" not in str(imported(tmp_path, write_table(tmp_path / "log.npz", rows()))[1])
+
+
 def test_times_that_come_in_bursts_have_a_mean_rate(tmp_path: Path) -> None:
     seconds = np.arange(20) // 4 * 0.45 + np.arange(20) % 4 * 0.01
     assert not with_times(tmp_path, seconds).split_points

@@ -1,6 +1,7 @@
 """The declared rate against recorded times: gaps, jitter, clocks that stand still."""
 
 import re
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,28 +33,35 @@ def is_clock(column: Column) -> bool:
 
 
 class Clock:
-    """The times of a dataset in `column` (T,), in its unit, by default s."""
+    """The times that are called `name`, in `scale` s, of a recording of `fps` declared steps per second."""
 
-    def __init__(self, column: Column, fps: int) -> None:
-        self._name, self._fps = column.name, fps
-        unit = column.units[0] or column.name.rpartition("_")[2]
-        self._scale = _SECONDS.get(unit, 1.0)
+    def __init__(self, name: str, fps: int, scale: float = 1.0) -> None:
+        self._name, self._fps, self._scale = name, fps, scale
         self._bins: NDArray[np.int64] = np.zeros(FINE * MOST_PERIODS + 1, np.int64)
         self._longest_s: list[float] = []
         self._standing: list[int] = []
         self._standing_steps = 0
         self._uids: list[int] = []
 
+    @classmethod
+    def of(cls, column: Column, fps: int) -> Self:
+        """Return a clock of the times in `column` (T,), in its unit, by default s."""
+        unit = column.units[0] or column.name.rpartition("_")[2]
+        return cls(column.name, fps, _SECONDS.get(unit, 1.0))
+
     def add(self, episode: Episode) -> None:
         """Count the steps between the times of the next episode."""
-        steps_s = np.diff(episode.columns[self._name].astype(np.float64)) * self._scale
+        self.count(np.diff(episode.columns[self._name].astype(np.float64)) * self._scale, episode.uid)
+
+    def count(self, steps_s: NDArray[np.float64], uid: int = 0) -> None:
+        """Count steps of the episode `uid`, (n,) in s."""
         goes_on = steps_s[steps_s > 0]
         bins = np.rint(goes_on * self._fps * FINE).clip(0, FINE * MOST_PERIODS).astype(np.int64)
         self._bins += np.bincount(bins, minlength=len(self._bins))
-        self._uids.append(episode.uid)
+        self._uids.append(uid)
         self._longest_s.append(float(goes_on.max(initial=0.0)))
         if len(goes_on) < len(steps_s):
-            self._standing.append(episode.uid)
+            self._standing.append(uid)
             self._standing_steps += len(steps_s) - len(goes_on)
 
     @property

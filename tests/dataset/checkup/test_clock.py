@@ -10,7 +10,7 @@ SECONDS = Column("time", astra={"unit": ["s"]})
 
 def clock(*steps_s: ArrayLike, fps: int = 10) -> Clock:
     """Times in ms."""
-    found = Clock(Column("time", "int64", astra={"unit": ["ms"]}), fps)
+    found = Clock.of(Column("time", "int64", astra={"unit": ["ms"]}), fps)
     for uid, steps in enumerate(steps_s):
         times = np.cumsum([0, *np.asarray(steps)]) * 1000
         found.add(Episode(uid, {"time": np.rint(times).astype(np.int64)}))
@@ -46,7 +46,7 @@ def test_clocks_are_known_by_their_name(column: Column, is_one: bool) -> None:
     ],
 )
 def test_times_have_units(column: Column, per_second: int) -> None:
-    found = Clock(column, 2)
+    found = Clock.of(column, 2)
     found.add(Episode(0, {column.name: np.arange(50, dtype=np.int64) * per_second}))
     assert found.period_s == pytest.approx(1.0)
 
@@ -55,7 +55,7 @@ def test_times_have_units(column: Column, per_second: int) -> None:
     ("period_s", "found"), [(0.0955, False), (0.1, False), (0.105, False), (0.106, True), (0.095, True)]
 )
 def test_a_rate_that_is_off_by_over_a_twentieth_is_wrong(period_s: float, found: bool) -> None:
-    timed = Clock(SECONDS, 10)
+    timed = Clock.of(SECONDS, 10)
     timed.add(Episode(0, {"time": (np.arange(100) * period_s).astype(np.float32)}))
     assert ["is declared" in finding.what for finding in timed.findings("walks")] == [True] * found
 
@@ -116,7 +116,7 @@ def test_time_that_never_goes_on_has_no_rate() -> None:
 
 
 def test_seconds_since_1970_in_float32_have_no_rate() -> None:
-    timed = Clock(SECONDS, 10)
+    timed = Clock.of(SECONDS, 10)
     timed.add(Episode(0, {"time": (1.6e9 + np.arange(5000) / 10).astype(np.float32)}))
     (finding,) = timed.findings("walks")
     assert "stands still" in finding.what
