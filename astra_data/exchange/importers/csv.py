@@ -103,7 +103,8 @@ def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Arr
     odd = [cell for cell in cells if not any(_is(cell[1], kind) for kind in (pa.float64(), pa.bool_()))]
     number, text = (odd or [cell for cell in cells if not _is(cell[1], pa.float64())])[0]
     raise BadInputError(
-        f"{source} line {row + number + 2}: field '{field}': expected numbers, or true and false, got '{text}'"
+        f"{source} line {row + number + 2}: field '{field}': expected numbers, or true and false, "
+        f"got '{text}'"
     )
 
 
