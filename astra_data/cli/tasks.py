@@ -1,10 +1,17 @@
 """`astra-data tasks` and `astra-data label`."""
 
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from astra_data.cli.arguments import DatasetName, NewName, Out
+
+if TYPE_CHECKING:
+    from astra_data.worlds.task import Task
+
+_SHOWN = 4
+"""Names that a row lists."""
 
 
 def tasks(
@@ -29,20 +36,37 @@ def tasks(
 
         if faults := check_task(task_named(task)):
             raise BadInputError("\n".join(f"task {task}: {fault}" for fault in faults))
+        named = task_named(task)
+        bounds = ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in named.limits.items())
+        typer.echo(f"commands: {bounds}\nabstract states: {', '.join(_names(named))}")
         typer.echo(f"{task}: nothing is wrong with its states, simulator, objective and robot")
         return
-    table = Table("task", "from", "commands", "abstract states", "target", "steps/s")
+    table = Table("task", "commands", "abstract states", "target", "steps/s")
+    table.columns[0].no_wrap = True
     for name, known in known_tasks().items():
         table.add_row(
-            name,
-            "astra-data" if name in TASKS else "an installed package",
-            ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in known.limits.items()),
-            ", ".join(known.abstract_state.names or (f"{known.abstract_state.size} values",)),
+            name if name in TASKS else f"{name} (installed)",
+            _in_short(list(known.limits)),
+            _in_short(_names(known)),
             "yes" if known.has_target else "no",
             str(known.fps),
         )
-    Console(soft_wrap=True).print(table)
-    typer.echo("A task of your own is named by its place, cart.py:TASK or package.module:TASK; it is run.")
+    Console().print(table)
+    typer.echo(
+        "`astra-data tasks TASK` tells all of one. A task of your own is named by its place, cart.py:TASK or "
+        "package.module:TASK; it is run."
+    )
+
+
+def _names(task: "Task") -> Sequence[str]:
+    """Return the names of a task's abstract states."""
+    return task.abstract_state.names or (f"{task.abstract_state.size} values",)
+
+
+def _in_short(names: Sequence[str]) -> str:
+    """List the first of `names`, and count the others."""
+    more = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def label(

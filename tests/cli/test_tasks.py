@@ -23,8 +23,13 @@ def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pyte
     assert result.exit_code == 0, result.output
     lines = {line.split()[1]: line for line in result.output.splitlines() if line.startswith("│")}
     assert set(registry.TASKS) <= set(lines)
-    assert "an installed package" in lines["rail-cart"] and "v -1…4" in lines["rail-cart"]
+    assert "(installed)" in lines["rail-cart"] and "(installed)" not in lines["antmaze-umaze"]
+    assert "vx, vy" in lines["antmaze-long"] and " 20 " in lines["antmaze-long"]
+    assert "z, pitch, left_hip, left_knee and 11 more" in lines["humanoid-walker2d"]
     assert "no" in lines["rail-cart"].split() and "yes" in lines["antmaze-umaze"].split()
+    narrow = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "80"}).output
+    assert all(f"│ {task} " in narrow for task in registry.TASKS)
+    assert max(map(len, narrow.splitlines()[:-1])) <= 80
     assert registry.task_named("rail-cart").name == "rail-cart"
     with pytest.raises(BadInputError, match=r"unknown task 'rail-crat': did you mean 'rail-cart'"):
         registry.task_named("rail-crat")
@@ -53,6 +58,7 @@ TASK = replace(RIGHT, objective=Wrong(horizon=40))
 def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = CliRunner().invoke(app, ["tasks", f"{CART}:TASK"])
     assert result.exit_code == 0 and "small_cart.py:TASK: nothing is wrong" in result.output
+    assert result.output.startswith("commands: v -1…4\nabstract states: x\n")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "wrong.py").write_text(WRONG)
     told = "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)"
