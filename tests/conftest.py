@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import importlib
 import os
 from collections.abc import Iterator
@@ -10,9 +11,18 @@ import pytest
 
 if TYPE_CHECKING:
     from astra_data.experiments.recipe import Recipe
+    from astra_data.stages.registry import Stage
 
 # Before torch and numpy are loaded: tests run side by side, a core each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Nothing here has to survive a power failure, but where that is what is tested.
+os.environ.setdefault("ASTRA_DATA_NO_FSYNC", "1")
+
+
+@pytest.fixture
+def fsync(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the disk, as the package does outside of tests."""
+    monkeypatch.setenv("ASTRA_DATA_NO_FSYNC", "")
 
 
 @pytest.fixture
@@ -42,6 +52,17 @@ def forgotten_methods() -> Iterator[None]:
         found.update(before)
 
 
+@functools.cache
+def _fake_stages() -> "tuple[dict[str, Stage], type[Recipe]]":
+    """Return fake stages and the model of their recipes, which takes long to make."""
+    plan, recipe = (importlib.import_module(f"astra_data.experiments.{name}") for name in ("plan", "recipe"))
+    stages: dict[str, Stage] = {
+        name: dataclasses.replace(stage, run=getattr(fake_stages, name), config=fake_stages.CONFIGS.get(name))
+        for name, stage in plan.STAGES.items()
+    }
+    return stages, recipe.with_tables(recipe.Recipe, stages.values(), ())
+
+
 @pytest.fixture
 def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     """Replace the stages, methods and tasks by fake ones, and return the model of their recipes."""
@@ -50,11 +71,7 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
         importlib.import_module(f"astra_data.experiments.{name}") for name in ("plan", "recipe", "experiment")
     )
     registry = importlib.import_module("astra_data.worlds.registry")
-    stages = {
-        name: dataclasses.replace(stage, run=getattr(fake_stages, name), config=fake_stages.CONFIGS.get(name))
-        for name, stage in plan.STAGES.items()
-    }
-    model: type[Recipe] = recipe.with_tables(recipe.Recipe, stages.values(), ())
+    stages, model = _fake_stages()
     monkeypatch.setattr(plan, "STAGES", stages)
     methods = importlib.import_module("astra_data.methods")
     for module in (plan, recipe, experiment, methods):

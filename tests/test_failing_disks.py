@@ -11,7 +11,7 @@ from disks.failing_disk import FAILURES, Kind, Operation, why_not
 from disks.lost_power import OUTCOMES, Memory, Outcome
 
 TOOLS = Path(__file__).parents[1] / "tools"
-COMMANDS = ("subset", "import csv", "export d4rl", "export robomimic", "collect")
+COMMANDS = ("import csv", "export robomimic", "collect")
 FAULTLESS = {"command", "failure", "tried"}
 
 WRITES = """
@@ -61,7 +61,7 @@ pytestmark = pytest.mark.skipif(why_not() is not None, reason=why_not() or "")
 
 
 def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(TOOLS)}
+    environment = os.environ | {"PYTHONPATH": str(TOOLS), "ASTRA_DATA_NO_FSYNC": ""}
     return subprocess.run(
         [sys.executable, *command], capture_output=True, text=True, check=False, env=environment
     )

@@ -36,9 +36,10 @@ def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
                 yield node.lineno, other or name.rpartition(".")[2]
 
 
-def parts(name: str) -> list[str]:
+@cache
+def parts(name: str) -> tuple[str, ...]:
     """Return the words of an identifier: `doubt_penalty` and `DoubtPenalty` are "doubt", "penalty"."""
-    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+    return tuple(word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name))
 
 
 def holds(name: str, avoided: str) -> bool:
@@ -71,8 +72,9 @@ def first_places() -> dict[str, str]:
     """Return where each identifier of the house stands first, by its name."""
     places: dict[str, str] = {}
     for path in sorted(HOUSE.rglob("*.py")):
+        place = path.relative_to(ROOT)
         for line, name in identifiers(ast.parse(path.read_text())):
-            places.setdefault(name, f"{path.relative_to(ROOT)}:{line}")
+            places.setdefault(name, f"{place}:{line}")
     return places
 
 

@@ -10,7 +10,6 @@ from fake_dataset import write_fake
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
-from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 
@@ -106,10 +105,10 @@ def test_no_error_of_a_disk_becomes_a_traceback(
     assert shown.count("\n") == 1
 
 
+@pytest.mark.usefixtures("fsync")
 def test_waiting_for_the_disk_can_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
-    monkeypatch.setenv(NO_FSYNC, "")
     source = str(write_fake(tmp_path / "fake").root)
     assert synced
     for options, is_synced in (([], True), (["--no-fsync"], False)):

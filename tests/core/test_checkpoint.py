@@ -301,6 +301,7 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     assert load_tensors(paths[0])[1] == metadata
 
 
+@pytest.mark.usefixtures("fsync")
 def test_a_disk_that_fails_at_any_operation_leaves_a_folder_to_go_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from astra_data.core.durable import (
 from astra_data.core.errors import DiskError
 from astra_data.core.lock import held
 
+pytestmark = pytest.mark.usefixtures("fsync")
 MUTATING = "mkdir rename replace unlink rmdir fsync"
 
 

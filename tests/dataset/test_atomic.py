@@ -76,6 +76,7 @@ def test_what_a_killed_export_left_is_swept_by_the_next(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["out.hdf5"]
 
 
+@pytest.mark.usefixtures("fsync")
 def test_a_disk_that_fails_at_any_operation_leaves_all_or_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

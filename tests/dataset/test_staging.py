@@ -23,7 +23,6 @@ from fake_dataset import (
     write_fake,
 )
 
-from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Episode
@@ -201,10 +200,7 @@ def test_an_episode_is_on_the_disk_itself_before_it_counts(
         assert synced == ["000000.partial", ".set.staged"]
 
 
-def test_a_kill_at_any_moment_loses_no_finished_episode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(NO_FSYNC, "1")
+def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
     record(tmp_path / "whole")
     whole = files(tmp_path / "whole")
     rng = np.random.default_rng(0)
@@ -229,9 +225,8 @@ def test_a_kill_at_any_moment_loses_no_finished_episode(
 
 
 def test_a_kill_in_any_operation_never_mixes_two_recordings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(os, "fsync", lambda handle: None)
     other = {**DESCRIPTION, "seeds": {"collect": 1}}
     episodes, others = fake_episodes()[:2], [fake_episode(uid, 9) for uid in (20, 21, 22)]
     whole = files(write_episodes(tmp_path / "whole", episodes))
@@ -330,6 +325,7 @@ def test_a_disk_that_is_full_when_the_dataset_is_written_costs_no_episode(tmp_pa
     )
 
 
+@pytest.mark.usefixtures("fsync")
 def test_a_disk_that_fails_at_any_operation_loses_no_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,9 +351,8 @@ def test_a_disk_that_fails_at_any_operation_loses_no_episode(
 
 @pytest.mark.parametrize("second", [OSError(errno.EIO, "fault"), KeyboardInterrupt()])
 def test_ctrl_c_and_a_second_error_in_the_clean_up_lose_no_episode(
-    tmp_path: Path, second: BaseException, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, second: BaseException
 ) -> None:
-    monkeypatch.setattr(os, "fsync", lambda handle: None)
     whole = files(write_episodes(tmp_path / "whole", [fake_episode(1, 4)]))
     for at in count():
         root = tmp_path / f"at_{at}" / "set"

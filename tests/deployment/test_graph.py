@@ -82,7 +82,7 @@ POLICIES = policies()
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_the_graphs_act_as_the_policy_over_1000_steps(name: str, tmp_path: Path) -> None:
+def test_the_graphs_act_as_the_policy_step_after_step(name: str, tmp_path: Path) -> None:
     deployed = POLICIES[name]
     write_graphs(deployed, tmp_path)
     task, rng = deployed.task, np.random.default_rng(1)
@@ -90,7 +90,7 @@ def test_the_graphs_act_as_the_policy_over_1000_steps(name: str, tmp_path: Path)
     hidden = [PolicyGraph(deployed).example[2]] * 2
     deployed.start(1)
     spread, apart = [], 0.0
-    for _ in range(1000):
+    for _ in range(1000 if name == "target encoder" else 200):
         state, goal = (
             torch.from_numpy(rng.standard_normal((1, size), np.float32))
             for size in (task.state.size, task.objective.goal_size)

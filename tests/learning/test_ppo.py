@@ -26,7 +26,7 @@ def ppo(
 ) -> Ppo:
     config = PpoConfig(
         total_steps=iterations * env.num_envs * 16,
-        **{"rollout_steps": 16, "learning_rate": 3e-3, "reward_scale": 1.0, **settings},
+        **{"rollout_steps": 16, "learning_rate": 3e-3, "reward_scale": 1.0, "minibatches": 2, **settings},
     )
     torch.manual_seed(0)
     shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,), clips_mean=clips)

@@ -25,7 +25,7 @@ def sac(
     recorded: Recorded | None = None,
     **settings: Any,  # noqa: ANN401
 ) -> Sac:
-    usual = {"rollout_steps": 10, "updates_per_step": 3, "batch_size": 64, "discount": 0.9}
+    usual = {"rollout_steps": 10, "updates_per_step": 2, "batch_size": 64, "discount": 0.9}
     config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
     torch.manual_seed(0)
     shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32, 32))
@@ -53,7 +53,8 @@ def distance_after(policy: SoftActor, steps: int) -> float:
 
 @pytest.mark.parametrize("memory", [0, 8])
 def test_learns_to_go_to_a_target(memory: int) -> None:
-    learner = sac(GoToZero(16), 100, horizon=20, memory=memory, window=8, burn_in=2, batch_size=128)
+    settings: dict[str, Any] = {"window": 8, "burn_in": 2, "batch_size": 128, "updates_per_step": 3}
+    learner = sac(GoToZero(16), 100, horizon=20, memory=memory, **settings)
     assert distance_after(learner.policy, 10) > 0.5
     metrics = train(learner)
     assert distance_after(learner.policy, 10) < 0.15
@@ -87,6 +88,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
         "window": 6,
         "burn_in": 2,
         "buffer_size": 8 * 25,
+        "updates_per_step": 1,
     }
     whole = sac(GoToZero(8), 60, **settings)
     train(whole)
@@ -316,6 +318,7 @@ def test_it_learns_so_often_after_each_step_that_a_window_is_kept(monkeypatch: p
 
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
     settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 96}
+    settings["updates_per_step"] = 3
     with_memory = train(sac(Recall(32), 120, memory=8, learning_rate=3e-3, **settings))
     without = train(sac(Recall(32), 120, learning_rate=3e-3, **settings))
     # An episode of three steps is worth at most 1.

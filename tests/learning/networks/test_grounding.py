@@ -61,7 +61,7 @@ def untrained(target: TargetKind = "ema", heads: int = 1) -> GroundingModel:
     return model
 
 
-def fit(model: GroundingModel, weights: LossWeights, updates: int = 200) -> float:
+def fit(model: GroundingModel, weights: LossWeights, updates: int = 130) -> float:
     """Train `model` and return the last loss of the latent, if it has one."""
     optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
     parts: dict[str, Tensor] = {}
