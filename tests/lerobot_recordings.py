@@ -33,7 +33,7 @@ ANT: dict[str, Any] = {
 BLIND = {name: ARM[name] for name in ("action", "observation.images.top")}
 LENGTHS = {"arm": (6, 1, 9, 4), "ant": (60, 50, 40), "blind": (3,)}
 TASKS = ("lift", "turn")
-FPS = 10
+FPS = {"arm": 10, "ant": 20, "blind": 10}
 
 
 def values(case: str, episode: int) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def main(folder: Path, merged: list[Path]) -> None:
     for case, features in {"arm": ARM, "ant": ANT, "blind": BLIND}.items():
         robot = "so101" if case == "arm" else None
         dataset = LeRobotDataset.create(
-            "a/b", FPS, features, root=folder / case, robot_type=robot, use_videos=False
+            "a/b", FPS[case], features, root=folder / case, robot_type=robot, use_videos=False
         )
         for episode, steps in enumerate(LENGTHS[case]):
             columns = values(case, episode)
