@@ -11,6 +11,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding import fit as fit_module
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, _optimise, residual_rewards
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.descent import DescentConfig
 from astra_data.learning.networks.grounding import GroundingModel, LossWeights
 from astra_data.worlds.registry import TASKS
 
@@ -237,6 +238,7 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
 def test_what_is_told_of_a_fit_is_measured_on_held_out_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reward: str
 ) -> None:
+    monkeypatch.setattr("astra_data.grounding.scatter._DESCENT", DescentConfig(updates=3))
     given: dict[str, tuple[Any, ...]] = {}
     for name in ("telemetry", "fit_scatter", "compared_foresight"):
         made = getattr(fit_module, name)

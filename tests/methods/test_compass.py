@@ -32,7 +32,7 @@ QUICK = CompassConfig(
     contexts=64,
     windows=60,
     window=15,
-    updates=600,
+    updates=400,
     iterations=3,
 )
 
