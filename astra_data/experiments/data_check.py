@@ -3,13 +3,14 @@
 import numpy as np
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import base_method
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.experiments.condition import Condition
 from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.paired_episodes import divided, recordings_of
-from astra_data.methods import METHODS, base_method
+from astra_data.methods import METHODS
 from astra_data.stages.label import check_fits, is_address
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import task_named
