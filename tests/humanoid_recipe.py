@@ -21,7 +21,7 @@ held_out_share = 0.25
 [train]
 num_envs = 8
 rollout_steps = 16
-total_steps = 512
+total_steps = 256
 hidden_sizes = [8]
 memory_size = 8
 data_start_share = 0.5

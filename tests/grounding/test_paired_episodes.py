@@ -194,7 +194,7 @@ def test_too_few_episodes_are_not_split(episodes: PairedEpisodes) -> None:
         episodes.split(0.95, seed=0)
     one = episodes.select(torch.tensor([2]))
     assert len(one) == 1
-    with pytest.raises(BadInputError, match="expected more episodes"):
+    with pytest.raises(BadInputError, match="recorded episodes: 1, of which 1 would be held out"):
         one.split(0.1, seed=0)
 
 

@@ -42,6 +42,7 @@ def test_who_has_fallen_is_no_longer_seen(monkeypatch: pytest.MonkeyPatch) -> No
         return outcome
 
     monkeypatch.setattr(NaoEnv, "step", falling)
+    monkeypatch.setattr("astra_data.reports.command_replay._ROBOTS", 8)
     gone = np.isnan(replay_commands(task).target)
     expected = np.zeros_like(gone)
     expected[3, 8:] = expected[0, 21:] = True

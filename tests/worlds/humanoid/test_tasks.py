@@ -54,7 +54,7 @@ held_out_share = 0.25
 learner = "sac"
 num_envs = 8
 rollout_steps = 16
-total_steps = 512
+total_steps = 256
 updates_per_step = 1
 batch_size = 8
 window = 4
@@ -137,9 +137,9 @@ def test_a_recipe_with_sac_runs(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(SAC_RECIPE)
     folder = run_here(tmp_path / "toy.toml", until="evaluate")
     for method, remembers, observed, steps in (
-        ("direct_transfer", True, "abstract", 512),
-        ("domain_randomization", True, "abstract", 512),
-        ("astra", False, "abstract", 512),
+        ("direct_transfer", True, "abstract", 256),
+        ("domain_randomization", True, "abstract", 256),
+        ("astra", False, "abstract", 256),
         ("direct_transfer_iql", True, "abstract", 6),
         ("full_obs", True, "full", 128),
     ):
