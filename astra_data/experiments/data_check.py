@@ -41,7 +41,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
         )
     task = task_named(recipe.task)
     check_fits(source, task)
-    if any(METHODS[base_method(row)].grounds for row in recipe.methods) and "held_out" not in source.metadata:
+    grounds = any(METHODS[base_method(row)].grounds for row in recipe.methods)
+    if grounds and not any(source.metadata.get("held_out", ())):
         divided(source.reference, len(set(recordings_of(source))), recipe.ground.held_out_share, seed=0)
     return Condition("finished", "; ".join(differing_bounds(task.limits, source)))
 

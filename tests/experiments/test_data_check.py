@@ -1,4 +1,5 @@
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,22 @@ from astra_data.stages.pair import pair
 ROOT = Path(__file__).parents[2]
 
 
-def write_logs(folder: Path, least: float, largest: float, *, state_size: int = 2, episodes: int = 2) -> None:
+def write_logs(
+    folder: Path,
+    least: float,
+    largest: float,
+    *,
+    state_size: int = 2,
+    held_out: Sequence[bool] = (False,) * 2,
+) -> None:
     """Write pushes of the small cart, whose bounds are -1 and 4."""
     columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
     with writer(folder, columns=columns, fps=10) as logs:
-        for uid in range(episodes):
-            logs.add(Episode(uid, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
+        for uid, held in enumerate(held_out):
+            columns_of_one = {STATE: states, NEXT_STATE: states, ACTION: actions}
+            logs.add(Episode(uid, columns_of_one, {"held_out": held}))
 
 
 @pytest.fixture
@@ -94,7 +103,7 @@ def test_data_of_another_robot_are_refused(recipe: Path) -> None:
 
 
 def test_data_of_which_none_is_left_to_train_on_are_refused(recipe: Path) -> None:
-    write_logs(recipe.parent / "logs", -1.0, 4.0, episodes=1)
+    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False])
     told = r"fake@data-1.0.0: recorded episodes: 1, of which 1 would be held out, and none is left"
     with pytest.raises(BadInputError, match=told):
         check(recipe, root=recipe.parent / "runs")
@@ -107,6 +116,9 @@ def test_data_are_divided_as_the_recipe_says(recipe: Path) -> None:
     recipe.write_text(recipe.read_text() + "[ground]\nheld_out_share = 0.9\n")
     with pytest.raises(BadInputError, match=r"recorded episodes: 2, of which 2 would be held out"):
         check(recipe, root=recipe.parent / "runs")
+    shutil.rmtree(recipe.parent / "logs")
+    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False, True])  # as it marks them
+    assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
 
 
 def test_recipes_that_collect_or_pull_have_no_such_line(recipe: Path) -> None:
