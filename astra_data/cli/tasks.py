@@ -34,9 +34,9 @@ def tasks(
     if task is not None:
         from astra_data.worlds.walk_through import check_task
 
-        if faults := check_task(task_named(task)):
-            raise BadInputError("\n".join(f"task {task}: {fault}" for fault in faults))
         named = task_named(task)
+        if faults := check_task(named):
+            raise BadInputError("\n".join(f"task {task}: {fault}" for fault in faults))
         bounds = ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in named.limits.items())
         typer.echo(f"commands: {bounds}\nabstract states: {', '.join(_names(named))}")
         typer.echo(f"{task}: nothing is wrong with its states, simulator, objective and robot")
