@@ -27,7 +27,7 @@ def address() -> Iterator[str]:
     cluster = Cluster(initialize_head=True, head_node_args=node)
     cluster.add_node(num_cpus=1, num_gpus=0)
     yield cluster.address
-    cluster.shutdown()  # type: ignore[no-untyped-call]
+    cluster.shutdown()
 
 
 def test_items_run_on_both_nodes_as_soon_as_their_inputs_are_finished(address: str, tmp_path: Path) -> None:
