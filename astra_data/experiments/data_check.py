@@ -5,6 +5,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
+from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.experiments.condition import Condition
@@ -26,7 +27,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
 
     Raises:
         BadInputError: there are no such data, their columns are not those of the task, they were paired, or
-            none is left to train on where some are held out.
+            none is left to train on where some are held out, in the smallest size of a sweep.
     """
     if recipe.data is None or is_address(recipe.data):
         return None
@@ -41,10 +42,20 @@ def data_condition(recipe: Recipe) -> Condition | None:
         )
     task = task_named(recipe.task)
     check_fits(source, task)
-    grounds = any(METHODS[base_method(row)].grounds for row in recipe.methods)
-    if grounds and not any(source.metadata.get("held_out", ())):
-        divided(source.reference, len(set(recordings_of(source))), recipe.ground.held_out_share, seed=0)
+    if any(METHODS[base_method(row)].grounds for row in recipe.methods):
+        _check_division(recipe, source)
     return Condition("finished", "; ".join(differing_bounds(task.limits, source)))
+
+
+def _check_division(recipe: Recipe, source: Dataset) -> None:
+    """Refuse data of which grounding would hold out all, unless they say which are held out."""
+    if any(source.metadata.get("held_out", ())):
+        return
+    name, recordings = source.reference, len(set(recordings_of(source)))
+    if recipe.sweep.percent:
+        smallest = min(recipe.sweep.percent)
+        name, recordings = f"{smallest} % of {name}", min(recordings, share(smallest, len(source)))
+    divided(name, recordings, recipe.ground.held_out_share, seed=0)
 
 
 def differing_bounds(limits: Commands, source: Dataset) -> list[str]:

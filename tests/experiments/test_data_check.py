@@ -121,6 +121,24 @@ def test_data_are_divided_as_the_recipe_says(recipe: Path) -> None:
     assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
 
 
+@pytest.mark.parametrize(
+    ("percent", "told"),
+    [
+        ("[50, 100]", ""),
+        ("[100, 25]", "25 % of fake@data-1.0.0: recorded episodes: 1, of which 1 would be held out"),
+        ("[10, 50]", "10 % of fake@data-1.0.0: recorded episodes: 0, of which 0 would be held out"),
+    ],
+)
+def test_the_smallest_size_of_a_sweep_has_to_leave_some(recipe: Path, percent: str, told: str) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False] * 4)
+    recipe.write_text(recipe.read_text() + f"[sweep]\npercent = {percent}\n")
+    if told:
+        with pytest.raises(BadInputError, match=told):
+            check(recipe, root=recipe.parent / "runs")
+    else:
+        assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
+
+
 def test_recipes_that_collect_or_pull_have_no_such_line(recipe: Path) -> None:
     text = recipe.read_text()
     recipe.write_text(text.replace('"logs"', '"somebody/logs"'))

@@ -30,6 +30,7 @@ def test_astra_is_compared_with_rows_that_are_trained_alike() -> None:
     trained = [0.0] * 3
     rows = {
         "direct_transfer": row(role="floor", success=[0.25, 0.0, 0.25], simulated_success=trained),
+        "a_method_of_ones_own": row(success=[0.0, 0.0, 0.0], simulated_success=trained),
         "astra": row(success=[0.5, 0.25, 0.75], simulated_success=trained),
         "astra_plus": row(success=[1.0, 0.75, 1.0], simulated_success=trained),
         "direct_transfer_plus": row(success=[0.25, 0.0, 0.25], simulated_success=trained),
@@ -44,7 +45,11 @@ def test_astra_is_compared_with_rows_that_are_trained_alike() -> None:
     }
     # ASTRA's worst seed ties with two of direct transfer's: two halves of nine pairs are lost.
     assert found == {
-        "astra": {"direct_transfer": pytest.approx(8 / 9), "iql": pytest.approx(8 / 9)},
+        "astra": {
+            "direct_transfer": pytest.approx(8 / 9),
+            "a_method_of_ones_own": 1.0,
+            "iql": pytest.approx(8 / 9),
+        },
         "astra_plus": {"direct_transfer_plus": 1.0, "iql": 1.0},
     }
     assert improvement({"iql": rows["iql"]}, SUCCESS, 100) == {}
