@@ -42,11 +42,8 @@ ABSTRACT_SIMULATED_NEXT_STATE = "abstract.simulated_next_state"
 
 EPISODE_UID = "episode_uid"
 """(T,) int64: identifies the episode through all later edits; filled in by the writer."""
-TIMESTAMP = "timestamp"
-FRAME_INDEX = "frame_index"
-EPISODE_INDEX = "episode_index"
-INDEX = "index"
-TASK_INDEX = "task_index"
+TIMESTAMP, FRAME_INDEX = "timestamp", "frame_index"
+EPISODE_INDEX, INDEX, TASK_INDEX = "episode_index", "index", "task_index"
 RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)
 """Columns filled in by the writer; all but the first are LeRobot's own."""
 
@@ -229,7 +226,8 @@ class Episode:
 
     Attributes:
         uid: identifies the episode through all later edits, 0 <= uid < 2^63.
-        columns: name to (T,) or (T, size) contiguous array of one of `DTYPES`; `RESERVED` names excluded.
+        columns: name to (T,) or (T, size) contiguous array of one of `DTYPES`, never one of the `RESERVED`
+            names; values given as (T, 1), as Gymnasium has them, become (T,).
         metadata: facts about the whole episode (success, return, seed, source_episode, ...).
 
     Raises:
@@ -252,6 +250,7 @@ class Episode:
         metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         masked = [k for k, v in self.columns.items() if isinstance(v, np.ma.MaskedArray) and v.mask.any()]
         columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
+        columns |= {name: values[:, 0] for name, values in columns.items() if values.shape[1:] == (1,)}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
         faults = []
@@ -291,8 +290,8 @@ def _column_faults(name: str, values: Array) -> list[str]:
         faults.append(f"{name}: is filled in by the writer, leave it out")
     if values.dtype not in DTYPES:
         faults.append(f"{name}: dtype {values.dtype}, expected one of {', '.join(DTYPES)}")
-    if values.ndim not in (1, 2) or values.shape[1:] in ((0,), (1,)):
-        faults.append(f"{name}: shape {values.shape}, expected (T,) or (T, size) with size > 1")
+    if values.ndim not in (1, 2) or values.shape[1:] == (0,):
+        faults.append(f"{name}: shape {values.shape}, expected (T,) or (T, size)")
     elif values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
         bad = np.argwhere(~finite)
         where = f"frame {bad[0][0]}" + (f" index {bad[0][1]}" if values.ndim == 2 else "")

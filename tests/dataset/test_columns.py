@@ -53,7 +53,7 @@ def test_every_fault_of_an_episode_is_reported_at_once() -> None:
     columns[STATE][4, 1] = np.nan
     columns[STATE][5, 0] = np.inf
     columns[ACTION] = columns[ACTION].astype(np.float64)
-    columns[REWARD] = columns[REWARD][:5, None]
+    columns[REWARD] = columns[REWARD][:5, None, None]
     columns["episode_uid"] = np.zeros(6, np.int64)
     with pytest.raises(BadInputError) as caught:
         Episode(-1, columns, {"return": float("nan"), "seeds": [1]})  # type: ignore[dict-item]
@@ -63,13 +63,22 @@ def test_every_fault_of_an_episode_is_reported_at_once() -> None:
         "uid -1",
         "observation.state: 2 values are not finite, the first in frame 4 index 1",
         "action: dtype float64",
-        "next.reward: shape (5, 1), expected (T,)",
+        "next.reward: shape (5, 1, 1), expected (T,) or (T, size)",
         "next.reward 5",
         "episode_uid: is filled in by the writer",
         "metadata return: nan",
         "metadata seeds: list",
     ):
         assert part in message
+
+
+def test_one_value_per_step_may_be_given_as_gymnasium_has_it() -> None:
+    rewards = np.arange(3, dtype=np.float32)
+    assert Episode(0, {REWARD: rewards[:, None]}).columns[REWARD].tolist() == [0.0, 1.0, 2.0]
+    assert Episode(0, {STATE: np.zeros((1, 2), np.float32)}).columns[STATE].shape == (1, 2)
+    for empty in (np.zeros((3, 0), np.float32), np.zeros((3, 1, 0), np.float32)):
+        with pytest.raises(BadInputError, match=r"next.reward: shape .*, expected \(T,\) or \(T, size\)"):
+            Episode(0, {REWARD: empty})
 
 
 @pytest.mark.parametrize(
