@@ -5,9 +5,9 @@ import pytest
 from fake_stages import FakeConfig
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import RecipeError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments import plan as module
-from astra_data.experiments.plan import plan
+from astra_data.experiments.plan import plan, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.stages.registry import Stage
@@ -297,3 +297,11 @@ def test_a_choice_that_cannot_be_made_is_refused(
 ) -> None:
     with pytest.raises(RecipeError, match=message):
         load(tmp_path, fake_recipe, text)
+
+
+def test_the_last_stage_is_one_of_those_made() -> None:
+    assert stages_until("collect") == {"collect"}
+    assert stages_until("subset") == {"collect", "label", "augment", "pair", "subset"}
+    assert stages_until(None) - stages_until("select") == {"evaluate", "report"}
+    with pytest.raises(BadInputError, match=r"unknown stage 'grond'.*ground"):
+        stages_until("grond")
