@@ -7,7 +7,6 @@ difference are not run again: links in its folder lead to the other recipe's art
 task with the same target; then it shares the collected episodes.
 """
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from astra_data.core.naming import base_method, is_plus
 from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
-from astra_data.experiments.recipe_file import read_tables
+from astra_data.experiments.recipe_file import RECORD, read_tables, recorded_settings
 from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
@@ -127,10 +126,9 @@ class Experiment:
     @cached_property
     def _outdated(self) -> tuple[str, list[Path]]:
         """What changed since the artefacts were made, and the folders made with the old."""
-        record = self.folder / "recipe.json"
-        if not record.is_file():
+        if not (self.folder / RECORD).is_file():
             return "", []
-        changed = _differences(json.loads(record.read_text()), self.recipe)
+        changed = _differences(recorded_settings(self.folder), self.recipe)
         code = changed_code(self.recipe, self.folder)
         whole = _stale_stages((changed - _ROWS_TABLES) | ({"task"} & code.keys()))
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
@@ -239,7 +237,7 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     Settings that did not exist then have their defaults, as they took effect.
     """
     with suppress(RecipeError):
-        before = validated(before, type(recipe), "recipe.json").settings
+        before = validated(before, type(recipe), RECORD).settings
     before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
     elsewhere = {"methods", "own_methods", "seeds", "based_on"}
     changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}

@@ -3,13 +3,18 @@
 import json
 from pathlib import Path
 
+from pydantic import TypeAdapter, ValidationError
+
+from astra_data.core.config import faults_of
 from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
 from astra_data.experiments.recipe import Recipe
 from astra_data.worlds.own_code import code_digest
 
 CODE = "code.json"
 """Beside recipe.json: the digests of "task", and of methods by their names, with their settings."""
 _SETTINGS = ".settings"
+_DIGESTS = TypeAdapter(dict[str, str])
 
 
 def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
@@ -17,9 +22,11 @@ def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
 
     Returns:
         "task" and names of methods, each to what of it changed: its file, or its settings.
+
+    Raises:
+        BadInputError: the record is damaged.
     """
-    record = folder / CODE
-    before = json.loads(record.read_text()) if record.is_file() else {}
+    before = _recorded(folder / CODE)
     now = _digests(recipe)
     changed = [name for name, digest in before.items() if now.get(name, digest) != digest]
     return {
@@ -34,6 +41,16 @@ def record_code(recipe: Recipe, folder: Path) -> None:
     """Write down in `folder` what the code is now, if there is any."""
     if digests := _digests(recipe):
         write_file(folder / CODE, json.dumps(digests, indent=1) + "\n")
+
+
+def _recorded(path: Path) -> dict[str, str]:
+    try:
+        return _DIGESTS.validate_json(path.read_bytes()) if path.is_file() else {}
+    except ValidationError as error:
+        raise BadInputError(
+            f"{path} is not what a run writes: {faults_of(error)}; restore it from a copy, or remove it if "
+            "the code is still what the run was made with"
+        ) from None
 
 
 def _places(recipe: Recipe) -> dict[str, str]:

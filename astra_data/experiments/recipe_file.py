@@ -1,4 +1,7 @@
-"""The file of a recipe: its tables, with keys that were renamed since under their names of today."""
+"""The file of a recipe: its tables, with keys that were renamed since under their names of today.
+
+A run writes down the settings that it is made with, in recipe.json.
+"""
 
 import sys
 from collections.abc import Mapping
@@ -6,12 +9,49 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import load_tables
-from astra_data.core.errors import RecipeError
+from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+
+from astra_data.core.config import faults_of, load_tables
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.dataset.format import INFO_PATH
 from astra_data.experiments.own_methods import looked_up
 from astra_data.training.build_env import RENAMED
 from astra_data.worlds.own_code import place_beside
+
+RECORD = "recipe.json"
+"""In the folder of a run: the settings that its artefacts were made with."""
+
+
+class _OwnMethod(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+    method: str
+
+
+class _Record(BaseModel):
+    """What is read of a record before it is known to be a recipe of today."""
+
+    model_config = ConfigDict(extra="allow")
+
+    task: str
+    own_methods: dict[str, _OwnMethod] = {}
+    sweep: dict[str, JsonValue] = {}
+
+
+def recorded_settings(folder: Path) -> dict[str, Any]:
+    """Return the settings that the run in `folder` was made with.
+
+    Raises:
+        BadInputError: their file is damaged.
+    """
+    path = folder / RECORD
+    try:
+        return _Record.model_validate_json(path.read_bytes()).model_dump(exclude_unset=True)
+    except ValidationError as error:
+        raise BadInputError(
+            f"{path} is not what a run writes: {faults_of(error)}; restore it from a copy, or move the "
+            "folder away and run the recipe again"
+        ) from None
 
 
 def read_tables(path: Path) -> dict[str, Any]:

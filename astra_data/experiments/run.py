@@ -27,6 +27,7 @@ from astra_data.experiments.plan import check_stage, plan, stage_of, stages_unti
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
+from astra_data.experiments.recipe_file import RECORD
 from astra_data.methods import grounded_as
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.own_code import is_own_code
@@ -195,7 +196,7 @@ def make(
     """
     check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
-    with folder_for(folder / "recipe.json"), held(folder) as ours:
+    with folder_for(folder / RECORD), held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
         experiment.check_unchanged()
@@ -218,7 +219,7 @@ def make(
         for key, reason in again.items():
             line = f"{key} is made again: {reason}; the old one is in {set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
-        write_file(folder / "recipe.json", recipe.model_dump_json(indent=2) + "\n")
+        write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
         record_code(recipe, folder)
         prepare, logs = partial(_prepare, dict(recipe.own_methods)), folder / "logs"
         with show(len(items), console) as watch:

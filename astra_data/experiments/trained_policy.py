@@ -1,12 +1,12 @@
 """Load a policy that a run has trained, ready to act."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import place
 from astra_data.experiments.own_methods import add_all
+from astra_data.experiments.recipe_file import RECORD, recorded_settings
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named
@@ -58,20 +58,15 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     Files of the user's that it names are looked up here, and else in the run's folder and those above it.
 
     Raises:
-        BadInputError: it is not the folder of a run.
+        BadInputError: it is not the folder of a run, or its record is damaged.
     """
-    recipe = Path(run) / "recipe.json"
-    if not recipe.is_file():
-        raise BadInputError(
-            f"{run}: expected the folder of a run, which holds recipe.json: make it with astra-data run"
-        )
-    try:
-        settings: dict[str, Any] = json.loads(recipe.read_text())
-    except ValueError as error:
-        raise BadInputError(f"{recipe}: expected the settings of a run, in JSON: {error}") from None
     folder = Path(run)
-    if isinstance(task := settings.get("task"), str):
-        settings["task"] = found_near(task, folder)
+    if not (folder / RECORD).is_file():
+        raise BadInputError(
+            f"{run}: expected the folder of a run, which holds {RECORD}: make it with astra-data run"
+        )
+    settings = recorded_settings(folder)
+    settings["task"] = found_near(settings["task"], folder)
     for own in settings.get("own_methods", {}).values():
         own["method"] = found_near(own["method"], folder)
     return settings

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from astra_data.core.errors import RecipeError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.own_files import CODE, record_code
 
@@ -110,3 +110,13 @@ def test_built_in_tasks_have_no_record(tmp_path: Path) -> None:
     experiment = load(tmp_path)
     record_code(experiment.recipe, tmp_path)
     assert not (tmp_path / CODE).exists()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"task": 3}'])
+def test_a_damaged_record_is_told(text: str, made: Path) -> None:
+    record = load(made).folder / CODE
+    record.write_text(text)
+    with pytest.raises(BadInputError, match=r"rail/code\.json is not what a run writes: .*; restore it"):
+        load(made).check_unchanged()
+    record.unlink()
+    load(made).check_unchanged()

@@ -1,11 +1,12 @@
+import json
 from pathlib import Path
 
 import pytest
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import RecipeError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.recipe_file import with_current_keys
+from astra_data.experiments.recipe_file import recorded_settings, with_current_keys
 
 RECIPE = """
 task = "antmaze-umaze"
@@ -62,3 +63,30 @@ def test_recipes_with_either_name_are_the_same_and_recorded_by_the_old_one(
     recorded = recipe.settings
     assert [recorded[table]["doubt_penalty"] for table in ("train", "plus")] == [0.5, 2.0]  # type: ignore[index, call-overload]
     assert Recipe.model_validate(recipe.model_dump()) == recipe
+
+
+def test_what_a_run_recorded_is_read_with_keys_of_any_age(tmp_path: Path) -> None:
+    recorded = {"task": "a", "own_methods": {"mine": {"method": "m.py:M", "rate": 0.5}}, "gone": [1, None]}
+    (tmp_path / "recipe.json").write_text(json.dumps(recorded))
+    assert recorded_settings(tmp_path) == recorded
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("", "file: Invalid JSON"),
+        ('{"task": "a", "seeds": [0', "file: Invalid JSON"),
+        ("[]", "file: "),
+        ("{}", "task: Field required"),
+        ('{"task": 3}', "task: "),
+        ('{"task": "a", "sweep": []}', "sweep: "),
+        ('{"task": "a", "own_methods": {"mine": {}}}', "own_methods.mine.method: Field required"),
+    ],
+)
+def test_a_damaged_record_is_told(text: str, fault: str, tmp_path: Path) -> None:
+    (tmp_path / "recipe.json").write_text(text)
+    with pytest.raises(BadInputError) as caught:
+        recorded_settings(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path}/recipe.json is not what a run writes: {fault}")
+    assert str(caught.value).endswith("or move the folder away and run the recipe again")
+    assert "\n" not in str(caught.value)

@@ -81,7 +81,7 @@ def test_no_run_and_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected the folder of a run, which holds recipe\.json"):
         load_policy(tmp_path, "astra")
     (tmp_path / "recipe.json").write_text("{")
-    with pytest.raises(BadInputError, match=r"recipe\.json: expected the settings of a run, in JSON"):
+    with pytest.raises(BadInputError, match=r"recipe\.json is not what a run writes"):
         load_policy(tmp_path, "astra")
     with pytest.raises(BadInputError, match="follower trains no policy"):
         load_policy(run, "follower")
