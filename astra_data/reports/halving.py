@@ -34,7 +34,7 @@ def least_trials(field: int) -> int:
 
 def widest_field(candidates: int, trials: int) -> int:
     """Return how many of the candidates so many trials are enough for, at least 1."""
-    return max(field for field in range(1, candidates + 1) if field == 1 or least_trials(field) <= trials)
+    return max(field for field in range(1, candidates + 1) if least_trials(field) <= trials)
 
 
 def posterior(prior: float, successes: int, trials: int) -> float:

@@ -144,13 +144,14 @@ def run_study(
 
 
 def _check_same(path: Path, settings: dict[str, Any]) -> None:
+    text = json.dumps(settings, indent=1)
     begun = any(path.parent.rglob("*.safetensors"))
-    if begun and path.exists() and json.loads(path.read_text()) != settings:
+    if begun and path.exists() and path.read_text() != text:
         raise BadInputError(
             f"{path.parent} holds results of other settings or other recordings: remove it, or name another "
             "folder with --root"
         )
-    write_file(path, json.dumps(settings, indent=1))
+    write_file(path, text)
 
 
 def _described(recording: Recording) -> dict[str, Any]:
