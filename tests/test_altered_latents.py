@@ -28,7 +28,7 @@ def deployed(latents: bool = True) -> RunningPolicy:
     policy = ActorCritic(ActorCriticShape(observation_size=16 if latents else 8, action_size=2))
     for layer in policy.actor.parameters():
         layer.mul_(10)
-    return RunningPolicy(TASK, policy, model, None, command_limit_m_s=0.3)
+    return RunningPolicy(TASK, policy, model, None, command_limit=0.3)
 
 
 @torch.no_grad()

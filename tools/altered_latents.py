@@ -45,7 +45,7 @@ class AlteredLatents(RunningPolicy):
             deployed.policy,
             deployed.source_encoder,
             deployed.target_encoder,
-            deployed.command_limit_m_s,
+            deployed.command_limit,
             deployed.observed,
             alter,
         )

@@ -86,7 +86,7 @@ def describe(deployed: RunningPolicy, parts: Mapping[str, int]) -> dict[str, Any
         "hidden": {"size": sum(parts.values()), "start": 0.0, "parts": dict(parts)},
         "encoder": encoder if deployed.source_encoder is not None else None,
         "observed": deployed.observed,
-        "command_limit_m_s": deployed.command_limit_m_s if task.plane else None,
+        "command_limit": deployed.command_limit if task.plane else None,
     }
 
 

@@ -174,7 +174,7 @@ def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
         "objective.observe": (task.objective.observe, (torch.zeros(1, task.abstract_state.size), goal)),
         "beyond": (task.beyond, (state,)),
         "objective.limit_command": (
-            lambda given: task.objective.limit_command(given, deployed.command_limit_m_s),
+            lambda given: task.objective.limit_command(given, deployed.command_limit),
             (action,),
         ),
     }

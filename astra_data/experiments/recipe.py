@@ -197,7 +197,7 @@ class Recipe(Config):
         elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]
         if self.train.limits_commands and elsewhere:
             raise ValueError(
-                f"train.command_limit_m_s: it does not reach {', '.join(elsewhere)}, which no simulator "
+                f"train.command_limit: it does not reach {', '.join(elsewhere)}, which no simulator "
                 "trains: leave these rows out, or give it in [plus]"
             )
         return self
@@ -221,9 +221,9 @@ class Recipe(Config):
             and self.collect.start == "anywhere",
             "collect.clearance_m": self.collect and self.collect.clearance_m > 0,
             "train.support_penalty": self.train.support_penalty > 0,
-            "train.command_limit_m_s": self.train.limits_commands,
+            "train.command_limit": self.train.limits_commands,
             "plus.support_penalty": self.plus.support_penalty > 0,
-            "plus.command_limit_m_s": self.plus.limits_commands,
+            "plus.command_limit": self.plus.limits_commands,
             "evaluate.leg_scale": self.evaluate.leg_scale != 1.0,
             "report.paper_success": bool(self.report.paper_success),
         }

@@ -20,7 +20,7 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
-RENAMED = {"doubt_penalty": "disagreement_penalty"}
+RENAMED = {"doubt_penalty": "disagreement_penalty", "command_limit_m_s": "command_limit"}
 """Keys as they were up to 0.1, and as they are now. Recipes may have the old ones; files always do."""
 
 _KERNEL_M = 0.25
@@ -58,7 +58,7 @@ class EnvConfig(Config):
     change_penalty: NotNegative = Field(default=0.0, exclude_if=lambda weight: not weight)
     """Subtracted from the reward of a step, times the squared change of the command, from the start: robots
     fall and lose time where commands jump about."""
-    command_limit_m_s: Positive = 2.0
+    command_limit: Positive = Field(default=2.0, serialization_alias="command_limit_m_s")
     """Shorten longer commands to this, in training and in the target, as a multiple of the largest along an
     axis, which is 1 m/s for the ant; by default longer than any command."""
     ramp: Share = 0.0
@@ -100,7 +100,7 @@ class EnvConfig(Config):
     @property
     def limits_commands(self) -> bool:
         """Whether commands are shortened."""
-        return bool(self.command_limit_m_s != type(self).model_fields["command_limit_m_s"].default)
+        return bool(self.command_limit != type(self).model_fields["command_limit"].default)
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def training_env(
         reward=config.reward or "abstract",
         topple=config.topple,
         risk_weight=config.risk_weight,
-        command_limit_m_s=config.command_limit_m_s,
+        command_limit=config.command_limit,
         thinness=None if parts.thinness is None else config.support_penalty * parts.thinness,
         disagreement_penalty=config.disagreement_penalty,
         change_penalty=config.change_penalty,

@@ -172,7 +172,7 @@ def running(
         trained.policy,
         grounding.encoder,
         target_encoder,
-        command_limit_m_s=world.command_limit_m_s,
+        command_limit=world.command_limit,
         observed=trained.observed,
     )
     if made.observation_size != (taken := trained.policy.shape.observation_size):

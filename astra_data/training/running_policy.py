@@ -55,7 +55,7 @@ class RunningPolicy:
         task: the task. policy: the networks.
         source_encoder: ψ^s; None for a policy without latents.
         target_encoder: ψ^t; where it is None, ψ^s is used.
-        command_limit_m_s: that of the environment in which the policy was trained.
+        command_limit: that of the environment in which the policy was trained.
         observed: whether the policy observes φ of the target's state, or the full state.
     """
 
@@ -63,7 +63,7 @@ class RunningPolicy:
     policy: Policy
     source_encoder: LatentEncoder | None = None
     target_encoder: LatentEncoder | None = None
-    command_limit_m_s: float = 2.0
+    command_limit: float = 2.0
     observed: Observed = "abstract"
 
     @property
@@ -138,6 +138,6 @@ class RunningPolicy:
         before = self.memory
         features, hidden = self.policy.remember(observation, before.previous_output, before.policy)
         output = self.policy.act(features, self._generator)
-        action = self.task.objective.limit_command(output, self.command_limit_m_s)
+        action = self.task.objective.limit_command(output, self.command_limit)
         self.memory = Memory(output, action, hidden, before.encoder)
         return action

@@ -66,7 +66,7 @@ class SimulatorEnv:
         reward: RewardSource = "abstract",
         topple: bool = False,
         risk_weight: float = 1.0,
-        command_limit_m_s: float = 2.0,
+        command_limit: float = 2.0,
         thinness: Tensor | None = None,
         disagreement_penalty: float = 0.0,
         change_penalty: float = 0.0,
@@ -82,7 +82,7 @@ class SimulatorEnv:
             reward: where the reward comes from.
             topple: end episodes by the topple head.
             risk_weight: how many topples a predicted one counts for in the reward "blend".
-            command_limit_m_s: longer velocity commands, ±1 per axis, are shortened to this.
+            command_limit: longer velocity commands, ±1 per axis, are shortened to this.
             thinness: subtracted from the reward of a step to each cell of the maze's fine grid, (height,
                 width); None without a maze.
             disagreement_penalty: subtracted from the reward, times the simulator's `disagreement`.
@@ -97,7 +97,7 @@ class SimulatorEnv:
         self.topple = topple
         self.penalty_scale = 1.0
         self.risk_weight = risk_weight
-        self.command_limit_m_s = command_limit_m_s
+        self.command_limit = command_limit
         maze, device = objective.layout, str(simulator.state.device)
         self.free = None if maze is None else FreeSpace.of_maze(maze, radius_m=0.0, device=device)
         self.thinness = thinness
@@ -152,7 +152,7 @@ class SimulatorEnv:
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A), clipped to ±1 and to the command limit."""
         before = self.simulator.state
-        command = self.objective.limit_command(action, self.command_limit_m_s)
+        command = self.objective.limit_command(action, self.command_limit)
         after = self.simulator.step(command)
         success = self.objective.reached(after, self.goal)
         self.failed = self.objective.missed(after, self.goal)

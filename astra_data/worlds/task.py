@@ -216,7 +216,7 @@ class Task:
         """Return the error for settings that need a maze."""
         return BadInputError(
             f"expected a task in a maze, got '{self.name}', which has none: leave out what needs "
-            "one (augment, follower, support_penalty, command_limit_m_s, "
+            "one (augment, follower, support_penalty, command_limit, "
             "clearance_m, start 'anywhere')"
         )
 

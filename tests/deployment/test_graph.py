@@ -68,9 +68,9 @@ def policies() -> dict[str, RunningPolicy]:
     still = Task(**GIVEN | {"make_simulator": Speed, "objective": Stay(horizon=40)})
     whole = SoftActor(PolicyShape(33, 2, hidden_sizes=(8,)))
     return {
-        "feed-forward": RunningPolicy(ANT, actor(8), command_limit_m_s=0.4),
-        "recurrent": RunningPolicy(ANT, actor(8, memory_size=8), command_limit_m_s=0.4),
-        "source encoder": RunningPolicy(ANT, actor(16), latent, command_limit_m_s=0.4),
+        "feed-forward": RunningPolicy(ANT, actor(8), command_limit=0.4),
+        "recurrent": RunningPolicy(ANT, actor(8, memory_size=8), command_limit=0.4),
+        "source encoder": RunningPolicy(ANT, actor(16), latent, command_limit=0.4),
         "target encoder": RunningPolicy(ANT, actor(16, memory_size=8), latent, aligned),
         "adaptive": RunningPolicy(ANT, lively(Student(rma))),
         "full state": RunningPolicy(ANT, whole, observed="full"),

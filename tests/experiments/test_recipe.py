@@ -35,7 +35,7 @@ def test_the_learner_decides_what_the_training_is_told() -> None:
 
 
 def test_a_limit_of_commands_that_does_not_reach_all_rows_is_refused() -> None:
-    limit = {"command_limit_m_s": 1.0}
+    limit = {"command_limit": 1.0}
     tables: dict[str, Any] = {"task": "antmaze-umaze", "methods": ["astra", "iql", "target", "follower"]}
     assert not read(**tables, plus=limit).train.limits_commands
     with pytest.raises(RecipeError, match="it does not reach iql, target, which no simulator trains"):

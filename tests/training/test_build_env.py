@@ -80,6 +80,7 @@ def test_failures_are_foreseen_where_rewards_or_ends_depend_on_them() -> None:
 
 def test_settings_have_their_old_names_as_well_and_penalties_grow_as_they_say() -> None:
     assert EnvConfig.model_validate({"doubt_penalty": 0.5}).disagreement_penalty == 0.5
+    assert EnvConfig.model_validate({"command_limit_m_s": 0.5, "ramp": 0.1}).command_limit == 0.5
     assert EnvConfig(ramp=0.4, ramp_while=0.5).penalty_ramp == Ramp(0.4, 0.5)
     with pytest.raises(ValidationError, match="ramp_while: expected a ramp"):
         EnvConfig(ramp_while=0.5)
@@ -152,7 +153,7 @@ def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> N
 
 def test_what_needs_a_maze_is_refused_without_one(episodes: PairedEpisodes) -> None:
     nowhere = replace(TASK, plane=None)
-    plain, *asked = EnvConfig(), EnvConfig(support_penalty=0.3), EnvConfig(command_limit_m_s=1.0)
+    plain, *asked = EnvConfig(), EnvConfig(support_penalty=0.3), EnvConfig(command_limit=1.0)
     parts = env_parts(nowhere, plain, episodes, NO_GROUNDING)
     assert parts.thinness is None
     world = training_env(nowhere, plain, parts, NO_GROUNDING, num_envs=1, device="cpu")

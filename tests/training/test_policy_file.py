@@ -47,7 +47,7 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
 
 
 def test_it_runs_as_it_was_trained(tmp_path: Path) -> None:
-    simulation = Simulation(None, torch.zeros(4, 4), EnvConfig(command_limit_m_s=0.7))
+    simulation = Simulation(None, torch.zeros(4, 4), EnvConfig(command_limit=0.7))
     policy = ActorCritic(ActorCriticShape(41, 2))
     PolicyFile(policy, simulation, None, None, "full").save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
@@ -55,7 +55,7 @@ def test_it_runs_as_it_was_trained(tmp_path: Path) -> None:
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
     acting = running(TASKS["antmaze-umaze"], loaded, HistoryGrounding(model), aligned)
-    assert (acting.command_limit_m_s, acting.observed) == (0.7, "full")
+    assert (acting.command_limit, acting.observed) == (0.7, "full")
     assert acting.source_encoder is model and acting.target_encoder is aligned
 
 

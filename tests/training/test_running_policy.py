@@ -85,7 +85,7 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
     policy = ActorCritic(ActorCriticShape(observation_size=16, action_size=2, memory_size=8))
     for layer in policy.actor.parameters():
         layer.mul_(20)  # actions of some size
-    running = RunningPolicy(TASK, policy, model, command_limit_m_s=0.2)
+    running = RunningPolicy(TASK, policy, model, command_limit=0.2)
     actions = run(running)
     assert actions.norm(dim=-1).max() <= 0.2 + 1e-6
     abstract = STATE[..., [0, 1, 15, 16]]

@@ -230,7 +230,7 @@ def test_commands_are_clipped_and_shortened() -> None:
 
 
 def test_the_penalty_scale_scales_the_penalties() -> None:
-    one = world(1, thinness=torch.ones(U_MAZE.fine_walls.shape), command_limit_m_s=0.5)
+    one = world(1, thinness=torch.ones(U_MAZE.fine_walls.shape), command_limit=0.5)
     state = {"state": torch.tensor([[-4.0, 4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
     rewards = []
     for scale in (0.0, 0.25, 1.0):
@@ -242,7 +242,7 @@ def test_the_penalty_scale_scales_the_penalties() -> None:
 
 
 def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -> None:
-    still, penalised = world(2), world(2, change_penalty=0.5, command_limit_m_s=0.5)
+    still, penalised = world(2), world(2, change_penalty=0.5, command_limit=0.5)
     penalised.penalty_scale = 0.0
     paid = []
     for command in ([0.0, 0.4], [0.0, 0.4], [3.0, 0.0]):  # the last is shortened to 0.5

@@ -255,13 +255,13 @@ def test_switches_reach_the_environment_and_the_policy_file(tmp_path: Path) -> N
         "support_penalty": 0.2,
         "disagreement_penalty": 0.3,
         "change_penalty": 0.1,
-        "command_limit_m_s": 0.7,
+        "command_limit": 0.7,
         "data_start_share": 0.6,
     }
     given = training(tmp_path, PPO.model_copy(update=switches))
     env, simulation = InSimulator().world(given)
     assert (env.num_envs, env.topple, env.risk_weight, env.disagreement_penalty) == (3, True, 2.0, 0.3)
-    assert (env.command_limit_m_s, env.data_start_share, env.change_penalty) == (0.7, 0.6, 0.1)
+    assert (env.command_limit, env.data_start_share, env.change_penalty) == (0.7, 0.6, 0.1)
     assert simulation.thinness is not None and env.thinness is not None
     torch.testing.assert_close(env.thinness, 0.2 * simulation.thinness)
     expected = 0.5 * NO_GROUNDING.scatter(given.episodes)
