@@ -148,9 +148,10 @@ def test_results_that_are_not_alike_are_not_added(
         assembled(root, published=published)
 
 
-def test_results_of_other_data_are_not_added(root: Path) -> None:
+@pytest.mark.parametrize("other", ["other", "another"])
+def test_results_of_other_data_are_not_added(root: Path, other: str) -> None:
     published = assembled(root)
     remove(root, "astra", 0)
-    edit_json(root / "pair/seed_1/meta/astra/dataset.json", content_hash="other")
-    with pytest.raises(BadInputError, match="pair seed 1 with content hash1 and other"):
+    edit_json(root / "pair/seed_1/meta/astra/dataset.json", content_hash=other)
+    with pytest.raises(BadInputError, match=f"pair seed 1 with content hash1 and {other}"):
         assembled(root, published=published)

@@ -38,8 +38,8 @@ def test_the_table_has_a_column_for_each_size() -> None:
 
 
 def test_rows_that_are_not_finished_are_left_open() -> None:
-    nas = bare_results("toy", {"nas": [0, 1], "astra": [1]}, {})
-    rows = {"nas": summarised(nas.methods["nas"], 100), "astra": summarised(nas.methods["astra"], 100)}
+    nas = bare_results("toy", {"nas": [0, 1], "iql": [0, 1, 2], "astra": [1]}, {})
+    rows = {name: summarised(row, 100) for name, row in nas.methods.items()}
     found = SizesResults(
         recipe="toy",
         task="maze",
@@ -53,6 +53,7 @@ def test_rows_that_are_not_finished_are_left_open() -> None:
     page = render_sizes(found, {})
     assert "Not finished yet: NAS and DT at 50 %; all rows at 10 %; all rows at 150 %. Produced by" in page
     assert "| astra | 0.38 ± 0.18 | 0.00 (1 seed) |" in page and "| nas | - | 0.00 ± 0.00 |" in page
+    assert "| iql | - | 0.00 ± 0.00 (3 seeds) |" in page
     assert "| astra | 0.38 [0.25, 0.50] | 0.00 |" in page and "| nas | - | 0.00 [0.00, 0.00] |" in page
     assert "Not finished" not in render_sizes(FOUND, {})
     assert "unfinished" in found.model_dump() and "unfinished" not in FOUND.model_dump()
