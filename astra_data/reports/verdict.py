@@ -215,13 +215,11 @@ def _trained(results: Results, percent: int | None) -> str:
     if source := results.settings.get("data"):
         return f", trained on {share}the episodes of {source}"
     collect = results.settings.get("collect")
-    episodes = collect.get("episodes") if isinstance(collect, dict) else None
-    if not episodes:
+    if not isinstance(collect, dict) or not collect.get("episodes"):
         return ""
-    seeds = len(results.seeds)
-    return (
-        f", trained on {share}{episodes} episodes of data{f' for each of {seeds} seeds' if seeds > 1 else ''}"
-    )
+    steps, seeds = collect.get("least_steps"), len(results.seeds)
+    amount = f"{steps:,} steps" if isinstance(steps, int) else f"{collect['episodes']} episodes"
+    return f", trained on {share}{amount} of data{f' for each of {seeds} seeds' if seeds > 1 else ''}"
 
 
 def _with_interval(share: float, low: float | None, high: float | None) -> str:

@@ -186,6 +186,11 @@ def test_references_alone_are_not_deployed(results: Results) -> None:
     ("settings", "percent", "text"),
     [
         ({"collect": {"episodes": 60}}, None, ", trained on 60 episodes of data for each of 3 seeds; "),
+        (
+            {"collect": {"episodes": 400, "least_steps": 80_000}},
+            None,
+            ", trained on 80,000 steps of data for each of 3 seeds; ",
+        ),
         ({"collect": {"episodes": 60}}, 25, ", trained on 25 % of 60 episodes of data for each of 3 seeds; "),
         ({"data": "walks@data-1.0.0"}, None, ", trained on the episodes of walks@data-1.0.0; "),
         ({}, 25, "best mean over seeds; "),
