@@ -25,7 +25,7 @@ def test_every_policy_acts_in_every_simulator(tmp_path: Path, capsys: pytest.Cap
             (tmp_path / f"align/{row}/seed_0").mkdir(parents=True)
             (tmp_path / f"align/{row}/seed_0/target_encoder.safetensors").touch()
             train(TASK, row, TRAIN, dataset=pairs, grounding=grounding, out=tmp_path / f"train/{row}/seed_0")
-        found = cross_simulators.outcomes(tmp_path, ROWS, 0, 3)
+        found = cross_simulators.outcomes(tmp_path, ROWS, 0, None, 3)
         cross_simulators.main(tmp_path, ROWS, [0, 0], episodes=3)
     names = [(simulator, acting) for simulator in ROWS for acting in ("follower", *ROWS)]
     assert [*found] == names

@@ -29,10 +29,11 @@ def main(
     run: Path,
     row: Annotated[list[str], typer.Option(help="Rows that are trained in a grounded simulator.")],
     seed: Annotated[list[int], typer.Option(help="Seeds of the run.")],
+    percent: Annotated[int | None, typer.Option(help="Size of the data, of a sweep.")] = None,
     episodes: Annotated[int, typer.Option(help="Of each policy in each simulator.", min=1)] = 40,
 ) -> None:
     """Print the table."""
-    found = [outcomes(run, row, one, episodes) for one in seed]
+    found = [outcomes(run, row, one, percent, episodes) for one in seed]
     print(f"| simulator of | who acts | success | failed | steps |\n|{'---|' * 5}")
     for simulator, acting in found[0]:
         of_seeds = [outcome[simulator, acting] for outcome in found]
@@ -42,10 +43,12 @@ def main(
         print(f"| {simulator} | {acting} | {success} | {failed} | {steps} |")
 
 
-def outcomes(run: Path, rows: list[str], seed: int, episodes: int) -> dict[tuple[str, str], Outcome]:
+def outcomes(
+    run: Path, rows: list[str], seed: int, percent: int | None, episodes: int
+) -> dict[tuple[str, str], Outcome]:
     """Return what came of each row's policy and of the follower in each row's simulator, by both names."""
     task = task_named(settings_of(run)["task"])
-    files = {row: policy_files(run, row, seed=seed) for row in rows}
+    files = {row: policy_files(run, row, seed=seed, percent=percent) for row in rows}
     trained = {row: PolicyFile.load(of["train"]) for row, of in files.items()}
     groundings = {row: load_grounding(of["ground"]) for row, of in files.items()}
     acting: dict[str, Begin] = {FOLLOWER: partial(careful, task)}
