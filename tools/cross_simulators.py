@@ -16,13 +16,11 @@ import typer
 from astra_data.core.seeding import derive
 from astra_data.experiments.trained_policy import policy_files, settings_of
 from astra_data.grounding.files import load_grounding
-from astra_data.methods.follower import careful
+from astra_data.methods.follower import FOLLOWER, careful
 from astra_data.training.episode_record import Outcome
 from astra_data.training.own_world import Begin, in_simulator, own_world, started
 from astra_data.training.policy_file import PolicyFile, running
 from astra_data.worlds.registry import task_named
-
-FOLLOWER = "follower"
 
 
 def main(
@@ -51,17 +49,16 @@ def outcomes(
     files = {row: policy_files(run, row, seed=seed, percent=percent) for row in rows}
     trained = {row: PolicyFile.load(of["train"]) for row, of in files.items()}
     groundings = {row: load_grounding(of["ground"]) for row, of in files.items()}
-    acting: dict[str, Begin] = {FOLLOWER: partial(careful, task)}
+    acting: dict[str, Begin] = {FOLLOWER.name: partial(careful, task)}
     for row in rows:
         policy = running(task, trained[row], groundings[row])
         acting[row] = partial(started, policy, policy.act_in_simulator)
-    found = {}
+    found, drawn = {}, derive(seed, "simulated evaluation")
     for row in rows:
         simulation = trained[row].simulation
         assert simulation is not None  # a row with a grounding is trained in it
         for name, begin in acting.items():
             world = own_world(task, simulation, groundings[row], episodes)
-            drawn = derive(seed, "simulated evaluation")
             found[row, name], _ = in_simulator(world, begin, task.objective.horizon, drawn)
     return found
 

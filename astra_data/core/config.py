@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, Tag, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, Tag, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from astra_data.core.errors import BadInputError, RecipeError
@@ -131,6 +131,18 @@ def faults_of(error: ValidationError) -> str:
     faults = [f"{'.'.join(map(str, one['loc'])) or 'file'}: {one['msg']}" for one in all_of[:_MOST_FAULTS]]
     more = len(all_of) - len(faults)
     return "; ".join([*faults, f"and {more} more"] if more else faults)
+
+
+def read_written[T](kind: type[T], path: Path, *, by: str, cure: str) -> T:
+    """Read the JSON file `path` that `by` writes, as `kind`.
+
+    Raises:
+        BadInputError: it holds something else; the message ends with the `cure`.
+    """
+    try:
+        return TypeAdapter(kind).validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise BadInputError(f"{path} is not what {by} writes: {faults_of(error)}; {cure}") from None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column
 
 STATE = "observation.state"
 """(T, S) float32: the full target state s_t."""
@@ -249,8 +250,7 @@ class Episode:
         """Convert numpy scalars and array layouts, and validate the episode."""
         metadata = {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         masked = [k for k, v in self.columns.items() if isinstance(v, np.ma.MaskedArray) and v.mask.any()]
-        columns = {name: np.asarray(values, order="C") for name, values in self.columns.items()}
-        columns |= {name: values[:, 0] for name, values in columns.items() if values.shape[1:] == (1,)}
+        columns = {name: as_column(np.asarray(values, order="C")) for name, values in self.columns.items()}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
         faults = []

@@ -3,18 +3,14 @@
 import json
 from pathlib import Path
 
-from pydantic import TypeAdapter, ValidationError
-
-from astra_data.core.config import faults_of
+from astra_data.core.config import read_written
 from astra_data.core.durable import write_file
-from astra_data.core.errors import BadInputError
 from astra_data.experiments.recipe import Recipe
 from astra_data.worlds.own_code import code_digest
 
 CODE = "code.json"
 """Beside recipe.json: the digests of "task", and of methods by their names, with their settings."""
 _SETTINGS = ".settings"
-_DIGESTS = TypeAdapter(dict[str, str])
 
 
 def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
@@ -44,13 +40,10 @@ def record_code(recipe: Recipe, folder: Path) -> None:
 
 
 def _recorded(path: Path) -> dict[str, str]:
-    try:
-        return _DIGESTS.validate_json(path.read_bytes()) if path.is_file() else {}
-    except ValidationError as error:
-        raise BadInputError(
-            f"{path} is not what a run writes: {faults_of(error)}; restore it from a copy, or remove it if "
-            "the code is still what the run was made with"
-        ) from None
+    if not path.is_file():
+        return {}
+    cure = "restore it from a copy, or remove it if the code is still what the run was made with"
+    return read_written(dict[str, str], path, by="a run", cure=cure)
 
 
 def _places(recipe: Recipe) -> dict[str, str]:

@@ -9,10 +9,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, JsonValue
 
-from astra_data.core.config import faults_of, load_tables
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.config import load_tables, read_written
+from astra_data.core.errors import RecipeError
 from astra_data.dataset.format import INFO_PATH
 from astra_data.experiments.own_methods import looked_up
 from astra_data.training.build_env import RENAMED
@@ -44,14 +44,8 @@ def recorded_settings(folder: Path) -> dict[str, Any]:
     Raises:
         BadInputError: their file is damaged.
     """
-    path = folder / RECORD
-    try:
-        return _Record.model_validate_json(path.read_bytes()).model_dump(exclude_unset=True)
-    except ValidationError as error:
-        raise BadInputError(
-            f"{path} is not what a run writes: {faults_of(error)}; restore it from a copy, or move the "
-            "folder away and run the recipe again"
-        ) from None
+    cure = "restore it from a copy, or move the folder away and run the recipe again"
+    return read_written(_Record, folder / RECORD, by="a run", cure=cure).model_dump(exclude_unset=True)
 
 
 def read_tables(path: Path) -> dict[str, Any]:

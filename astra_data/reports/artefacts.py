@@ -6,11 +6,11 @@ from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from astra_data.core.config import faults_of
+from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Machine
 
@@ -195,12 +195,7 @@ def read_json[T: Artefact](model: type[T], path: Path) -> T:
     Raises:
         BadInputError: the file does not hold what its stage writes; the message lists mismatches.
     """
-    try:
-        return model.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise BadInputError(
-            f"{path} is not what its stage writes: {faults_of(error)}; run that stage again"
-        ) from None
+    return read_written(model, path, by="its stage", cure="run that stage again")
 
 
 def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:

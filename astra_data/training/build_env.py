@@ -20,9 +20,6 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
-RENAMED = {"doubt_penalty": "disagreement_penalty", "command_limit_m_s": "command_limit"}
-"""Keys as they were up to 0.1, and as they are now. Recipes may have the old ones; files always do."""
-
 _KERNEL_M = 0.25
 """Standard deviation of the kernel that smooths the density of the data."""
 
@@ -101,6 +98,14 @@ class EnvConfig(Config):
     def limits_commands(self) -> bool:
         """Whether commands are shortened."""
         return bool(self.command_limit != type(self).model_fields["command_limit"].default)
+
+
+RENAMED = {
+    field.serialization_alias: name
+    for name, field in EnvConfig.model_fields.items()
+    if field.serialization_alias
+}
+"""Keys as they were up to 0.1, and as they are now. Recipes may have the old ones; files always do."""
 
 
 @dataclass(frozen=True)

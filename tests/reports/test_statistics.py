@@ -252,6 +252,7 @@ def test_ranks_are_correlated_within_rows() -> None:
     found = mean_rank_correlation(rows, least=3, replicates=500)
     expected = np.mean([stats.spearmanr(*np.array(list(row.values())).T).statistic for row in rows])
     assert found is not None and found.value == pytest.approx(expected)
+    assert -1 <= found.low < found.value < found.high <= 1
     of_rows = []
     draws = rng.integers(9, size=(4000, 9))
     for row in rows:

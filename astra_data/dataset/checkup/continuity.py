@@ -1,5 +1,6 @@
 """Next states that are not the states of the rows after them."""
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import Finding
 from astra_data.dataset.columns import NEXT_STATE, STATE, Episode
 
@@ -15,7 +16,7 @@ class Continuity:
         """Compare the steps of the next episode."""
         if NEXT_STATE not in episode.columns or STATE not in episode.columns:
             return
-        state, arrived = (episode.columns[name].reshape(len(episode), -1) for name in (STATE, NEXT_STATE))
+        state, arrived = as_rows(episode.columns[STATE]), as_rows(episode.columns[NEXT_STATE])
         broken = int((arrived[:-1] != state[1:]).any(axis=1).sum())
         self._steps += len(state) - 1
         self._broken += broken

@@ -53,9 +53,11 @@ def test_the_ranges_are_those_printed_in_the_paper() -> None:
         assert task.varied.randomized == JointVariation(**of_actions)
 
 
-def test_a_recipe_runs(tmp_path: Path) -> None:
+def test_a_recipe_runs_whole(tmp_path: Path) -> None:
     (tmp_path / "toy.toml").write_text(HEAD + RECIPE[RECIPE.index("[collect]") :])
-    folder = run_here(tmp_path / "toy.toml", until="evaluate")
+    folder = run_here(tmp_path / "toy.toml")
+    results = json.loads((folder / "report" / "results.json").read_text())
+    assert list(results["methods"]) == ["domain_randomization", "compass_uniform", "compass"]
     drawn = {
         "domain_randomization": RANDOMIZED_ACTIONS,
         "compass_uniform": JointVariation(**WIDE_RANGES.model_dump() | {"friction": (0.5, 1.5)}),
