@@ -3,12 +3,15 @@
 import time
 from collections.abc import Mapping
 
+CLOCKS = ("wall_seconds", "cpu_seconds")
+"""What is measured: time by the clock, and that of the processor."""
+
 
 class Stopwatch:
     """Measure time from now on, added to the time `spent` before an interruption."""
 
     def __init__(self, spent: Mapping[str, float] | None = None) -> None:
-        before = spent or {"wall_seconds": 0.0, "cpu_seconds": 0.0}
+        before = spent or dict.fromkeys(CLOCKS, 0.0)
         self._wall_began = time.perf_counter() - before["wall_seconds"]
         self._cpu_began = time.process_time() - before["cpu_seconds"]
 

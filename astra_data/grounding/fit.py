@@ -13,6 +13,7 @@ from astra_data.core.config import AtOnce, Config, Number, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part
 from astra_data.core.seeding import derive, generator
+from astra_data.core.stopwatch import CLOCKS
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.clearance import recorded_clearance_m
 from astra_data.grounding.diagnostics import telemetry
@@ -155,8 +156,8 @@ class HistoryFit:
         _fit_scatter(model, members, fitting.held_out)
         if members:
             metrics["members"] = [figures["epochs"][-1] for _, figures in others]
-            for spent in ("wall_seconds", "cpu_seconds"):
-                metrics[spent] += sum(figures[spent] for _, figures in others)
+            for clock in CLOCKS:
+                metrics[clock] += sum(figures[clock] for _, figures in others)
         grounding = HistoryGrounding(model, members=members)
         if config.recorded_clearance:
             metrics["clearance_m"] = clearance = recorded_clearance_m(fitting.task, fitting.training)

@@ -15,6 +15,7 @@ from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import part
 from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import CLOCKS
 from astra_data.learning.networks.adaptation import AdaptiveShape, Teacher
 from astra_data.learning.ppo import Ppo
 from astra_data.learning.rma import Adaptation, RmaConfig
@@ -56,8 +57,8 @@ class TeacherThenStudent(InSimulator):
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )
         curve["adaptation"] = optimise(adaptation, env, Ramp(), phase_2, "adaptation_checkpoint.safetensors")
-        for spent in ("wall_seconds", "cpu_seconds"):
-            curve[spent] += curve["adaptation"][spent]
+        for clock in CLOCKS:
+            curve[clock] += curve["adaptation"][clock]
         episodes = training.episodes
         return PolicyFile(adaptation.student, simulation, episodes.reference, episodes.content_hash), curve
 

@@ -115,14 +115,13 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     if TERMINATED in given:
         over = torch.from_numpy(given[TERMINATED])
     missed = judged(task.objective, "missed", after, goal)
-    reached = (
-        torch.from_numpy(given[SUCCESS])
-        if SUCCESS in given
-        else judged(task.objective, "reached", after, goal) & ~over
-    )
-    failed = (over | missed) & ~reached
-    success = reached.clone()
-    if SUCCESS not in given:
+    reached = judged(task.objective, "reached", after, goal) & ~over
+    success = torch.from_numpy(given[SUCCESS]) if SUCCESS in given else reached.clone()
+    failed = (over | missed) & ~success
+    if SUCCESS in given:
+        # That what is to last did so ends no episode.
+        reached = reached if task.objective.is_lasting else success
+    else:
         late = slice(task.objective.horizon - 1, None)
         success[late] = task.objective.succeeded(reached[late], failed[late], task.objective.horizon)
     reward = paid(task.objective, before, after, goal, failed).numpy()

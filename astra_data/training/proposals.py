@@ -105,7 +105,7 @@ def suggested(
     features = torch.cat([rollouts.state, proposals.action], dim=-1)
     spread = features.flatten(0, 1).std(0).clamp_min(1e-6)
     taken, information = chosen(
-        rollouts.expected.T,
+        torch.stack([steps.sum(0) for steps in rollouts.expected.split(every)], dim=1),
         (features[::every] / spread).transpose(0, 1),
         config.episodes,
         config.reach,
@@ -153,8 +153,8 @@ def chosen(
     """Take `count` proposals, each the one that teaches most given those that were taken before.
 
     Args:
-        information: of each step, (N, T).
-        features: of every k-th step, in units in which 1 is far, (N, ceil(T / k), F).
+        information: of each step that is compared with others, and those up to the next, (N, K).
+        features: of each step that is compared, in units in which 1 is far, (N, K, F).
         count: how many to take.
         reach: distance at which a step of a proposal still teaches 1 - exp(-½) of what it would otherwise.
         progress: called with the share done and a note.
@@ -162,15 +162,11 @@ def chosen(
     Returns:
         their numbers (count,), and what each was expected to teach then, (count,).
     """
-    steps = features.shape[1]
-    every = -(-information.shape[1] // steps)
-    padded = torch.nn.functional.pad(information, (0, steps * every - information.shape[1]))
-    worth = padded.unflatten(1, (steps, every)).sum(-1)
-    left = torch.ones_like(worth)
-    open_ = torch.ones(len(worth), dtype=torch.bool)
+    left = torch.ones_like(information)
+    open_ = torch.ones(len(information), dtype=torch.bool)
     taken, gained = [], []
     for number in range(count):
-        gains = (worth * left).sum(1).masked_fill(~open_, -1.0)
+        gains = (information * left).sum(1).masked_fill(~open_, -1.0)
         best = int(gains.argmax())
         taken.append(best)
         gained.append(float(gains[best]))

@@ -6,6 +6,7 @@ from typing import Any
 
 from astra_data.core.progress import part
 from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import CLOCKS
 from astra_data.grounding.protocols import Grounding
 from astra_data.training.own_world import Reached, trial
 from astra_data.training.policy_file import POLICY, PolicyFile
@@ -23,8 +24,8 @@ def with_restarts(
         grounding: that of the training, on the CPU, where policies are tested.
 
     Returns:
-        the policy that does, or else the one with the most success there; and its learning curve, with all
-        tries as "tries": their seeds, what they reached, and their points.
+        the policy that does, or else the one with the most success there; and its learning curve, with the
+        time that all tries took, and with them as "tries": their seeds, what they reached, and their points.
     """
     config = training.config
     if config.tries == 1:
@@ -39,14 +40,19 @@ def with_restarts(
         made.append((reached, policy, curve))
         if _masters(reached, training):
             break
-    _, policy, curve = max(made, key=lambda one: one[0].success)
+    kept = len(made) - 1
+    if not _masters(made[kept][0], training):
+        kept = max(range(len(made)), key=lambda number: made[number][0].success)
+    _, policy, curve = made[kept]
     tries = [
         {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": of_try["points"]}
         for seed, (one, _, of_try) in zip(seeds, made, strict=False)
     ]
+    curves = [of_try for _, _, of_try in made]
+    spent = {clock: sum(of_try[clock] for of_try in curves) for clock in CLOCKS if clock in curve}
     for number in range(1, len(made)):
         shutil.rmtree(_attempt(training, 0, number).folder)
-    return policy, curve | {"tries": tries}
+    return policy, curve | spent | {"tries": tries}
 
 
 def _attempt(training: Training, seed: int, number: int) -> Training:

@@ -69,10 +69,10 @@ class RunningPolicy:
     @property
     def observation_size(self) -> int:
         """O, of what the task and the grounding give a policy to observe."""
-        state = torch.zeros(self.task.state_columns[0].size)
-        goal = torch.zeros(self.task.objective.goal_size)
-        seen = len(target_observation(self.task, state, goal, None, self.observed))
-        return seen + self._latent_size
+        state = torch.zeros(1, self.task.state_columns[0].size)
+        goal = torch.zeros(1, self.task.objective.goal_size)
+        seen = target_observation(self.task, state, goal, None, self.observed)
+        return seen.shape[1] + self._latent_size
 
     def start(self, count: int, generator: torch.Generator | None = None) -> None:
         """Start B = `count` episodes without history; with `generator`, draw actions as in training."""

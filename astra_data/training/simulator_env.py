@@ -35,9 +35,9 @@ def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent
     """Assemble a policy's observation (..., O): the latent (..., Z) if there is one, then state and goal.
 
     The latent is scaled from its length of sqrt(Z) to about one. At its own length it drowns the rest: PPO
-    then hardly learns to use the position.
+    then hardly learns to use the position. The objective is given B states at a time.
     """
-    seen = objective.observe(state, goal)
+    seen = objective.observe(state.flatten(0, -2), goal.flatten(0, -2)).unflatten(0, state.shape[:-1])
     return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
 
 

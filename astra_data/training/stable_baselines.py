@@ -27,8 +27,10 @@ class StableBaselinesEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Array:
-        """Start all rows; return observations (B, O)."""
-        return self.env.reset()[0]
+        """Start all rows, from the seed that was set last if there is one; return observations (B, O)."""
+        observation, _ = self.env.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        return observation
 
     def step_async(self, actions: Array) -> None:
         """Keep `actions` (B, A) for `step_wait`."""

@@ -138,7 +138,7 @@ class Training:
         episodes: paired episodes. grounding: of the method; `NO_GROUNDING` where it fits none.
         initial: the policy that the training starts from, if the method names one.
         seed: of all randomness. device: of the networks.
-        folder: for checkpoints; files left in it become part of the artefact.
+        folder: for checkpoints.
         progress: called with the share done and a note.
         num_threads: of the target's physics, for methods that train in the target; None is one per core.
     """

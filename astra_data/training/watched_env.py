@@ -25,10 +25,12 @@ class WatchedEnv(BatchedVectorEnv):
         super().__init__(seeded, training.simulated_steps)
         self.points: list[dict[str, Any]] = []
         self._training, self._total = training, training.config.total_steps
+        self._simulated, self._ramp = env, training.config.penalty_ramp
         self._steps = self._ended = self._succeeded = 0
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions (B, A) for one control step."""
+        self._simulated.penalty_scale = self._ramp.scale(self.points, self._steps, self._total)
         stepped = super().step(actions)
         infos = stepped[-1]
         self._steps += self.num_envs

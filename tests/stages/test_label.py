@@ -107,6 +107,11 @@ def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
     assert lasted.metadata["success"] and lasted.columns[TRUNCATED].tolist() == [False] * 9 + [True]
     fell = labels(task, Episode(0, dict(long.columns) | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0)
     assert not fell.columns[SUCCESS].any() and fell.metadata["failed"]
+    for over in ({}, {TERMINATED: lasted.columns[TRUNCATED]}):
+        told = labels(task, Episode(0, dict(long.columns) | over | {SUCCESS: lasted.columns[SUCCESS]}, {}), 0)
+        assert told.metadata["success"] and not told.metadata["failed"]
+        assert not told.columns[TERMINATED].any()
+        assert told.columns[TRUNCATED].tolist() == [False] * 9 + [True]
 
 
 def test_outcomes_are_those_of_the_steps_that_are_kept() -> None:

@@ -28,15 +28,8 @@ def test_the_most_instructive_is_taken_first_and_the_next_one_elsewhere() -> Non
 
 
 def test_at_its_reach_a_step_teaches_two_fifths() -> None:
-    _, gained = chosen(torch.ones(2, 4), torch.tensor([[0.0, 0.0], [0.7, 0.7]])[..., None], 2, reach=0.7)
+    _, gained = chosen(torch.full((2, 2), 2.0), torch.tensor([[0.0, 0.0], [0.7, 0.7]])[..., None], 2, reach=0.7)
     assert gained == pytest.approx([4.0, 4.0 * (1 - np.exp(-0.5))])
-
-
-def test_steps_between_those_that_are_compared_count_with_them() -> None:
-    information = torch.tensor([[1.0, 1.0, 1.0, 1.0, 9.0], [3.0, 3.0, 3.0, 3.0, 0.0]])
-    places = torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, 0.0]])[..., None]
-    taken, gained = chosen(information, places, 2, reach=0.1)
-    assert taken.tolist() == [0, 1] and gained == pytest.approx([13.0, 0.0])
 
 
 def test_equal_commands_in_a_row_are_held() -> None:
@@ -86,7 +79,11 @@ def test_what_a_simulator_draws_is_of_the_seed(monkeypatch: pytest.MonkeyPatch) 
     assert suggested(TASK, committee, CONFIG, seed=1).taken.tolist() == first.taken.tolist()
 
 
-def test_steps_are_compared_every_half_second_in_standard_deviations(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("steps", [10, 13])
+def test_steps_are_compared_every_half_second_in_standard_deviations(
+    monkeypatch: pytest.MonkeyPatch, steps: int
+) -> None:
+    """Steps between those that are compared, and after the last one, count with them."""
     committee, given = Committee.of(TASK, [HistoryGrounding(shifted(*OFFSETS_M))]), list[Any]()
 
     def noted(*them: Any) -> Any:  # noqa: ANN401 - handed on
@@ -94,11 +91,15 @@ def test_steps_are_compared_every_half_second_in_standard_deviations(monkeypatch
         return chosen(*them)
 
     monkeypatch.setattr(proposals, "chosen", noted)
-    made = suggested(TASK, committee, CONFIG, seed=1)
+    made = suggested(TASK, committee, CONFIG.model_copy(update={"max_steps": steps}), seed=1)
     every = torch.cat([made.rollouts.state, made.proposals.action], dim=-1)
-    expected = every[[0, 5]] / every.flatten(0, 1).std(0)  # of ten steps of 0.1 s
+    compared = range(0, steps, 5)  # of steps of 0.1 s
+    expected = every[[*compared]] / every.flatten(0, 1).std(0)
     torch.testing.assert_close(given[1], expected.transpose(0, 1))
-    assert torch.equal(given[0], made.rollouts.expected.T) and (made.rollouts.reached == 0).any()
+    blocks = [made.rollouts.expected[first : first + 5].sum(0) for first in compared]
+    torch.testing.assert_close(given[0], torch.stack(blocks, dim=1))
+    assert (made.rollouts.reached == 0).any()
+    assert made.information.max() == pytest.approx(float(given[0].sum(1).max()))
 
 
 def test_a_suggestion_is_what_was_taken_of_the_proposals() -> None:

@@ -34,9 +34,10 @@ def restarted(
     folder: Path,
     commands: Iterable[float],
     progress: Progress = silent,
+    clocks: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> tuple[float, dict[str, Any], list[int]]:
-    """Train policies that give these commands, one a try; return what is kept, the curve and the seeds."""
+    """Train policies that give these commands, one a try, in 2, 4, … s; return what is kept, the curve and the seeds."""
     rest, seeds, one = iter(commands), [], torch.zeros(1, 3, 1)
 
     def learn(env: Any, given: Training) -> Constant:  # noqa: ANN401
@@ -60,7 +61,13 @@ def restarted(
         folder=folder,
         progress=progress,
     )
-    kept, curve = with_restarts(OwnLearner(learn=learn, policy=Constant), training, NO_GROUNDING)
+    learner = OwnLearner(learn=learn, policy=Constant)
+
+    def timed(given: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        kept, curve = learner(given)
+        return kept, curve | ({"wall_seconds": 2.0 * len(seeds), "cpu_seconds": len(seeds)} if clocks else {})
+
+    kept, curve = with_restarts(timed, training, NO_GROUNDING)
     assert isinstance(kept, PolicyFile) and isinstance(kept.policy, OwnPolicy)
     return kept.policy.acting.command, curve, seeds  # type: ignore[attr-defined]
 
@@ -96,7 +103,16 @@ def test_one_that_is_late_does_not_master_it(tmp_path: Path) -> None:
     # At 0.55 m/s all arrive within 37 of 40 steps.
     settings: dict[str, Any] = {"tries": 2, "least_success": 0.9}
     assert len(restarted(tmp_path, [-0.38, 1.0], **settings)[2]) == 1
-    assert len(restarted(tmp_path, [-0.38, 1.0], most_of_horizon=0.5, **settings)[2]) == 2
+    command, curve, seeds = restarted(tmp_path, [-0.38, 1.0], most_of_horizon=0.5, **settings)
+    assert (command, seeds) == (1.0, SEEDS[:2])
+    assert [one["success"] for one in curve["tries"]] == [1.0, 1.0]
+
+
+def test_all_tries_cost_time(tmp_path: Path) -> None:
+    command, curve, _ = restarted(tmp_path, [-0.44, -1.0, -0.9], tries=3, clocks=True)
+    assert command == -0.44
+    assert (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
+    assert "wall_seconds" not in restarted(tmp_path, [-1.0, 1.0], tries=2)[1]
 
 
 def test_without_tries_nothing_is_tested(tmp_path: Path) -> None:

@@ -33,5 +33,14 @@ def test_rows_are_those_of_the_vector_environment() -> None:
     assert len(lengths) >= 3
 
 
+def test_the_seed_that_is_set_is_that_of_the_next_reset() -> None:
+    rows = StableBaselinesEnv(gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=3))
+    truth = gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=3)
+    for _ in range(2):
+        rows.seed(5)
+        np.testing.assert_array_equal(rows.reset(), truth.reset(seed=5)[0])
+        np.testing.assert_array_equal(rows.reset(), truth.reset()[0])
+
+
 def test_its_checker_finds_nothing_in_a_single_one() -> None:
     check_env(gymnasium.make("astra_data/PointMazeUMaze-v0").unwrapped)
