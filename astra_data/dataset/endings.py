@@ -7,7 +7,9 @@ it, as `terminal = "stand_still"` still does: that is no step of the robot.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from astra_data.dataset.columns import NEXT_STATE, STATE, TERMINATED, Array
+import numpy as np
+
+from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, Array
 from astra_data.dataset.reader import Dataset
 
 NEEDED = (STATE, NEXT_STATE, TERMINATED)
@@ -60,6 +62,16 @@ def endings_of(dataset: Dataset) -> Endings:
 def is_terminated(columns: Mapping[str, Array]) -> bool:
     """Return whether an episode with these columns is known to end in success or failure."""
     return TERMINATED in columns and bool(columns[TERMINATED][-1])
+
+
+def outcome_of(columns: Mapping[str, Array]) -> dict[str, bool | float]:
+    """Return what the metadata of an episode with these columns say of its outcome."""
+    success = bool(columns[SUCCESS].any())
+    return {
+        "success": success,
+        "failed": is_terminated(columns) and not success,
+        "return": float(columns[REWARD].sum(dtype=np.float64)),
+    }
 
 
 def stands_still(state: Array, next_state: Array) -> bool:

@@ -75,6 +75,8 @@ def add_method(name: str, place: str) -> None:
     method = own_object(place)
     if not isinstance(method, Method):
         raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
+    if method.learn is None:
+        raise BadInputError(f"{place} learns no policy: expected learn, an OwnLearner that returns one")
     if method.table is not None and method.table.ranges:
         raise BadInputError(f"{place} has a table of ranges, which only methods of the package have")
     if kind := method.grounding:

@@ -30,13 +30,11 @@ from astra_data.dataset.columns import (
     GOAL,
     NEXT_STATE,
     OUTCOME_COLUMNS,
-    REWARD,
     STATE,
-    SUCCESS,
-    TERMINATED,
     Column,
     Episode,
 )
+from astra_data.dataset.endings import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
@@ -261,10 +259,8 @@ def _episode(uid: int, source: int, copied: Copy) -> Episode:
     return Episode(
         uid,
         columns,
-        {
-            "success": bool(columns[SUCCESS][-1]),
-            "failed": bool(columns[TERMINATED][-1] and not columns[SUCCESS][-1]),
-            "return": float(columns[REWARD].sum(dtype=np.float64)),
+        outcome_of(columns)
+        | {
             "held_out": False,
             "source_episode": source,
             "augmentation_first_step": int(steps.start),

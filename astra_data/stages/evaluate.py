@@ -152,6 +152,8 @@ def _check(task: Task, method: str, policy: Path | PolicyFile | None, grounding:
     row = method_named(method)
     if row.trains and policy is None:
         raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
+    if not row.trains and policy is not None:
+        raise BadInputError(f"method '{method}' has no policy: leave it out, or name the row of it")
     if not (row.trains or task.has_target):
         raise BadInputError(f"method '{method}' acts in a target, and {task.name} has none")
     if row.grounds and grounding is None:

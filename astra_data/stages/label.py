@@ -25,6 +25,7 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.endings import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
@@ -137,17 +138,8 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     columns = (
         computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
     )
-    succeeded = bool(columns[SUCCESS][:length].any())
-    outcome = {
-        "success": succeeded,
-        "failed": bool(terminated[length - 1]) and not succeeded,
-        "return": float(columns[REWARD][:length].sum(dtype=np.float64)),
-    }
-    return Episode(
-        episode.uid,
-        {key: values[:length] for key, values in columns.items()},
-        dict(episode.metadata) | outcome,
-    )
+    kept = {key: values[:length] for key, values in columns.items()}
+    return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
 
 
 def _opened(data: str | Path) -> Dataset:

@@ -208,6 +208,9 @@ def training_env(
     if task.plane is None and (config.support_penalty or config.limits_commands):
         raise task.without_maze()
     scatter = parts.scatter if config.residual_noise else None
+    thinness = None
+    if config.support_penalty and parts.thinness is not None:
+        thinness = config.support_penalty * parts.thinness
     used = _used(grounding, config)
     simulator = used.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter)
     return SimulatorEnv(
@@ -217,7 +220,7 @@ def training_env(
         topple=config.topple,
         risk_weight=config.risk_weight,
         command_limit=config.command_limit,
-        thinness=None if parts.thinness is None else config.support_penalty * parts.thinness,
+        thinness=thinness,
         disagreement_penalty=config.disagreement_penalty,
         change_penalty=config.change_penalty,
         starts=parts.starts,

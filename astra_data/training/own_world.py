@@ -8,6 +8,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.protocols import Grounding
 from astra_data.training.build_env import EnvParts, training_env
@@ -78,8 +79,16 @@ class Reached:
 
 
 def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
-    """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions."""
-    assert trained.simulation is not None
+    """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions.
+
+    Raises:
+        BadInputError: it does not know that simulator.
+    """
+    if trained.simulation is None:
+        raise BadInputError(
+            "tries: expected a policy that knows its simulator, got one without: give PolicyFile its "
+            "simulation, or set tries = 1"
+        )
     policy = running(task, trained, grounding)
     world = own_world(task, trained.simulation, grounding, _EPISODES)
     begin = partial(started, policy, policy.act_in_simulator)

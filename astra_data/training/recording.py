@@ -21,6 +21,7 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
+from astra_data.dataset.endings import outcome_of
 from astra_data.dataset.staging import StagedWriter
 from astra_data.training.behaviors import Behavior
 from astra_data.worlds.batched import TargetEnv
@@ -69,7 +70,7 @@ def record(
         for index in torch.nonzero(active & row[DONE]).squeeze(1).tolist():
             if rows[index] not in writer.staged:
                 episode = {name: as_column(values[: step + 1, index]) for name, values in columns.items()}
-                writer.add(_episode(rows[index], episode, seed), rows[index])
+                writer.add(Episode(rows[index], episode, outcome_of(episode) | {"seed": seed}), rows[index])
         active &= ~row[DONE]
         rate = steps / (time.perf_counter() - began)
         progress((step + 1) / max_steps, f"{rate:,.0f} target steps/s")
@@ -94,14 +95,3 @@ def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> 
         DONE: outcome.terminated | truncated,
         SUCCESS: outcome.success,
     }
-
-
-def _episode(uid: int, values: dict[str, Array], seed: int) -> Episode:
-    success = bool(values[SUCCESS].any())
-    metadata = {
-        "success": success,
-        "failed": bool(values[TERMINATED][-1]) and not success,
-        "return": float(values[REWARD].sum(dtype=np.float64)),
-        "seed": seed,
-    }
-    return Episode(uid, values, metadata)

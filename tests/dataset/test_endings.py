@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 
 from astra_data.dataset import Dataset, DatasetWriter
-from astra_data.dataset.columns import NEXT_STATE, STATE, TERMINATED, Column, Episode
-from astra_data.dataset.endings import Endings, endings_of
+from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, Column, Episode
+from astra_data.dataset.endings import Endings, endings_of, outcome_of
 
 
 def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Path) -> None:
@@ -23,3 +23,18 @@ def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Pat
     assert found == Endings(terminated=2, cut_off=2, made_up=1)
     assert str(found).startswith("2 terminated, 2 cut off; 1 next states were made up")
     assert str(Endings(3, 1)) == "3 terminated, 1 cut off"
+
+
+def test_an_outcome_is_of_all_steps() -> None:
+    reward, never = np.array([0.1, 0.2, -1.0], np.float32), np.zeros(3, bool)
+    early, last = np.array([True, False, False]), np.array([False, False, True])
+    for success, terminated, expected in (
+        (never, never, (False, False)),
+        (never, last, (False, True)),
+        (last, last, (True, False)),
+        (early, last, (True, False)),
+        (last, never, (True, False)),
+    ):
+        outcome = outcome_of({SUCCESS: success, TERMINATED: terminated, REWARD: reward})
+        assert (outcome["success"], outcome["failed"]) == expected
+        assert outcome["return"] == reward.sum(dtype=np.float64) and isinstance(outcome["return"], float)

@@ -220,6 +220,16 @@ def test_what_is_no_method_is_refused_in_one_line(tmp_path: Path, name: str, pla
     assert "\n" not in str(caught.value)
 
 
+def test_what_learns_no_policy_is_no_row_of_the_users(tmp_path: Path) -> None:
+    """It would be tested as the package's follower."""
+    (tmp_path / "mine.py").write_text(
+        "from astra_data.methods.method import Method\nMETHOD = Method(name='', title='', learn=None)"
+    )
+    with pytest.raises(BadInputError, match=r"mine.py:METHOD learns no policy: expected learn"):
+        add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
+    assert "mine" not in METHODS
+
+
 def test_a_kind_of_the_package_is_not_replaced(tmp_path: Path) -> None:
     text = (EXAMPLES / "delta_action.py").read_text().replace('kind = "delta action"', 'kind = "residual"')
     (tmp_path / "mine.py").write_text(text)

@@ -237,6 +237,8 @@ def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> No
     with pytest.raises(BadInputError, match=r"policy.safetensors does not exist") as caught:
         make(task, "direct_transfer", tmp_path / "out", {"policy": tmp_path})
     assert "\n" not in str(caught.value)
+    with pytest.raises(BadInputError, match="'follower' has no policy: leave it out, or name the row"):
+        make(task, "follower", tmp_path / "out", {"policy": trained})
 
 
 def test_what_does_not_fit_is_refused_before_any_episode(

@@ -149,6 +149,8 @@ def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> N
     world = training_env(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.thinness is not None and parts.thinness is not None
     torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
+    free = training_env(TASK, EnvConfig(), parts, NO_GROUNDING, num_envs=1, device="cpu")
+    assert free.thinness is None
 
 
 def test_what_needs_a_maze_is_refused_without_one(episodes: PairedEpisodes) -> None:

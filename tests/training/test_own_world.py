@@ -9,6 +9,7 @@ import torch
 from constant_policy import Constant
 from small_cart import TASK, Last
 
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.build_env import EnvConfig
 from astra_data.training.own_policy import OwnPolicy
@@ -35,6 +36,12 @@ def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
     none = trial(TASK, constant(-1.0), NO_GROUNDING, seed=0)
     assert (none.success, none.steps) == (0.0, 40.0)
     assert trial(TASK, constant(-0.44), NO_GROUNDING, seed=1) != some
+
+
+def test_a_policy_that_knows_no_simulator_cannot_be_tried() -> None:
+    trained = PolicyFile(OwnPolicy(Constant(1.0), 2, 1), None, None, None)
+    with pytest.raises(BadInputError, match=r"tries: expected a policy that knows its simulator"):
+        trial(TASK, trained, NO_GROUNDING, seed=0)
 
 
 def test_it_has_the_noise_that_it_was_trained_with() -> None:

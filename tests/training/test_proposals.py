@@ -28,7 +28,8 @@ def test_the_most_instructive_is_taken_first_and_the_next_one_elsewhere() -> Non
 
 
 def test_at_its_reach_a_step_teaches_two_fifths() -> None:
-    _, gained = chosen(torch.full((2, 2), 2.0), torch.tensor([[0.0, 0.0], [0.7, 0.7]])[..., None], 2, reach=0.7)
+    places = torch.tensor([[0.0, 0.0], [0.7, 0.7]])[..., None]
+    _, gained = chosen(torch.full((2, 2), 2.0), places, 2, reach=0.7)
     assert gained == pytest.approx([4.0, 4.0 * (1 - np.exp(-0.5))])
 
 

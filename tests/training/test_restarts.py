@@ -37,7 +37,7 @@ def restarted(
     clocks: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> tuple[float, dict[str, Any], list[int]]:
-    """Train policies that give these commands, one a try, in 2, 4, … s; return what is kept, the curve and the seeds."""
+    """Train policies that give these commands, one a try; return what is kept, the curve and the seeds."""
     rest, seeds, one = iter(commands), [], torch.zeros(1, 3, 1)
 
     def learn(env: Any, given: Training) -> Constant:  # noqa: ANN401
