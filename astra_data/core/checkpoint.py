@@ -1,10 +1,9 @@
 """Weights and training states on disk, as safetensors and JSON: written atomically, never pickled."""
 
 import json
-import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from astra_data.core.disk import refuse_finished, writing
 from astra_data.core.durable import (
-    clean,
-    discard,
-    make_folder,
-    move,
-    remove_empty,
-    sweep,
-    sync_tree,
     write_file,
 )
 from astra_data.core.errors import BadInputError
@@ -30,9 +21,6 @@ type Nested = (
     Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
 )
 """A training state, such as an optimizer's `state_dict()`."""
-
-_SETTINGS = "config.json"
-"""Name of the file of the settings in a folder."""
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
@@ -137,86 +125,9 @@ def understood(
         ) from error
 
 
-@contextmanager
-def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
-    """Yield a working folder that becomes `out` when the block succeeds.
-
-    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than the
-    settings: the next call yields it again with its contents, so that training can resume from its last
-    checkpoint. With `replace` it begins empty instead; the older `out` is kept as `.<name>.old` until the new
-    one is in its place.
-
-    Args:
-        out: the finished folder.
-        replace: replace an existing `out`.
-        config: the settings as JSON, written to `config.json`; a working folder with others is refused.
-
-    Raises:
-        BadInputError: `out` exists and `replace` is not set, or was begun with other settings.
-        DiskError: it cannot be written.
-    """
-    partial, old = (out.with_name(f".{out.name}.{state}") for state in ("partial", "old"))
-    with writing(out):
-        sweep(out)
-        if old.exists() and not out.exists():  # a kill came between the two renames below
-            move(old, out)
-        if not replace:
-            refuse_finished(out)
-        for folder in (partial, old):
-            if replace and folder.exists():
-                discard(folder, out)
-        made = make_folder(partial)
-        try:
-            clean(partial)
-            if config is not None:
-                _begin(partial, config)
-            yield partial
-        except BaseException:
-            # Not where an earlier call made it, which may be under way in another process.
-            with suppress(OSError):
-                if made and {path.name for path in partial.iterdir()} <= {_SETTINGS}:
-                    discard(partial, out)
-                    remove_empty(made)
-            raise
-        clean(partial)
-        sync_tree(partial)
-        _put(partial, out, old)
-
-
-def remove_checkpoints(folder: Path) -> None:
-    """Remove what trainings in `folder` would have been resumed from; they are over."""
-    for checkpoint in folder.glob("*checkpoint.safetensors"):
-        checkpoint.unlink()
-
-
-def _put(partial: Path, out: Path, old: Path) -> None:
-    """Rename `partial` to `out`; an older `out` is `old` in between, and comes back after an error."""
-    if out.exists():
-        move(out, old)
-    try:
-        move(partial, out)
-    finally:
-        with suppress(OSError):
-            if out.exists():
-                discard(old, out)
-            else:
-                os.replace(old, out)
-
-
 def _is_usable(name: str, tensor: Tensor) -> bool:
     # An infinite deviation is how networks leave out a part of their input.
     return not (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
-
-
-def _begin(partial: Path, config: str) -> None:
-    """Write the settings to `partial`, unless it was begun with them."""
-    settings = partial / _SETTINGS
-    if not any(partial.iterdir()):
-        write_file(settings, config)
-    elif not (settings.exists() and settings.read_text() == config):
-        raise BadInputError(
-            f"{partial} was begun with other settings, see its config.json if it has one: remove it"
-        )
 
 
 def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:

@@ -86,7 +86,7 @@ def _is_about(error: Exception, target: Path) -> bool:
     if not isinstance(name, str | bytes):
         return False
     path = Path(os.fsdecode(name))
-    hidden = str(target.with_name(f".{target.name}."))
+    hidden = str(target.parent / f".{target.name}.")
     return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
 
 

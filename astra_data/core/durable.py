@@ -171,7 +171,7 @@ def _missing(folder: Path) -> list[Path]:
 
 def _hidden_names(target: Path) -> Iterator[Path]:
     for attempt in itertools.count():
-        yield target.with_name(f".{target.name}.tmp-{os.getpid()}{f'-{attempt}' if attempt else ''}")
+        yield target.parent / f".{target.name}.tmp-{os.getpid()}{f'-{attempt}' if attempt else ''}"
 
 
 @contextmanager

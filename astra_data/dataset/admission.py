@@ -82,16 +82,19 @@ def _metadata_faults(key: str, value: Scalar) -> list[str]:
 
 
 def _outcome_faults(columns: Mapping[str, Array]) -> list[str]:
-    """List faults of the flags that end an episode: only its last step may."""
-    faults = []
-    for name in (TERMINATED, TRUNCATED, DONE):
-        ends = columns.get(name)
-        if ends is not None and ends.dtype == bool and ends[:-1].any():
-            faults.append(f"{name}: true in frame {int(ends.argmax())}, expected in the last one only")
-    done = columns.get(DONE)
-    if done is not None and done.dtype == bool and not done[-1]:
+    """List faults of the flags that end an episode, as far as they are flags: only its last step may."""
+    flags = {
+        name: ends
+        for name in (TERMINATED, TRUNCATED, DONE)
+        if (ends := columns.get(name)) is not None and ends.dtype == bool and ends.ndim == 1
+    }
+    faults = [
+        f"{name}: true in frame {int(ends.argmax())}, expected in the last one only"
+        for name, ends in flags.items()
+        if ends[:-1].any()
+    ]
+    if DONE in flags and not flags[DONE][-1]:
         faults.append(f"{DONE}: false in the last frame, expected true: an episode ends there")
-    both = [columns[name] for name in (TERMINATED, TRUNCATED) if name in columns]
-    if done is not None and done[-1] and len(both) == 2 and not any(flags[-1] for flags in both):
+    if len(flags) == 3 and flags[DONE][-1] and not (flags[TERMINATED][-1] or flags[TRUNCATED][-1]):
         faults.append(f"{DONE}: true in the last frame, expected {TERMINATED} or {TRUNCATED} there, too")
     return faults

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import QUANTILES, STATISTICS, STORED_STATISTICS
 from astra_data.dataset.parquet import read_arrays
@@ -80,7 +81,7 @@ def ranges(blocks: Iterable[Mapping[str, Array]]) -> dict[str, dict[str, Any]]:
     rows = 0
     for block in blocks:
         for name, values in block.items():
-            table = values.reshape(len(values), -1).astype(np.float64)
+            table = as_rows(values).astype(np.float64)
             low, high, total = table.min(axis=0), table.max(axis=0), table.sum(axis=0)
             before = found.get(name, {"min": low, "max": high})
             found[name] = {"min": np.minimum(before["min"], low), "max": np.maximum(before["max"], high)}

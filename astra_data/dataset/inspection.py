@@ -171,7 +171,7 @@ def _empty_map(spreads: list[Spread], role: str) -> tuple[Map, slice] | None:
             if found == role:
                 low, span = spread.low[group], spread.high[group] - spread.low[group]
                 cell = float(span.max()) / CELLS or 1.0
-                width, height = (int(cells) for cells in np.floor(span / cell + 1e-9) + 1)
+                width, height = (max(1, int(cells)) for cells in np.ceil(span / cell - 1e-9))
                 return Map(np.zeros((height, width), dtype=np.int64), low, cell), group
     return None
 

@@ -106,8 +106,7 @@ class Rows:
             run.columns[name][:steps] != 0 if name in self.stored else np.zeros(steps, bool) for name in ENDS
         )
         terminated[-1] |= self._is_terminated(run)
-        if self.dropped or names.TRUNCATED not in self.stored:
-            truncated[-1] |= not terminated[-1]
+        truncated[-1] |= not terminated[-1]
         return terminated, truncated
 
     def _successes(self, run: Run, steps: int) -> Array:

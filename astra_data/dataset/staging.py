@@ -90,7 +90,7 @@ class StagedWriter:
         self.policy: Path | None = None
         self.staged: dict[int, Mapping[str, Scalar]] = {}
         self.lengths: dict[int, int] = {}
-        self.folder = root.with_name(f".{root.name}.staged")
+        self.folder = root.parent / f".{root.name}.staged"
         self._columns = list(columns)
         self._schema = layout.data_schema(columns)
         self._plan = {

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.columns import (
     ACTION,
     GOAL,
@@ -45,4 +46,4 @@ def fields_of(columns: Iterable[str], own: Mapping[str, str]) -> dict[str, str]:
 
 def as_stored(name: str, values: Array) -> Array:
     """Return a column's values (T,) or (T, size) in the shape that the formats have it."""
-    return values.reshape(len(values), -1) if name in VECTORS else values
+    return as_rows(values) if name in VECTORS else values

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.checkpoint import finished_folder
+from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError

@@ -9,6 +9,7 @@ import numpy as np
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_rows
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
@@ -131,7 +132,7 @@ def _send(
         for name in shown:
             if name in episode.columns:
                 times = _times(rerun, len(episode), name == ABSTRACT_SIMULATED_NEXT_STATE, fps)
-                table = episode.columns[name].reshape(len(episode), -1)
+                table = as_rows(episode.columns[name])
                 for label, values in zip(_labels(schema[name]), table.T, strict=True):
                     _send_values(rerun, stream, f"{root}/{label}", values, times)
         for replay in replays.get(episode.uid, ()):

@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.checkpoint import finished_folder, remove_checkpoints
+from astra_data.core.artefact import finished_folder, remove_checkpoints
 from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.manifest import write_manifest

@@ -15,7 +15,8 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.core.checkpoint import finished_folder, save_tensors
+from astra_data.core.artefact import finished_folder
+from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
 from astra_data.core.disk import refuse_finished

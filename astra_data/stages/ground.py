@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from astra_data.core.checkpoint import finished_folder, remove_checkpoints
+from astra_data.core.artefact import finished_folder, remove_checkpoints
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from astra_data.core.checkpoint import finished_folder
+from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file

@@ -10,7 +10,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.checkpoint import finished_folder
+from astra_data.core.artefact import finished_folder
 from astra_data.core.config import AtOnce, Config, Number
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file

@@ -78,3 +78,9 @@ def test_a_lost_connection_is_not_a_fault_of_the_disk() -> None:
     assert disk_error(ConnectionRefusedError(errno.ECONNREFUSED, "refused")) is None
     message = str(disk_error(PermissionError(errno.EACCES, "no", "a/log.csv")))
     assert message.startswith("a/log.csv cannot be read or written: permission is denied.")
+
+
+def test_a_path_without_a_name_is_told_as_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DiskError, match=r"\. cannot be written: a folder has its name"), writing(Path(".")):
+        Path(".").write_bytes(b"")

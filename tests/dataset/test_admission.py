@@ -61,6 +61,15 @@ def test_only_the_last_step_ends_an_episode(
             open_writer.add(Episode(2, columns))
 
 
+@pytest.mark.parametrize("name", [DONE, TERMINATED, TRUNCATED])
+def test_flags_of_another_shape_are_a_fault_like_others(name: str) -> None:
+    columns = fake_columns(4, seed=1)
+    columns[name] = np.stack([columns[name]] * 2, axis=1)
+    with pytest.raises(BadInputError, match=rf"Episode 2: {name}: .*\(4, 2\)") as caught:
+        Admission(COLUMNS).check(Episode(2, columns))
+    assert "\n" not in str(caught.value)
+
+
 def test_an_episode_is_not_done_without_an_end() -> None:
     columns = fake_columns(4, seed=1)
     for name in (TERMINATED, TRUNCATED):

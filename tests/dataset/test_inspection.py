@@ -14,7 +14,7 @@ from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode, Scalar
 from astra_data.dataset.edit import filter_episodes
-from astra_data.dataset.inspection import BINS, Inspection, Map, inspect_dataset, visited
+from astra_data.dataset.inspection import BINS, CELLS, Inspection, Map, inspect_dataset, visited
 from astra_data.exchange.sharing.card import render_card
 from astra_data.exchange.sharing.notes import Notes
 
@@ -75,6 +75,19 @@ def test_the_page_shows_every_value_within_80_columns(inspection: Inspection) ->
         assert words in text
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+def test_the_longer_side_of_the_map_has_as_many_cells_as_a_side_may_have(tmp_path: Path) -> None:
+    source = write_fake(tmp_path / "fake")
+    description = {"name": "far", "stage": "x"}
+    with DatasetWriter(tmp_path / "far", source.schema, fps=20, task="go", description=description) as writer:
+        for episode in source.episodes():
+            episode.columns[STATE][:, :2] = np.linspace([0, 0], [6.4, 1.6], len(episode))
+            writer.add(episode)
+    places = inspect_dataset(Dataset.open(tmp_path / "far")).positions
+    assert places is not None
+    assert places.counts.shape == (CELLS // 4, CELLS) and places.counts.sum() == sum(LENGTHS)
+    assert places.cell * CELLS == pytest.approx(6.4)
 
 
 def test_bars_and_shades_follow_the_counts() -> None:

@@ -62,6 +62,9 @@ def test_an_episode_that_is_cut_off_is_truncated_unless_it_terminated(has_next: 
     np.testing.assert_array_equal(values(names.DONE, "bool", more=more), last)
     del more[names.TERMINATED]
     np.testing.assert_array_equal(values(names.TRUNCATED, "bool", more=more), last)
+    more[names.TRUNCATED] = np.zeros(STEPS, bool)
+    np.testing.assert_array_equal(values(names.TRUNCATED, "bool", more=more), last)
+    np.testing.assert_array_equal(values(names.DONE, "bool", more=more), last)
 
 
 def test_a_terminated_row_that_is_left_out_hands_its_flags_to_the_step_before() -> None:

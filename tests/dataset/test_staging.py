@@ -415,3 +415,10 @@ def record(root: Path) -> None:
 if __name__ == "__main__":
     os.write(1, b"begun\n")
     record(Path(sys.argv[1]))
+
+
+def test_the_working_directory_is_no_new_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInputError, match="exists"), staged_writer(Path(".")):
+        pass
+    assert not list(tmp_path.iterdir())

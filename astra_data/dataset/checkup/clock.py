@@ -46,7 +46,7 @@ class Clock:
     @classmethod
     def of(cls, column: Column, fps: int) -> Self:
         """Return a clock of the times in `column` (T,), in its unit, by default s."""
-        unit = column.units[0] or column.name.rpartition("_")[2]
+        unit = column.units[0] or column.name.lower().rpartition("_")[2]
         return cls(column.name, fps, _SECONDS.get(unit, 1.0))
 
     def add(self, episode: Episode) -> None:
@@ -88,6 +88,8 @@ class Clock:
         """Compare the rates."""
         if not self._has_rate:
             return f"{self._fps} Hz declared; {self._name} does not go on in most steps"
+        if self._is_off:
+            return f"{self._fps} Hz declared, and {self._off} by {self._name}"
         return (
             f"{self._fps} Hz declared, {1 / self.period_s:.4g} Hz by {self._name}; gaps: {self.gaps}, jitter "
             f"{100 * self.jitter:.1f} % of a period"
@@ -104,10 +106,9 @@ class Clock:
             found.append(Finding("warning", what, advice, tuple(self._standing)))
         if not self._has_rate:
             return found
-        if self._period() > FINE * (MOST_PERIODS - 1):
-            what = f"a step takes {MOST_PERIODS} periods or more, by {self._name}"
+        if self._is_off:
             advice = "give its `unit` (s, ms, us or ns) or correct `fps` in the mapping, and import again"
-            return [*found, Finding("warning", what, advice)]
+            return [*found, Finding("warning", f"{self._off}, by {self._name}", advice)]
         if abs(1 / period_s / self._fps - 1) > WRONG_RATE:
             found.append(
                 Finding(
@@ -138,6 +139,17 @@ class Clock:
     def _has_rate(self) -> bool:
         """Whether time goes on in most steps: float32 cannot hold the seconds since 1970, for one."""
         return bool(self._bins.sum() > self._standing_steps)
+
+    @property
+    def _is_off(self) -> bool:
+        """Whether steps are so long or short that the times are in another unit than is thought."""
+        return not 1.0 <= self._period() <= FINE * (MOST_PERIODS - 1)
+
+    @property
+    def _off(self) -> str:
+        """How long a step is, if it is so long or short."""
+        few = f"1/{FINE} of a period or less"
+        return f"a step takes {few if self._period() < FINE else f'{MOST_PERIODS} periods or more'}"
 
     def _period(self) -> float:
         """The mean over the `INNER` share of steps around the median, in bins: gaps do not move it."""

@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import SHOWN, Finding, channels, labels
 from astra_data.dataset.columns import ACTION, Array, Column, Episode
 
@@ -28,7 +29,7 @@ class GivenCommands:
 
     def add(self, episode: Episode) -> None:
         """Count the commands of the next episode."""
-        actions = episode.columns[ACTION].reshape(len(episode), -1)
+        actions = as_rows(episode.columns[ACTION])
         self._steps += len(actions)
         for side, extreme in enumerate((actions.min(axis=0), actions.max(axis=0))):
             beyond = extreme < self._edges[side] if side == 0 else extreme > self._edges[side]

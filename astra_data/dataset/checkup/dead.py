@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import Finding, channels, deletion
 from astra_data.dataset.columns import ACTION, STATE, Array, Column, Episode
 
@@ -33,7 +34,7 @@ class DeadChannels:
     def add(self, episode: Episode) -> None:
         """Look at the next episode."""
         for column in self._columns:
-            values = episode.columns[column.name].reshape(len(episode), -1)
+            values = as_rows(episode.columns[column.name])
             first = self._first.setdefault(column.name, values[0].copy())
             self._changed[column.name] |= (values != first).any(axis=0)
             if column.name == STATE and len(values) >= FEWEST_STEPS:

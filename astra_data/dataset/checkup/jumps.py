@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import Finding, channels, deletion, labels
 from astra_data.dataset.columns import NEXT_STATE, STATE, Array, Column, Episode
 from astra_data.dataset.reader import Dataset
@@ -59,9 +60,9 @@ class Jumps:
 
     def steps(self, columns: Mapping[str, Array]) -> Floats:
         """Return how far each value moves in each step, (T, S) or without next states (T - 1, S)."""
-        state: Floats = columns[STATE].reshape(len(columns[STATE]), -1).astype(np.float64)
+        state: Floats = as_rows(columns[STATE]).astype(np.float64)
         if NEXT_STATE in columns:
-            following: Floats = columns[NEXT_STATE].reshape(len(state), -1).astype(np.float64)
+            following: Floats = as_rows(columns[NEXT_STATE]).astype(np.float64)
         else:
             state, following = state[:-1], state[1:].copy()
         for group in self._quaternions:  # q and -q are the same rotation

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import SHOWN, Finding, channels, deletion
 from astra_data.dataset.columns import REWARD, STATE, Column, Episode
 from astra_data.dataset.endings import is_terminated
@@ -44,7 +45,7 @@ class Outliers:
         if REWARD in columns:
             self._returns.append(float(columns[REWARD].sum(dtype=np.float64)))
         if self._column is not None:
-            state = columns[STATE].reshape(len(episode), -1)
+            state = as_rows(columns[STATE])
             self._extremes.append(np.array([state.min(axis=0), state.max(axis=0)], np.float64))
 
     def findings(self, called: str) -> list[Finding]:

@@ -118,7 +118,8 @@ def repair(
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
         for number, (uid, run) in enumerate(whole(result.notes)):
-            values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
+            with np.errstate(over="ignore"):  # what is too large for its type is refused below
+                values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
             known = joined[number] if joined else Joined(uid, {}, is_known=False)
             if first is None:
                 known = Joined(known.uid, metadata.get(uid, {}) | known.metadata, uid in metadata)
@@ -128,11 +129,15 @@ def repair(
                     f"{' or '.join(source.reference for source in sources)}"
                 )
                 continue
-            unknown += not known.is_known
             facts = known.metadata
             if len(tasks) > 1:
                 facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
-            writer.add(Episode(known.uid, values, facts))
+            try:
+                writer.add(Episode(known.uid, values, facts))
+            except BadInputError as error:
+                result.notes.append(f"left out the episode of uid {uid}: {error}")
+                continue
+            unknown += not known.is_known
             result.episodes += 1
             result.frames += len(run)
         counted = info.get("total_episodes")

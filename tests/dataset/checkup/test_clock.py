@@ -139,3 +139,16 @@ def test_a_step_of_a_hundred_periods_is_another_unit() -> None:
     assert "100 periods or more" in finding.what
     (slow,) = clock(np.full(50, 9.8)).findings("walks")
     assert "at 0.102 Hz" in slow.what
+
+
+def test_a_step_of_next_to_no_time_is_another_unit() -> None:
+    """Seconds that are called microseconds."""
+    timed = Clock.of(Column("Stamp_US"), 20)
+    timed.add(Episode(0, {"Stamp_US": np.arange(50, dtype=np.float32) * 0.05}))
+    (finding,) = timed.findings("walks")
+    assert finding.what == "a step takes 1/1000 of a period or less, by Stamp_US"
+    assert finding.advice.startswith("give its `unit`")
+    assert str(timed) == "20 Hz declared, and a step takes 1/1000 of a period or less by Stamp_US"
+    fast = Clock.of(Column("time", astra={"unit": ["ms"]}), 20)
+    fast.add(Episode(0, {"time": np.arange(50, dtype=np.float32) * np.float32(0.1)}))
+    assert "at 1e+04 Hz" in fast.findings("walks")[0].what

@@ -16,7 +16,7 @@ from fake_dataset import DESCRIPTION, LENGTHS, fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import REWARD
+from astra_data.dataset.columns import DONE, REWARD, TERMINATED, TRUNCATED
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, METADATA_PATH, POLICY_PATH, SUBSETS_PATH
@@ -118,6 +118,30 @@ def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
         assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
         for name, values in expected.columns.items():
             np.testing.assert_array_equal(found.columns[name], values)
+
+
+def test_an_episode_that_cannot_be_written_is_left_out_alone(tmp_path: Path) -> None:
+    """One has no end, one a value that float32 cannot hold."""
+    root = write_fake(tmp_path / "set").root
+    as_in_0_1(root)
+    ends = np.cumsum(LENGTHS) - 1
+    for flag in (DONE, TERMINATED, TRUNCATED):
+        alter_rows(root / DATA, flag, {int(ends[1]): False})
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][REWARD]["dtype"] = "float64"
+    (root / "meta/info.json").write_text(json.dumps(info))
+    table = pq.read_table(root / DATA)
+    at = table.column_names.index(REWARD)
+    pq.write_table(table.set_column(at, REWARD, table[REWARD].cast(pa.float64())), root / DATA)
+    alter_rows(root / DATA, REWARD, {int(ends[2]): 1e39})
+    repaired = repair(root, out=tmp_path / "saved")
+    notes = "\n".join(repaired.notes)
+    assert repaired.episodes == len(LENGTHS) - 2
+    uids = [episode.uid for episode in fake_episodes()]
+    assert f"left out the episode of uid {uids[1]}: Episode {uids[1]}: next.done: false in the last" in notes
+    assert f"left out the episode of uid {uids[2]}: " in notes and "next.reward" in notes
+    saved = Dataset.open(tmp_path / "saved")
+    assert saved.uids.tolist() == [uids[0], *uids[3:]] and check(saved.root).faults == []
 
 
 def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
