@@ -44,7 +44,7 @@ def write_minari(folder: Path, made: list[dict[str, Any]], data_format: str = "h
         # It warns that there is no environment, no description and the like.
         minari.create_dataset_from_buffers(
             "ant/test-v1",
-            [EpisodeBuffer(id=index, infos={}, **episode) for index, episode in enumerate(made)],
+            [EpisodeBuffer(id=index, **{"infos": {}} | episode) for index, episode in enumerate(made)],
             observation_space=spaces.Dict(parts) if is_dict else box(3),
             action_space=box(2),
             data_format=data_format,

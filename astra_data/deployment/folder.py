@@ -60,7 +60,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
             **origin(),
         }
         (folder / DESCRIPTION).write_text(json.dumps(about, indent=1))
-        (folder / PAGE).write_text(page(about))
+        (folder / PAGE).write_text(page(about), encoding="utf-8")
         write_lerobot_files(about, folder)
         with as_file(files("astra_data.deployment") / LOOP) as loop:
             shutil.copyfile(loop, folder / LOOP)

@@ -223,7 +223,7 @@ class Cutter:
                     self.tally.back_rows += int(masks["back"].sum())
                 now[key] = times[1:]
             else:
-                masks["end"] |= (series[:-1] != 0).any(axis=1)
+                masks["end"] |= (np.nan_to_num(series[:-1]) != 0).any(axis=1)
         masks["file"][0], masks["source"][0] = is_apart, block.starts
         self._before = {key: values[-1:] for key, values in now.items()}
         if self._mapping.not_finite == "split":

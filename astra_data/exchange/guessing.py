@@ -183,7 +183,7 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
 
 
 def _numbers(path: Path) -> dict[str, Floats]:
-    """Return the fields of a file that are numbers, or true and false."""
+    """Return the fields of a file: what is no number, nor true or false, is NaN; see `_as_numbers`."""
     delimiter, mark = delimiter_of(path.name)
     try:
         table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
@@ -191,17 +191,34 @@ def _numbers(path: Path) -> dict[str, Floats]:
         raise BadInputError(f"{path}: there is no such file") from None
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         raise BadInputError(f"{path}: expected CSV with a header ({in_short(error)})") from None
-    fields = list(zip(table.column_names, table.columns, strict=True))
+    named = zip(table.column_names, table.columns, strict=True)
+    fields = [(name, values) for name, values in named if name or not pa.types.is_null(values.type)]
     for name, values in fields:
         if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):
             raise BadInputError(f"{path} line {wrong[0] + 2}: {name}: expected a number, got {wrong[1]!r}")
-    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
-    numbers = [(name, values) for name, values in fields if any(kind(values.type) for kind in kinds)]
-    if len(table) < 2 or not numbers or len(dict(numbers)) < len(numbers):
+    numbers = {name: _as_numbers(name, values) for name, values in fields}
+    names = [name for name, _ in fields]
+    usable = [name for name, values in numbers.items() if np.isfinite(values).any()]
+    if len(table) < 2 or not usable or any(names.count(name) > 1 for name in usable):
         raise BadInputError(
             f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
         )
-    return {name: values.cast(pa.float64(), safe=False).to_numpy() for name, values in numbers}
+    return numbers
+
+
+def _as_numbers(name: str, values: pa.ChunkedArray) -> Floats:
+    """Return a field (T,) as numbers; texts and dates are NaN, or numbered where they tell episodes apart."""
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    if any(kind(values.type) for kind in kinds):
+        numbers: Floats = values.cast(pa.float64(), safe=False).to_numpy()
+        return numbers
+    if re.fullmatch(dict(_NAMES)["episode"], _plain(name)) and not values.null_count:
+        return np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
+    return np.full(len(values), np.nan)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
 def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
@@ -211,10 +228,12 @@ def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
 
 
 def _field(name: str, values: Floats) -> Field:
-    plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-    if not plain:
-        return Field(name, "left out", plain, "1", 1.0, "no letter a to z and no digit in its name")
+    plain = _plain(name)
     left_out = partial(Field, name, "left out", plain, "1", 1.0)
+    if not plain:
+        return left_out("no letter a to z and no digit in its name")
+    if not np.isfinite(values).any():
+        return left_out("texts, dates or nothing: expected numbers, of a time in s, ms, us or ns")
     body, ending = _without_unit(plain, _TIMES)
     if re.fullmatch(_NAMES[0][1], body):
         _check_finite(name, "time", values)

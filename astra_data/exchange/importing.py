@@ -99,7 +99,11 @@ def import_dataset(
     for source, record in records.items():
         episodes = _restored(source, chosen, record)
         if settings is None:
-            root, frames = write_restored(sources, record, episodes, options, identities(sources), out)
+            if len(sources) > 1:
+                raise BadInputError(
+                    f"{source} is an export of astra-data: import each on its own, then merge"
+                )
+            root, frames = write_restored(record, episodes, options, identities(sources), out)
             seconds = time.perf_counter() - began
             return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
         deque(episodes, maxlen=0)  # verifies the sums

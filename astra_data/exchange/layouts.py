@@ -40,8 +40,10 @@ VECTORS = (STATE, NEXT_STATE, GOAL, ACTION)
 
 
 def fields_of(columns: Iterable[str], own: Mapping[str, str]) -> dict[str, str]:
-    """Return the field of each of the columns: a format's own name, or one among its infos."""
-    return {name: own.get(name, f"infos/{name}") for name in columns}
+    """Return the field of each of the columns: a format's own name, or another one, among its infos."""
+    infos = {name: f"infos/{name}" for name in columns}
+    taken = own.values()
+    return {name: own.get(name, f"{field}_" if field in taken else field) for name, field in infos.items()}
 
 
 def as_stored(name: str, values: Array) -> Array:

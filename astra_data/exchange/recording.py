@@ -55,8 +55,10 @@ class Source:
             )
 
     def __str__(self) -> str:
-        """Name the file for messages and for the episodes' metadata."""
-        return self.path.name if self.member is None else f"{self.path.name}/{self.member.name}"
+        """Name the file within its recording, for messages and for the episodes' metadata."""
+        if self.member is not None:
+            return f"{self.path.name}/{self.member.name}"
+        return _named(self.path, self.recording)
 
     @contextmanager
     def open(self) -> Iterator[IO[bytes]]:
@@ -191,11 +193,22 @@ def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
 
 def identities(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Return name and sha256 of every file of the recordings."""
-    return [{"name": file.name, "sha256": file_digest(file)} for file in _files_of(sources)]
+    return [
+        {"name": _named(file, recording), "sha256": file_digest(file)}
+        for file, recording in _files_of(sources).items()
+    ]
 
 
-def _files_of(sources: Sequence[Source]) -> list[Path]:
-    files: list[Path] = []
-    for path in dict.fromkeys(source.path for source in sources):
-        files += sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+def _files_of(sources: Sequence[Source]) -> dict[Path, Path]:
+    """Return the files, each with the recording that it is of."""
+    files: dict[Path, Path] = {}
+    for path, recording in dict.fromkeys((source.path, source.recording) for source in sources):
+        found = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+        files |= dict.fromkeys(found, recording)
     return files
+
+
+def _named(path: Path, recording: Path) -> str:
+    """Name a file by its path within a recording that is a folder."""
+    within = path.relative_to(recording) if path.is_relative_to(recording) else Path()
+    return within.as_posix() if within.parts else path.name

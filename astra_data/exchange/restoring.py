@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
 from astra_data.dataset.versions import Version, place, versions_at_home
 from astra_data.dataset.writer import DatasetWriter
@@ -68,7 +68,6 @@ def restored(module: ModuleType, source: Source, record: ExportRecord) -> Iterat
 
 
 def write_restored(
-    sources: Sequence[Source],
     record: ExportRecord,
     episodes: Iterable[Episode],
     options: Mapping[str, Any],
@@ -78,19 +77,15 @@ def write_restored(
     """Write the dataset that was exported as the version after it; return its folder and number of steps.
 
     Args:
-        sources: the export.
-        record: its record.
+        record: the record of the export.
         episodes: those of `restored`.
         options: name, fps and task, where they are to differ.
         recordings: names and sums of the files.
         out: the dataset's folder, by default its place at home.
 
     Raises:
-        BadInputError: there are several sources, which have to be merged.
         CorruptDatasetError: values differ from those that were exported; nothing is written.
     """
-    if len(sources) > 1:
-        raise BadInputError(f"{sources[0]} is an export of astra-data: import each on its own, then merge")
     began = time.perf_counter()
     name, version = options.get("name", record.name), Version(1, 0, 0)
     if name == record.name:

@@ -223,6 +223,13 @@ def test_a_rejected_row_still_ends_its_episode(block_rows: int) -> None:
     assert cutting.tally.split_points == {"end": 1}
 
 
+@BLOCKS
+def test_a_flag_that_is_not_known_ends_no_episode(block_rows: int) -> None:
+    cutting = cutter(not_finite="drop", split={"ends": ("end",)})
+    episodes = cut(cutting, block_rows, x=[0, 0, np.nan, 0, 0, 0], end=[0, 0, np.nan, 0, 0, 1])
+    assert rows(episodes) == [[0, 1, 3, 4]]
+
+
 def test_what_is_not_finite_is_not_clipped_into_range() -> None:
     cutting = cutter(columns={ACTION: {"fields": ("x",), "clip": (-1, 1)}}, not_finite="drop")
     (episode,) = cut(cutting, x=[5, np.inf, -5, 0.5])

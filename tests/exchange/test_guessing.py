@@ -223,10 +223,32 @@ def test_a_text_among_numbers_is_refused_with_its_line(tmp_path: Path) -> None:
         guess([log])
 
 
-def test_texts_are_no_field(tmp_path: Path) -> None:
+def test_texts_and_dates_are_left_out_with_the_reason(tmp_path: Path) -> None:
+    log, empty = tmp_path / "log.csv", tmp_path / "log_2.csv"
+    head = "time,x,mode,cmd_x\n"
+    log.write_text(
+        head + "".join(f"2024-01-01 12:00:{row},{row}.5,driving,{row % 3}\n" for row in range(10, 30))
+    )
+    empty.write_text(head + "".join(f",{row}.5,,{row % 3}\n" for row in range(20)))
+    logs = guess([log, empty])
+    assert [field.taken_for for field in logs.fields] == ["left out", "state x", "left out", "command x"]
+    why = {field.name: field.why for field in logs.fields}
+    assert (
+        why["time"]
+        == why["mode"]
+        == "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"
+    )
+    assert [values.tolist() for values in logs.values(logs.of("command"))[1:]] == [
+        [[row % 3] for row in range(20)]
+    ]
+
+
+def test_texts_tell_episodes_apart(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
-    log.write_text("x,mode,cmd_x\n" + "".join(f"{row}.5,driving,{row % 3}\n" for row in range(20)))
-    assert [field.name for field in guess([log]).fields] == ["x", "cmd_x"]
+    log.write_text("run,x,cmd_x\n" + "".join(f"{'b' if row < 8 else 'a'},{row},{row}\n" for row in range(20)))
+    logs = guess([log])
+    assert logs.fields[0].role == "episode"
+    assert [len(values) for values in logs.values(logs.of("state"))] == [8, 12]
 
 
 def test_a_name_without_letters_or_digits_is_left_out(tmp_path: Path) -> None:
@@ -239,7 +261,10 @@ def test_a_name_without_letters_or_digits_is_left_out(tmp_path: Path) -> None:
 def test_texts_may_share_a_name(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("note,x,note,cmd\n" + "".join(f"a,{row},b,{row}\n" for row in range(6)))
-    assert [field.name for field in guess([log]).fields] == ["x", "cmd"]
+    assert [field.name for field in guess([log]).fields] == ["note", "x", "cmd"]
+    log.write_text("note,x,note,cmd\n" + "".join(f"a,{row},{row},{row}\n" for row in range(6)))
+    with pytest.raises(BadInputError, match="expected a header of different names"):
+        guess([log])
 
 
 @pytest.mark.parametrize("time", [{}, {"t": RAMP / 10}])

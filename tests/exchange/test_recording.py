@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.recording import MOST_UNPACKED, SMALL_BYTES, Source, bounded, find_sources
+from astra_data.exchange.recording import (
+    MOST_UNPACKED,
+    SMALL_BYTES,
+    Source,
+    bounded,
+    find_sources,
+    identities,
+)
 
 
 def archive(path: Path, *members: tarfile.TarInfo, content: bytes = b"{}") -> Path:
@@ -41,6 +48,17 @@ def test_files_come_in_the_order_of_their_numbers_without_those_that_are_hidden(
         "logs/log_2.csv",
         "logs/log_10.csv",
     ]
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    for run in ("run_1", "run_2"):
+        (tmp_path / "logs" / run).mkdir(parents=True)
+        (tmp_path / "logs" / run / "log.csv").write_text(run)
+    found = [*find_sources(tmp_path / "logs", [".csv"]), *find_sources(tmp_path / "logs/run_1/log.csv", [])]
+    assert [str(source) for source in found] == ["run_1/log.csv", "run_2/log.csv", "log.csv"]
+    named = identities(find_sources(tmp_path / "logs", [".csv"]))
+    assert [one["name"] for one in named] == ["run_1/log.csv", "run_2/log.csv"]
+    assert identities(found[2:])[0] == {"name": "log.csv", "sha256": named[0]["sha256"]}
 
 
 def test_members_are_read_without_unpacking(tmp_path: Path) -> None:

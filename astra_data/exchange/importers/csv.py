@@ -89,7 +89,9 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
 
 
 def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Array:
-    """Return the numbers of a field's `texts`, the first of which is in `row`."""
+    """Return the numbers of a field's `texts`, without blanks around them; the first is in `row`."""
+    texts = pc.utf8_trim_whitespace(texts)
+    texts = pc.if_else(pc.equal(texts, ""), pa.scalar(None, pa.string()), texts)
     whole = [] if texts.null_count else [pa.int64()]  # An empty cell has no integer value.
     for kind in (*whole, pa.float64(), pa.bool_()):
         try:

@@ -1,7 +1,8 @@
 """Minari: a dataset's folder, read by Minari itself, one episode at a time.
 
 Fields are `observations`, `next_observations`, `actions`, `rewards`, `terminations`, `truncations` and
-`infos`; where a space is a dictionary or a tuple, its parts: `observations/desired_goal`, `actions/0`.
+`infos`, and `next_infos` where the info of the reset was recorded; where a space is a dictionary or a tuple,
+its parts: `observations/desired_goal`, `actions/0`.
 """
 
 import json
@@ -83,11 +84,14 @@ def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
 
 def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
     observations = dict(_parts("observations", episode.observations))
+    infos = dict(_parts("infos", episode.infos))
+    with_reset = {name: values for name, values in infos.items() if len(values) == len(episode.rewards) + 1}
+    between = observations | with_reset
     steps = {
-        **{name: values[:-1] for name, values in observations.items()},
-        **{f"next_{name}": values[1:] for name, values in observations.items()},
+        **infos,
+        **{name: values[:-1] for name, values in between.items()},
+        **{f"next_{name}": values[1:] for name, values in between.items()},
         **dict(_parts("actions", episode.actions)),
-        **dict(_parts("infos", episode.infos)),
     }
     for name in ("rewards", "terminations", "truncations"):
         steps[name] = np.asarray(getattr(episode, name))

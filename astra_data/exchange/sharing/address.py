@@ -48,7 +48,7 @@ def parse_place(text: str) -> Place:
     if hub := _HUB.fullmatch(text):
         return Hub(hub["repo"])
     if text.startswith(("/", "./", "../", "~/")):
-        return Url(Path(text).expanduser().absolute().as_uri())
+        return Url(f"file://{Path(text).expanduser().absolute()}")
     if not _URL.fullmatch(text) or text.startswith("hf://"):
         raise BadInputError(
             f"{text}: expected user/name or hf://datasets/user/name for the Hugging Face Hub, "

@@ -149,6 +149,25 @@ def test_exports_are_imported_one_by_one(dataset: Dataset, tmp_path: Path) -> No
         export(dataset, path, format="d4rl")
     with pytest.raises(BadInputError, match="import each on its own, then merge"):
         import_dataset(paths, out=tmp_path / "back")
+    (tmp_path / "a").mkdir()
+    foreign = tmp_path / "a" / "foreign.hdf5"
+    with h5py.File(foreign, "w") as file:
+        file["rewards"] = np.zeros(3)
+    with pytest.raises(BadInputError, match=r"two\.hdf5 is an export of astra-data: import each"):
+        import_dataset([foreign, paths[1]], out=tmp_path / "back")
+
+
+@pytest.mark.parametrize("format", sorted(EXPORTERS))
+def test_a_column_called_as_a_field_of_the_format_has_one_of_its_own(tmp_path: Path, format: str) -> None:
+    columns = [*COLUMNS, Column(GOAL, size=2), Column("goal"), NEXT]
+    with writer(tmp_path / "set", columns=columns) as open_writer:
+        values = fake_columns(4, seed=1)
+        values |= {NEXT_STATE: np.roll(values[STATE], -1, axis=0), GOAL: np.ones((4, 2), np.float32)}
+        open_writer.add(Episode(1, values | {"goal": np.full(4, 2, np.float32)}))
+    export(Dataset.open(tmp_path / "set"), tmp_path / FILES[format], format=format)
+    back = Dataset.open(import_dataset([tmp_path / FILES[format]], out=tmp_path / "back").root)
+    episode = next(back.episodes())
+    assert (episode.columns["goal"] == 2).all() and (episode.columns[GOAL] == 1).all()
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))

@@ -68,6 +68,18 @@ def test_cells_are_numbers_flags_or_nothing(tmp_path: Path) -> None:
     np.testing.assert_array_equal(block.values["gap"], [1.0, np.nan])
 
 
+def test_blanks_around_cells_are_nothing(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("whole, float , flag,gap\n 1, 0.5 , true, 2.5\n2 ,\t1e3,false , \n")
+    columns = {name: {"fields": (name,)} for name in ("whole", " float ", " flag", "gap")}
+    mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
+    source = Source(tmp_path / "log.csv", None, tmp_path / "log.csv")
+    (block,) = csv.read(source, mapping)
+    assert block.values["whole"].tolist() == [1, 2]
+    assert block.values[" float "].tolist() == [0.5, 1000.0]
+    assert block.values[" flag"].tolist() == [1.0, 0.0]
+    np.testing.assert_array_equal(block.values["gap"], [2.5, np.nan])
+
+
 def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows())
     path.write_text(path.read_text().replace("True", "perhaps"))

@@ -53,6 +53,28 @@ fields = ["observations/achieved_goal"]
     )
 
 
+def test_infos_are_of_the_step_with_or_without_that_of_the_reset(tmp_path: Path) -> None:
+    """Minari's `DataCollector` records the info of the reset, too."""
+    made = episodes(is_dict=True)
+    for episode, length in zip(made, LENGTHS, strict=True):
+        episode["infos"] = {"qpos": np.arange(length + 1.0), "cost": -np.arange(1.0 * length)}
+    path = write_minari(tmp_path / "minari", made)
+    mapping = """
+name = "ant"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["infos/qpos", "infos/cost"]
+[columns."next.observation.state"]
+fields = ["next_infos/qpos", "infos/cost"]
+"""
+    dataset, _ = imported(tmp_path, path, mapping)
+    for episode, length in zip(dataset.episodes(), LENGTHS, strict=True):
+        steps = np.arange(length, dtype=np.float32)
+        np.testing.assert_array_equal(episode.columns[STATE], np.stack([steps, -steps], axis=1))
+        np.testing.assert_array_equal(episode.columns[NEXT_STATE], np.stack([steps + 1, -steps], axis=1))
+
+
 def test_fields_that_are_missing_are_told(tmp_path: Path) -> None:
     path = write_minari(tmp_path / "minari", episodes(is_dict=False))
     with pytest.raises(BadInputError, match=r"no field 'x'; known: .*observations"):

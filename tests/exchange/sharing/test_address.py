@@ -33,5 +33,6 @@ def test_anything_else_is_told(text: str) -> None:
 def test_a_folder_is_a_place_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert parse_place("./shared") == parse_place(f"{tmp_path}/shared") == Url(f"file://{tmp_path}/shared")
+    assert parse_place("./My Läufe") == Url(f"file://{tmp_path}/My Läufe")
     assert parse_place("~/shared") == Url(f"file://{Path.home()}/shared")
     assert parse_source(f"{tmp_path}/it@data-1.2.0") == (Url(f"file://{tmp_path}/it"), Version(1, 2, 0))
