@@ -95,7 +95,7 @@ def _print_likelihoods(
             raise typer.BadParameter(f"expected two episodes that fail to cross-fit, got {int(fails.sum())}")
         hazard = torch.zeros_like(mask)
         torch.manual_seed(0)
-        for fold in folds(fails):
+        for fold in folds(fails, episodes.recordings):
             fitted_to, fresh = (episodes.select(part.nonzero().squeeze(1)) for part in (~fold, fold))
             model = fit_failures(task, grounding, fitted_to, members, 0, steps)
             hazard[fold] = model.hazard(model.probability(replayed_inputs(task, grounding, model, fresh)))
@@ -126,7 +126,7 @@ def _print_rates(task: Task, grounding: HistoryGrounding, measured: Mapping[int,
     print("\n| commands of seed | recorded | expected |\n|---|---|---|")
     for name, episodes in measured.items():
         windows, expected = episodes.windows, 0.0
-        simulator = grounding.simulator(task, len(episodes))
+        simulator = grounding.foreseeing(task.objective).simulator(task, len(episodes))
         simulator.start(windows.state[:, 0], torch.arange(len(episodes)), windows.goal[:, 0])
         for action, mask in zip(windows.action.unbind(1), windows.mask.unbind(1), strict=True):
             simulator.step(action)

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import csv
 
-from astra_data.core.errors import BadInputError, in_short
-from astra_data.exchange.importers.csv import csv_files, delimiter_of
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
+from astra_data.exchange.importers.csv import csv_files
 
 Floats = NDArray[np.float64]
 Role = Literal["time", "episode", "state", "command", "failure", "success", "reward", "left out"]
@@ -66,9 +65,7 @@ LENGTH = re.compile(
 )
 _FULL_TURNS = 4 * math.pi
 """An angle beyond it is taken for degrees."""
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*|[+-]?(nan|inf)", re.IGNORECASE)
-_MOSTLY = 0.9
-"""Share of a field's rows with a number above which the others are faults."""
+_EPISODE = re.compile(dict(_NAMES)["episode"])
 _COMMAND = re.compile(rf"(^|_)({_COMMANDED}|u)(_|(?=\d)|$)")
 
 
@@ -131,7 +128,7 @@ def guess(paths: Sequence[Path]) -> Logs:
             fields come to the same name, or there are no commands, no states or no episodes of two rows.
     """
     files = [file for path in paths for file in csv_files(path)]
-    tables = {file: _numbers(file) for file in files}
+    tables = {file: read_numbers(file, _EPISODE) for file in files}
     header = list(next(iter(tables.values())))
     for file, table in tables.items():
         if table.keys() != set(header):
@@ -182,53 +179,8 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _numbers(path: Path) -> dict[str, Floats]:
-    """Return the fields of a file: what is no number, nor true or false, is NaN; see `_as_numbers`."""
-    delimiter, mark = delimiter_of(path.name)
-    try:
-        table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
-    except FileNotFoundError:
-        raise BadInputError(f"{path}: there is no such file") from None
-    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path}: expected CSV with a header ({in_short(error)})") from None
-    named = zip(table.column_names, table.columns, strict=True)
-    fields = [(name, values) for name, values in named if name or not pa.types.is_null(values.type)]
-    for name, values in fields:
-        if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):
-            raise BadInputError(f"{path} line {wrong[0] + 2}: {name}: expected a number, got {wrong[1]!r}")
-    numbers = {name: _as_numbers(name, values) for name, values in fields}
-    names = [name for name, _ in fields]
-    usable = [name for name, values in numbers.items() if np.isfinite(values).any()]
-    if len(table) < 2 or not usable or any(names.count(name) > 1 for name in usable):
-        raise BadInputError(
-            f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
-        )
-    return numbers
-
-
-def _as_numbers(name: str, values: pa.ChunkedArray) -> Floats:
-    """Return a field (T,) as numbers; texts and dates are NaN, or numbered where they tell episodes apart."""
-    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
-    if any(kind(values.type) for kind in kinds):
-        numbers: Floats = values.cast(pa.float64(), safe=False).to_numpy()
-        return numbers
-    if re.fullmatch(dict(_NAMES)["episode"], _plain(name)) and not values.null_count:
-        return np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
-    return np.full(len(values), np.nan)
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-
-
-def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
-    """Return the row and the text of the first of `values` that is no number, if nearly all others are."""
-    wrong = [(row, value) for row, value in enumerate(values) if value and not _NUMBER.fullmatch(value)]
-    return wrong[0] if wrong and len(wrong) < (1 - _MOSTLY) * len(values) else None
-
-
 def _field(name: str, values: Floats) -> Field:
-    plain = _plain(name)
+    plain = plain_name(name)
     left_out = partial(Field, name, "left out", plain, "1", 1.0)
     if not plain:
         return left_out("no letter a to z and no digit in its name")
@@ -261,7 +213,7 @@ def _field(name: str, values: Floats) -> Field:
             short = _COMMAND.sub("_", body).strip("_") or "command"
             return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
     finite = np.isfinite(values)
-    if finite.mean() <= _MOSTLY or np.ptp(values[finite]) == 0:
+    if finite.mean() <= MOSTLY or np.ptp(values[finite]) == 0:
         return left_out("never changes" if finite.all() else f"no number in {(~finite).sum()} rows")
     if is_flag:
         return left_out("0 or 1: name it success or failed if it is an end")

@@ -47,7 +47,7 @@ class OwnMethod(Config):
         if table is None or not given:
             return None if table is None else table.usual
         try:
-            return validated(given, table.model, name)
+            return validated(table.over_usual(given), table.model, name)
         except RecipeError as error:
             raise BadInputError(str(error)) from None
 

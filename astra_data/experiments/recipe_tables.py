@@ -34,7 +34,7 @@ def plus_field(train: Any, default: Any) -> tuple[Any, Any]:  # noqa: ANN401 - a
 def method_field(table: Table) -> tuple[Any, Any]:
     """Return the type and the default of a method's table."""
     if table.ranges is None:
-        return table.model, table.usual
+        return Annotated[table.model, BeforeValidator(table.over_usual)], table.usual
     return Annotated[table.model, WrapValidator(_laid_over(table.ranges))], _FILLED
 
 

@@ -72,7 +72,7 @@ def view_run(
     of: dict[str, Grounding] = {RAW: NO_GROUNDING}
     of |= {name: load_grounding(_result(run, item)) for name, item in groundings.items()}
     task, drawn = task_named(recipe.task), selection.seeds[0]
-    episodes.check(task.limits)
+    episodes.check(task)
     replays = {name: replay_open_loop(task, one, episodes, seed=drawn) for name, one in of.items()}
     view(dataset, uids or _uids(episodes), save=save, replays=_by_episode(replays, episodes))
     return _lacking({name: replay for name, replay in replays.items() if name != RAW})

@@ -7,18 +7,23 @@ from torch.nn import functional
 _MOST_FOLDS = 5
 
 
-def folds(fails: Tensor) -> list[Tensor]:
+def folds(fails: Tensor, recordings: Tensor | None = None) -> list[Tensor]:
     """Split episodes at random, those that fail (E,) and the others alike; return who is in each fold, (E,).
 
-    There are as many folds as failing episodes, at most five; none with a single one.
+    Copies stay with the episode that they are of: `recordings` (E,) are the same for them; None where there
+    are no copies. There are as many folds as recordings with a failure, at most five; none with a single one.
     """
-    count = min(_MOST_FOLDS, int(fails.sum()))
+    if recordings is None:
+        recordings = torch.arange(len(fails), device=fails.device)
+    known, recording = recordings.unique(return_inverse=True)
+    failing = torch.bincount(recording[fails], minlength=len(known)) > 0
+    count = min(_MOST_FOLDS, int(failing.sum()))
     if count < 2:
         return []
-    numbers = torch.empty(len(fails), dtype=torch.long, device=fails.device)
-    for rows in (fails.nonzero().squeeze(1), (~fails).nonzero().squeeze(1)):
+    numbers = torch.empty(len(known), dtype=torch.long, device=fails.device)
+    for rows in (failing.nonzero().squeeze(1), (~failing).nonzero().squeeze(1)):
         numbers[rows[torch.randperm(len(rows))]] = torch.arange(len(rows), device=rows.device) % count
-    return [numbers == fold for fold in range(count)]
+    return [(numbers == fold)[recording] for fold in range(count)]
 
 
 def calibration(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, Tensor]:

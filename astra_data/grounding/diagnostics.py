@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, LossWeights
 from astra_data.learning.networks.paired_windows import PairedWindows
@@ -17,16 +18,22 @@ def telemetry(
     They are: R² of each head that is trained (for the correction: the share of the simulator's error that it
     removes), None where there is no variance to explain, as in a perfect simulator; the mean standard
     deviation of the latent's entries; and the latent's effective rank (exponential of the entropy of the
-    normalised eigenvalues of its covariance).
+    normalised eigenvalues of its covariance); both None for a single step.
+
+    Raises:
+        BadInputError: latents are not finite: the fit diverged.
     """
     windows = episodes.windows
     latent, _ = model.encode(windows)
     mask = windows.mask.bool()
+    samples = latent[mask]
+    if not samples.isfinite().all():
+        raise BadInputError("the fit diverged: lower learning_rate in [ground], or look at the data's values")
     corrected = model.correct(latent, windows.action, windows.simulated_next)
-    figures = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
+    figures: dict[str, float | None] = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
     if weights.reward > 0:
         going_on, failing = model.predict_reward_parts(latent, windows.action)[mask].unbind(-1)
-        reward, failed = windows.reward[mask][:, 0], windows.reward[mask][:, 1] != 0
+        reward, failed = windows.reward[mask][:, 0], windows.failed[mask]
         goes_on = windows.goes_on[mask].bool()
         figures["r2_reward"] = _r2(going_on[goes_on], reward[goes_on])
         figures["r2_final_reward"] = _r2(failing, failed * model.failure_cost)
@@ -34,7 +41,9 @@ def telemetry(
         mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
         both = mask[:, :-1] & mask[:, 1:]
         figures["r2_latent"] = _r2(mean[both], latent[:, 1:][both])
-    samples = latent[mask]
+    figures["latent_std"] = figures["latent_rank"] = None
+    if len(samples) < 2:
+        return figures
     eigenvalues = torch.linalg.eigvalsh(torch.cov(samples.T)).clamp_min(1e-12)
     shares = eigenvalues / eigenvalues.sum()
     figures["latent_std"] = float(samples.std(0).mean())

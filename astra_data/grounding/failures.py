@@ -79,7 +79,7 @@ def fit_failures(
     untrained.set_input_scales(seen)
     model = _descended(untrained, seen, training.steps(fails))
     odds, happened = [], []
-    for fold in folds(fails.any(1)):
+    for fold in folds(fails.any(1), training.recordings):
         others = training.select((~fold).nonzero().squeeze(1))
         if not _tells(others):
             continue

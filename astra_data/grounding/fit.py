@@ -210,9 +210,9 @@ def _fitted(
             "correction": training.steps(windows.next_state - windows.simulated_next),
         }
     )
-    rewards, goes_on = training.steps(windows.reward), training.steps(windows.goes_on)
+    rewards, goes_on, failed = map(training.steps, (windows.reward, windows.goes_on, windows.failed))
     # Where a failure model tells them, R_pred would fill the latent with the failures of the data in vain.
-    model.set_reward_scales(rewards, goes_on, config.failure_weight * weights.failures)
+    model.set_reward_scales(rewards, goes_on, failed, config.failure_weight * weights.failures)
     fitting = replace(whole, training=training, seed=seed, progress=progress)
     return model, _optimise(model, weights, fitting, whole.folder / name)
 

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -30,6 +31,9 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     Replays start every 25 steps, with a grounding's memory of the true history up to there. Errors are
     distances in the task's quantities after 1, 10, 50 and 200 steps: means and 95 % bootstrap intervals over
     episodes.
+
+    Raises:
+        BadInputError: a simulator's states are not finite, though the recorded ones are.
     """
     torch.manual_seed(derive(seed, "gap noise"))
     windows, lengths = episodes.windows, episodes.lengths
@@ -49,7 +53,13 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         if step + 1 in horizons:
             for name, state in states.items():
                 apart = distances(task, state - windows.next_state[episode, now])
-                apart[start + step >= lengths[episode]] = torch.nan
+                beyond = start + step >= lengths[episode]
+                if not apart[~beyond].isfinite().all():
+                    raise BadInputError(
+                        f"the {name} simulator of {task.name} diverges: its states are not finite in step "
+                        f"{step + 1} of recorded commands"
+                    )
+                apart[beyond] = torch.nan
                 errors[name][step + 1] = apart
     rng = generator(seed, "gap bootstrap")
     report: dict[str, Any] = {"horizons": horizons, "replays": len(moments)}

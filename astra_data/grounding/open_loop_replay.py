@@ -44,7 +44,7 @@ def replay_open_loop(
     if history is None:
         is_ensemble = bool(disagreement.any())
     else:
-        foreseeing = history.reduced(members=False, failures=True)
+        foreseeing = history.foreseeing(task.objective).reduced(members=False, failures=True)
         hazard = None if history.failures is None else _replayed(task, foreseeing, episodes, seed=seed)[1]
         is_ensemble = bool(history.members) or history.model.shape.correction_heads > 1
         if count := len(history.members):

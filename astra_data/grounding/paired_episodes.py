@@ -31,6 +31,7 @@ from astra_data.dataset.versions import open_dataset
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows, before_failures
 from astra_data.learning.recorded import draw_steps
 from astra_data.worlds.commands import Commands
+from astra_data.worlds.task import Task
 
 _COLUMNS = (
     *(STATE, ACTION, TERMINATED),
@@ -138,16 +139,28 @@ class PairedEpisodes:
             recordings=torch.tensor(recordings, device=device),
         )
 
-    def check(self, commands: Commands) -> None:
-        """Check that the actions are multiples of ±1 within `commands`.
+    def check(self, task: Task) -> None:
+        """Check that states, goals and actions are those of `task`.
 
         Raises:
-            BadInputError: the dataset was paired with other bounds.
+            BadInputError: it was paired with another simulator or other bounds; lists every mismatch.
         """
-        if (self.commands or {}) != ({} if commands.are_normal else commands):
+        faults = [
+            f"has {found} values in {what}, {task.name} {expected}"
+            for what, found, expected in (
+                ("a state", self.target_state.shape[-1], task.state.size),
+                ("an abstract state", self.windows.state.shape[-1], task.abstract_state.size),
+                ("a goal", self.windows.goal.shape[-1], task.objective.goal_size),
+                ("an action", self.windows.action.shape[-1], task.action.size),
+            )
+            if found != expected
+        ]
+        if (self.commands or {}) != ({} if task.limits.are_normal else task.limits):
+            within = dict(self.commands or {}) or "±1"
+            faults.append(f"was paired for commands within {within}, {task.name} has {dict(task.limits)}")
+        if faults:
             raise BadInputError(
-                f"{self.reference} was paired for commands within {dict(self.commands or {}) or '±1'}, the "
-                f"task has {dict(commands)}: pair it again"
+                f"{self.reference} {'; '.join(faults)}: pair it again, with the simulator of this task"
             )
 
     def __len__(self) -> int:

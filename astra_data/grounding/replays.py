@@ -13,9 +13,14 @@ from astra_data.worlds.task import Task
 
 @dataclass(frozen=True)
 class ReplayWindows:
-    """W windows of H steps of the target: `state` (W, X), `action` (W, H, A) and `next_state` (W, H, X)."""
+    """W windows of H steps of the target.
+
+    Attributes:
+        state: (W, X), and goal: (W, G), at their beginning. action: (W, H, A). next_state: (W, H, X).
+    """
 
     state: Tensor
+    goal: Tensor
     action: Tensor
     next_state: Tensor
 
@@ -24,7 +29,8 @@ class ReplayWindows:
         """Cut windows of `length` steps out of `episode` (W,) from step `first` (W,) on."""
         windows, steps = episodes.windows, first[:, None] + torch.arange(length, device=first.device)
         rows = episode[:, None], steps
-        return cls(windows.state[episode, first], windows.action[rows], windows.next_state[rows])
+        state, goal = windows.state[episode, first], windows.goal[episode, first]
+        return cls(state, goal, windows.action[rows], windows.next_state[rows])
 
     @classmethod
     def side_by_side(cls, episodes: PairedEpisodes, length: int) -> "ReplayWindows":
@@ -34,11 +40,11 @@ class ReplayWindows:
         return cls.at(episodes, episode[chosen], first[chosen], length)
 
     def summary(self, task: Task) -> Tensor:
-        """Return a causal model's inputs of each window: first state and mean command, (W, K), scaled to one.
+        """Return a causal model's inputs of each window, (W, K), scaled to one: observation, mean command.
 
-        In a maze the position is left out.
+        In a maze that is the first state without its position.
         """
-        known = self.state[:, 2:] if task.plane else task.objective.observe(self.state, self.state[:, :0])
+        known = self.state[:, 2:] if task.plane else task.objective.observe(self.state, self.goal)
         return torch.cat([known, self.action.mean(1)], dim=-1)
 
 

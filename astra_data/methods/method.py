@@ -1,7 +1,7 @@
 """The descriptor of methods: the parts of the pipeline that they use, their settings, how they are shown."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from astra_data.core.config import Config
 from astra_data.grounding.fit import Fit
@@ -38,6 +38,10 @@ class Table:
     def usual(self) -> Config:
         """The settings where a recipe has no such table."""
         return self.default or self.model()
+
+    def over_usual(self, given: Any) -> Any:  # noqa: ANN401 - checked by whoever asks
+        """Return a recipe's table, which may leave out keys, laid over the usual settings."""
+        return self.default.model_dump() | given if self.default and isinstance(given, dict) else given
 
 
 @dataclass(frozen=True)

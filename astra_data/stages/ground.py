@@ -58,7 +58,7 @@ def ground(
         raise BadInputError(f"method '{method}' does not ground its simulator")
     world, made = task_named(task), origin(device)
     episodes = PairedEpisodes.load(dataset, device)
-    episodes.check(world.limits)
+    episodes.check(world)
     training, held_out = episodes.split(config.held_out_share, seed)
     named = {"task": world.name, "method": method, **episodes.named}
     settings_text = as_json(**named, seed=seed, ground=config, settings=settings)

@@ -77,7 +77,7 @@ def train(
         raise BadInputError(f"ramp_while: no episode of {world.name} succeeds before its end: expected 0")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
-    episodes.check(world.limits)
+    episodes.check(world)
     grounding_file = grounding and grounding / GROUNDING
     initial_file = initial and initial / POLICY
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING

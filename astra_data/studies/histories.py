@@ -61,7 +61,7 @@ class HistoryModel(Predictor):
             }
         )
         rewards = torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1)
-        model.set_reward_scales(rewards, torch.ones_like(rewards[:, 0]))
+        model.set_reward_scales(rewards, torch.ones_like(rewards[:, 0]), torch.zeros_like(rewards[:, 0]))
         model.state_mean *= model.state_mean.new_tensor(self.body.usual_motion)
         model.goal_mean *= model.goal_mean.new_tensor(self.body.usual_seen)
         if self.body.is_scaled and self.body.given_size:

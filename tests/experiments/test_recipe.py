@@ -54,6 +54,14 @@ def test_rows_that_predict_no_reward_are_not_trained_with_it() -> None:
             read(**tables | {"methods": ["astra", row]}, train=predicted)
 
 
+def test_keys_that_a_table_leaves_out_are_those_of_the_method_without_it() -> None:
+    rows = {"methods": ["direct_transfer_iql", "iql"]}
+    recipe = read(**rows, direct_transfer_iql={"temperature": 2.5}, iql={"temperature": 2.5})
+    settings = recipe.settings_of("direct_transfer_iql", "train"), recipe.settings_of("iql", "train")
+    assert settings == (FINE_TUNING.model_copy(update={"temperature": 2.5}), IqlConfig(temperature=2.5))
+    assert read(**recipe.settings) == recipe
+
+
 class MyConfig(Config):
     rate: float = 0.5
 

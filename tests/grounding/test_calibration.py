@@ -62,3 +62,20 @@ def test_folds_share_failing_and_other_episodes_alike(failing: int, count: int) 
             assert max(sizes) - min(sizes) <= 1
         assert found[0].nonzero().squeeze(1).tolist() != [*range(0, 40, count)]  # at random
     assert not torch.equal(torch.stack(folds(fails) or [fails]), torch.stack(found or [~fails]))
+
+
+def test_copies_are_in_the_fold_of_their_recording() -> None:
+    torch.manual_seed(0)
+    recordings = torch.tensor([9, 9, 9, 4, 4, 4, 7, 7, 7, 2, 2, 2])
+    fails = recordings >= 7
+    found = folds(fails, recordings)
+    assert len(found) == 2  # recordings that fail, though six episodes do
+    for fold in found:
+        for recording in recordings.unique():
+            assert len(fold[recordings == recording].unique()) == 1
+        assert int((fold & fails).sum()) == int((fold & ~fails).sum()) == 3
+    assert folds(recordings == 9, recordings) == []
+    torch.manual_seed(1)
+    alone = folds(fails)
+    torch.manual_seed(1)
+    assert torch.equal(torch.stack(alone), torch.stack(folds(fails, torch.arange(12))))

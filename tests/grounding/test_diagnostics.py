@@ -4,9 +4,11 @@ import pytest
 import torch
 from toy_episodes import toy_episodes
 
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.diagnostics import correction_r2, telemetry
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.learning.networks.paired_windows import PairedWindows
 
 WEIGHTS = LossWeights()
 
@@ -42,7 +44,7 @@ def model(given: PairedEpisodes) -> GroundingModel:
     torch.manual_seed(1)
     made = GroundingModel(GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,), position_octaves=0))
     rewards = given.steps(given.windows.reward)
-    made.set_reward_scales(rewards, given.steps(given.windows.goes_on))
+    made.set_reward_scales(rewards, *map(given.steps, (given.windows.goes_on, given.windows.failed)))
     with torch.no_grad():
         list(made.corrections.parameters())[-2].normal_(std=0.05)
     return made.requires_grad_(False)
@@ -117,3 +119,17 @@ def test_a_perfect_simulator_leaves_nothing_to_explain() -> None:
     given = episodes()
     windows = replace(given.windows, simulated_next=given.windows.next_state)
     assert correction_r2(windows.next_state + 1.0, windows, torch.ones(4)) is None
+
+
+def test_a_single_step_has_no_spread() -> None:
+    given = episodes().select(torch.tensor([0]))
+    one = replace(given, windows=PairedWindows(**{k: v[:, :1] for k, v in vars(given.windows).items()}))
+    figures = telemetry(model(given), one, WEIGHTS)
+    assert figures["latent_std"] is None and figures["latent_rank"] is None
+
+
+def test_a_fit_that_diverged_is_told() -> None:
+    used = model(episodes())
+    next(used.encoder.parameters()).data.fill_(torch.nan)
+    with pytest.raises(BadInputError, match=r"the fit diverged: lower learning_rate in \[ground\]"):
+        telemetry(used, episodes(), WEIGHTS)

@@ -269,7 +269,7 @@ def test_what_is_only_learned_by_heart_is_not_believed(monkeypatch: pytest.Monke
         return float(found["brier_skill"])
 
     calibrated = skill()
-    monkeypatch.setattr("astra_data.grounding.failures.folds", lambda fails: [])
+    monkeypatch.setattr("astra_data.grounding.failures.folds", lambda fails, recordings: [])
     assert skill() < calibrated - 0.02
     assert calibrated > -0.03
 

@@ -34,7 +34,7 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
     model = GroundingModel(shape, "detach")
     model.set_scales({"state": torch.randn(50, 4)})
     reward = torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1)
-    model.set_reward_scales(reward, torch.ones(50))
+    model.set_reward_scales(reward, torch.ones(50), reward[:, 1])
     assert torch.isfinite(model.failure_weight)
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, HistoryGrounding(model), no_episodes())

@@ -5,11 +5,14 @@ import pytest
 import torch
 from toy_episodes import toy_episodes
 
+from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.open_loop_error import _interval, distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.parameters import IdentifiedParameters
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 
@@ -158,3 +161,15 @@ def test_identified_parameters_are_replayed_without_their_noise() -> None:
     report = gap_report(TASK, IdentifiedParameters(found), episodes(speed=0.9), seed=0)
     assert report["raw"]["position_m"]["mean"][-1] > 0.1
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=1e-3)
+
+
+def test_a_simulator_that_diverges_is_told() -> None:
+    """Not left out, as replays that are over are."""
+
+    class Exploding(PointMass):
+        def step(self, command: torch.Tensor) -> torch.Tensor:
+            return 1e30 * super().step(command)
+
+    task = replace(TASK, make_simulator=lambda count: Exploding(TASK.maze, count, timestep_s=TASK.timestep_s))
+    with pytest.raises(BadInputError, match=r"the raw simulator of antmaze-umaze diverges: .* in step 1 of"):
+        gap_report(task, NO_GROUNDING, episodes(speed=0.9), seed=0)

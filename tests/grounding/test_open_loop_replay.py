@@ -42,6 +42,17 @@ def test_a_grounding_of_one_correction_corrects_and_does_not_disagree(episodes: 
         torch.testing.assert_close(found.hazard[:, step], simulator.topple_risk())
 
 
+def test_hazards_are_told_where_the_failure_model_was_fitted(episodes: PairedEpisodes) -> None:
+    """Where touching a wall is a failure, not within the recorded clearance."""
+    grounding = HistoryGrounding(model(), failure_model(), clearance_m=1.5)
+    touching = replace(TASK, objective=replace(TASK.objective, ends_at_walls=True))
+    found = replay_open_loop(touching, grounding, episodes, seed=0).hazard
+    free = replay_open_loop(touching, replace(grounding, clearance_m=None), episodes, seed=0).hazard
+    held = replay_open_loop(TASK, grounding, episodes, seed=0).hazard
+    assert found is not None and free is not None and held is not None
+    assert torch.equal(found, free) and not torch.equal(found, held)
+
+
 def test_members_disagree_by_their_mean_and_leave_path_and_hazards_to_the_model(
     episodes: PairedEpisodes,
 ) -> None:

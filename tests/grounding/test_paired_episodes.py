@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.registry import TASKS
 
 LENGTHS = (7, 1, 12, 30, 5)
 ABSTRACT = (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE)
@@ -248,3 +251,25 @@ def test_what_tells_the_place_is_dropped_if_phi_drops_it(
         info["features"][ABSTRACT_STATE]["astra"] = {"role": [kept] * 4}
     (root / "meta/info.json").write_text(json.dumps(info))
     assert PairedEpisodes.load(root).dropped_place == dropped
+
+
+def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> None:
+    sizes = {STATE: 29, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
+    ant = TASKS["antmaze-umaze"]
+    PairedEpisodes.load(write(tmp_path / "ant", sizes)).check(ant)
+    other = PairedEpisodes.load(write(tmp_path / "toy", {STATE: 3, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)))
+    with pytest.raises(BadInputError) as caught:
+        other.check(ant)
+    assert str(caught.value) == (
+        "toy@data-1.0.0 has 3 values in a state, antmaze-umaze 29; has 0 values in a goal, antmaze-umaze 2: "
+        "pair it again, with the simulator of this task"
+    )
+    wide = write(tmp_path / "wide", {STATE: 29, GOAL: 2, ACTION: 3} | dict.fromkeys(ABSTRACT, 3))
+    with pytest.raises(
+        BadInputError, match=r"3 values in an abstract state, .* 4; has 3 values in an action"
+    ):
+        PairedEpisodes.load(wide).check(ant)
+    bounded = {"vx": (-1.0, 2.0), "vy": (-1.0, 1.0)}
+    moved = replace(PairedEpisodes.load(tmp_path / "ant"), commands=Commands(bounded))
+    with pytest.raises(BadInputError, match=r"was paired for commands within \{'vx': \(-1.0, 2.0\)"):
+        moved.check(ant)

@@ -1,5 +1,9 @@
+from dataclasses import replace
+
 import pytest
 import torch
+from small_cart import TASK as CART
+from small_cart import Reach
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
@@ -56,9 +60,23 @@ def test_a_summary_leaves_out_the_place_in_a_maze() -> None:
     walker = TASKS["humanoid-kinematics"]
     size = walker.abstract_state.size
     state, action = torch.randn(2, size), torch.randn(2, 3, walker.objective.action_size)
-    known = ReplayWindows(state, action, state[:, None].expand(2, 3, size)).summary(walker)
+    goal = state[:, :0]
+    known = ReplayWindows(state, goal, action, state[:, None].expand(2, 3, size)).summary(walker)
     seen = walker.objective.observe(state, state[:, :0])
     torch.testing.assert_close(known, torch.cat([seen, action.mean(1)], dim=-1))
+
+
+def test_a_summary_outside_of_a_maze_is_of_what_is_observed_with_the_goal() -> None:
+    class Ahead(Reach):
+        def observe(self, state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+            return goal - state
+
+    task = replace(CART, objective=Ahead(horizon=40))
+    state = torch.arange(8.0).reshape(1, 8, 1)
+    recorded = toy_episodes(state, torch.ones(1, 8, 1), next_state=state + 1, goal=state + 5)
+    cut = ReplayWindows.at(recorded, torch.tensor([0, 0]), torch.tensor([2, 4]), 3)
+    assert cut.goal.tolist() == [[7.0], [9.0]]
+    assert cut.summary(task).tolist() == [[5.0, 1.0]] * 2
 
 
 def test_gaps_are_mean_distances_from_the_recording() -> None:
@@ -68,7 +86,7 @@ def test_gaps_are_mean_distances_from_the_recording() -> None:
     speed = torch.tensor([0.5, 1.0])
     along = torch.arange(1, 5) * TASK.timestep_s
     target = start[:, None] + torch.cat([0.8 * action * along[:, None], 0.8 * action], dim=-1)
-    recorded = ReplayWindows(start, action, target)
+    recorded = ReplayWindows(start, start[:, :2], action, target)
     factors = torch.tensor([1.0, 0.8, 0.6])
     plain = PlanarVariation().ranges()[:, 0]
     parameters = plain.repeat(3, 1)
@@ -84,7 +102,7 @@ def test_gaps_are_mean_distances_from_the_recording() -> None:
 def test_all_parameters_are_replayed_with_the_same_noise() -> None:
     start = torch.tensor([*TASK.maze.cell_centre(1, 1), 0.0, 0.0]).float().expand(3, 4)
     action = torch.zeros(3, 5, 2)
-    recorded = ReplayWindows(start, action, start[:, None].expand(3, 5, 4))
+    recorded = ReplayWindows(start, start[:, :2], action, start[:, None].expand(3, 5, 4))
     noisy = PlanarVariation(position_noise_m=(0.1, 0.1)).ranges()[:, 0].repeat(2, 1)
     gaps = trajectory_gaps(TASK, recorded, noisy, seed=1)
     assert gaps[0].abs().max() > 0.01

@@ -162,6 +162,14 @@ def test_cloning_is_iql_at_temperature_zero(learn: Learn, tmp_path: Path) -> Non
     assert all(map(torch.equal, cloned.parameters(), plain.parameters()))
 
 
+def test_cloning_needs_no_steps_to_look_ahead(learn: Learn, episodes: PairedEpisodes, tmp_path: Path) -> None:
+    episodes.windows.mask[:, 4:] = 0.0
+    episodes.terminated[:] = False
+    with pytest.raises(BadInputError, match=r"at least 10 steps \(return_steps\)"):
+        learn(temperature=0.0, critic_updates=1, return_steps=10)
+    assert learn(how=clone_behavior, return_steps=10)
+
+
 class Stopped(Exception):  # noqa: N818 - stands for a kill
     pass
 

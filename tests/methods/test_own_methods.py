@@ -14,6 +14,7 @@ from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.progress import silent
 from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.own_methods import OwnMethod
 from astra_data.experiments.plan import plan
 from astra_data.experiments.trained_policy import load_policy
 from astra_data.grounding.files import load_grounding
@@ -164,6 +165,13 @@ def test_its_settings_stand_in_the_recipe(tmp_path: Path) -> None:
     settings = recipe_of.settings_of("delta_action_plus", "ground")
     assert settings is not None and settings.model_dump() == {"memory": 4, "learning_rate": 0.003}
     assert recipe_of.settings_of("delta_action_plus", "train") is None
+    table = METHODS["delta_action"].table
+    assert table is not None
+    slow = replace(table, default=table.model(learning_rate=0.5))  # type: ignore[call-arg]
+    METHODS["delta_action"] = replace(METHODS["delta_action"], table=slow)
+    given = OwnMethod(method=DELTA, memory=4)  # type: ignore[call-arg]
+    assert given.settings("delta_action") == table.model(memory=4, learning_rate=0.5)  # type: ignore[call-arg]
+    METHODS["delta_action"] = replace(METHODS["delta_action"], table=table)
     again = validated(recipe_of.settings, type(recipe_of), "recipe.json")
     assert again.settings_of("delta_action", "ground") == settings
 

@@ -69,9 +69,8 @@ class TargetEncoder(nn.Module):
         """Assemble [s_i, features of its position, goal, a_{i-1}] (..., I)."""
         normal_state = normalised(state, self.state_mean, self.state_std)
         waves = self.position_features(state[..., :2])
-        return torch.cat(
-            [normal_state, waves, (goal - self.goal_mean) / self.goal_std, previous_action], dim=-1
-        )
+        normal_goal = normalised(goal, self.goal_mean, self.goal_std)
+        return torch.cat([normal_state, waves, normal_goal, previous_action], dim=-1)
 
 
 def gaussian_mmd(

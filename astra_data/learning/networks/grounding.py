@@ -20,6 +20,8 @@ TargetKind = Literal["ema", "detach", "online"]
 
 _BALL_M = 0.1
 """Unit of the ball's position relative to the robot: less than this decides whether they touch."""
+_LEAST_DISAGREEMENT = 1e-9
+"""On the data, in standard deviations of the correction; 0 where there was nothing to correct."""
 
 
 @dataclass(frozen=True)
@@ -117,21 +119,22 @@ class GroundingModel(nn.Module):
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
 
     @torch.no_grad()
-    def set_reward_scales(self, reward: Tensor, goes_on: Tensor, failure_weight: float = 1.0) -> None:
+    def set_reward_scales(
+        self, reward: Tensor, goes_on: Tensor, failed: Tensor, failure_weight: float = 1.0
+    ) -> None:
         """Take the scales of `reward` (N, 2), in its two parts (see `PairedWindows`), from training steps.
 
-        The mean and deviation are those of steps where `goes_on` (N,) is 1. The reward head starts at the
-        rate of failures in the data; their loss is weighted by how rare they are, times `failure_weight`.
+        Steps that `failed` (N,) end in failure. Mean and deviation are those of steps where `goes_on` (N,) is
+        1. The reward head starts at the rate of failures, whose loss counts by rarity times `failure_weight`.
         """
-        going_on, failing = reward.unbind(-1)
-        failed = failing != 0
+        failed = failed.bool()
         if goes_on.any():
-            paid = going_on[goes_on.bool()]
+            paid = reward[goes_on.bool(), 0]
             self.reward_mean.copy_(paid.mean())
             self.reward_std.copy_(paid.std(correction=0).clamp_min(1e-3))
         if failed.any():
             rate = failed.float().mean().clamp(max=0.5)
-            self.failure_cost.copy_((failing[failed].mean() - self.reward_mean).clamp_max(0.0))
+            self.failure_cost.copy_((reward[failed, 1].mean() - self.reward_mean).clamp_max(0.0))
             self.failure_weight.copy_(failure_weight / functional.binary_cross_entropy(rate, rate))
             list(self.reward_head.parameters())[-1][1] = rate.logit()
 
@@ -147,7 +150,7 @@ class GroundingModel(nn.Module):
 
     def normal_goal(self, goal: Tensor) -> Tensor:
         """Normalise goals (..., G)."""
-        return (goal - self.goal_mean) / self.goal_std
+        return normalised(goal, self.goal_mean, self.goal_std)
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
@@ -216,7 +219,7 @@ class GroundingModel(nn.Module):
     def disagreement(self, predictions: Tensor) -> Tensor:
         """Return the spread (...) of ensemble predictions (K, ..., X), relative to that on the data."""
         spread = (predictions / self.correction_std).std(0).square().mean(-1).sqrt()
-        return spread / self.usual_disagreement
+        return spread / self.usual_disagreement.clamp_min(_LEAST_DISAGREEMENT)
 
     def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
         """Return the log-odds (...) of a topple within `RISK_STEPS`, on the way to `next_state`."""
@@ -270,10 +273,8 @@ class GroundingModel(nn.Module):
         if self.shape.reward_dropout:
             latent = functional.dropout(latent, self.shape.reward_dropout, self.training)
         going_on, log_odds = self._reward_outputs(latent, windows.action)
-        reward, failing = windows.reward.unbind(-1)
-        failed = (failing != 0).float()
-        error = windows.goes_on * (going_on - (reward - self.reward_mean) / self.reward_std)
-        surprise = functional.binary_cross_entropy_with_logits(log_odds, failed, reduction="none")
+        error = windows.goes_on * (going_on - (windows.reward[..., 0] - self.reward_mean) / self.reward_std)
+        surprise = functional.binary_cross_entropy_with_logits(log_odds, windows.failed, reduction="none")
         return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
 
     def _correction_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:

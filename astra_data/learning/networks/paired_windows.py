@@ -35,6 +35,12 @@ class PairedWindows:
     topples_soon: Tensor
     mask: Tensor
 
+    @property
+    def failed(self) -> Tensor:
+        """(B, T), 1 where the step ends in failure, also where that pays nothing."""
+        ends = self.topples_soon.bool() & ~self.goes_on.bool()
+        return (ends | (self.reward[..., 1] != 0)).float()
+
 
 def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:
     """Return 1 at the last `steps` real steps of each episode that fails (E,), by the mask (E, T), else 0."""

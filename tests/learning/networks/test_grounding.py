@@ -39,7 +39,8 @@ def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
 
 
 def set_reward_scales(model: GroundingModel, windows: PairedWindows, failure_weight: float = 1.0) -> None:
-    model.set_reward_scales(windows.reward.flatten(0, 1), windows.goes_on.flatten(), failure_weight)
+    failed = windows.failed.flatten()
+    model.set_reward_scales(windows.reward.flatten(0, 1), windows.goes_on.flatten(), failed, failure_weight)
 
 
 TRAINING, HELD_OUT = lagging_world(32, 30, seed=0), lagging_world(64, 30, seed=1)
@@ -126,6 +127,9 @@ def test_heads_agree_where_there_is_data_and_nowhere_else() -> None:
             latent, 4.0 * action, model.state_mean - 4.0 * model.state_std + 0 * landed
         )
         assert float(model.disagreement(elsewhere).mean()) > 3.0
+        model.usual_disagreement.zero_()
+        agreed = elsewhere[:1].expand_as(elsewhere)
+        assert float(model.disagreement(agreed).abs().max()) == 0.0
 
 
 def test_it_learns_what_only_the_history_tells() -> None:

@@ -52,7 +52,7 @@ def model(heads: int = 1, target: TargetKind = "ema", dropout: float = 0.0) -> G
         "correction": 0.5 * (given.next_state - given.simulated_next),
     }
     made.set_scales({name: values.flatten(0, 1) for name, values in columns.items()})
-    made.set_reward_scales(given.reward[given.mask.bool()], given.goes_on[given.mask.bool()])
+    made.set_reward_scales(*(one[given.mask.bool()] for one in (given.reward, given.goes_on, given.failed)))
     with torch.no_grad():
         for head in made.corrections:
             list(head.parameters())[-2].normal_(std=0.2)
@@ -88,6 +88,8 @@ def test_the_encoder_sees_state_places_goal_and_previous_action_in_this_order() 
     torch.testing.assert_close(inputs[..., :4], normal.clamp(-5.0, 5.0))
     torch.testing.assert_close(inputs[..., 4:20], used.position_features(given.state[..., :2]))
     torch.testing.assert_close(inputs[..., 20:22], (given.goal - used.goal_mean) / used.goal_std)
+    far = used.encoder_input(given.state, given.goal + 1e3, given.previous_action)
+    assert (far[..., 20:22] == 5.0).all()  # as of states, beyond what was seen
     assert torch.equal(inputs[..., 22:], given.previous_action)
     latent, hidden = used.encode(given)
     torch.testing.assert_close(latent, functional.layer_norm(hidden, (8,)))
@@ -98,7 +100,7 @@ def test_reward_scales_are_those_of_steps_that_go_on() -> None:
     used = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     going_on, failing = torch.tensor([1.0, 2.0, 3.0, 6.0, 0.0, 99.0]), torch.zeros(6)
     failing[4], goes_on = -12.0, torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0, 0.0])
-    used.set_reward_scales(torch.stack([going_on, failing], dim=-1), goes_on, failure_weight=2.0)
+    used.set_reward_scales(torch.stack([going_on, failing], dim=-1), goes_on, failing, failure_weight=2.0)
     assert float(used.reward_mean) == pytest.approx(3.0)
     assert float(used.reward_std) == pytest.approx(3.5**0.5)  # (4 + 1 + 0 + 9) / 4
     assert float(used.failure_cost) == pytest.approx(-12.0 - 3.0)
@@ -111,12 +113,13 @@ def test_reward_scales_are_those_of_steps_that_go_on() -> None:
 def test_failures_never_pay_and_are_taken_as_rare() -> None:
     used = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     goes_on = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    used.set_reward_scales(torch.tensor([[1.0, 0.0], [0.0, 5.0], [0.0, 5.0], [0.0, 5.0]]), goes_on)
+    paid = torch.tensor([[1.0, 0.0], [0.0, 5.0], [0.0, 5.0], [0.0, 5.0]])
+    used.set_reward_scales(paid, goes_on, paid[:, 1])
     assert float(used.failure_cost) == 0.0
     assert float(used.failure_weight) == pytest.approx(1.0 / math.log(2.0), rel=1e-5)
     before = float(used.reward_mean)
     # All fail: nothing that goes on to scale by.
-    used.set_reward_scales(torch.tensor([[0.0, -3.0]]), torch.zeros(1))
+    used.set_reward_scales(torch.tensor([[0.0, -3.0]]), torch.zeros(1), torch.ones(1))
     assert (float(used.reward_mean), float(used.failure_cost)) == (before, -4.0)
 
 
@@ -177,6 +180,22 @@ def test_each_head_learns_from_its_own_half_of_the_windows() -> None:
     torch.testing.assert_close(parts["state"], error[counted].mean())
 
 
+def test_failures_that_pay_nothing_are_failures() -> None:
+    """As where every step pays 1 but that of the fall."""
+    given = windows()
+    given.reward[:], given.topples_soon[:], given.goes_on[:] = torch.tensor([1.0, 0.0]), 0.0, given.mask
+    given.goes_on[2, -1], given.reward[2, -1] = 0.0, 0.0
+    assert not given.failed.any()  # the goal was reached
+    given.topples_soon[2, -3:] = 1.0
+    assert given.failed.nonzero().tolist() == [[2, 6]]
+    used, real = model(), given.mask.bool()
+    used.set_reward_scales(given.reward[real], given.goes_on[real], given.failed[real])
+    assert (float(used.reward_mean), float(used.failure_cost)) == (1.0, -1.0)
+    known = used.losses(given, LossWeights())[1]["reward"]
+    given.topples_soon[:] = 0.0
+    assert not torch.equal(known, used.losses(given, LossWeights())[1]["reward"])
+
+
 def test_the_loss_of_the_reward_weighs_failures() -> None:
     used, given = model(), windows()
     outputs = used.reward_head(torch.cat([latents(used), given.action], dim=-1))
@@ -197,7 +216,7 @@ def test_what_a_success_pays_counts_nowhere() -> None:
         given = windows()
         given.goes_on[2, -1], given.reward[2, -1, 0] = 0.0, paid
         used, real_steps = model(), given.mask.bool()
-        used.set_reward_scales(given.reward[real_steps], given.goes_on[real_steps])
+        used.set_reward_scales(*(one[real_steps] for one in (given.reward, given.goes_on, given.failed)))
         found.append((used.reward_mean, used.reward_std, used.losses(given, LossWeights())[0]))
     assert all(map(torch.equal, *found))
 

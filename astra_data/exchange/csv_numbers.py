@@ -1,0 +1,74 @@
+"""The fields of CSV logs as numbers, before it is known what they are."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from astra_data.core.errors import BadInputError, in_short
+from astra_data.exchange.importers.csv import delimiter_of
+
+Floats = NDArray[np.float64]
+MOSTLY = 0.9
+"""Share of a field's rows with a number above which the others are faults."""
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*|[+-]?(nan|inf)", re.IGNORECASE)
+
+
+def read_numbers(path: Path, numbered: re.Pattern[str]) -> dict[str, Floats]:
+    """Return the fields (T,) of a CSV file as numbers; true and false are 1 and 0.
+
+    Texts and dates are NaN, but where the name of their field is one of those `numbered`: there equal ones
+    have the same number.
+
+    Raises:
+        BadInputError: it is no CSV, has no numbers, or a field of numbers has a text or the name of another.
+    """
+    delimiter, mark = delimiter_of(path.name)
+    try:
+        table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
+    except FileNotFoundError:
+        raise BadInputError(f"{path}: there is no such file") from None
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
+        raise BadInputError(f"{path}: expected CSV with a header ({in_short(error)})") from None
+    named = zip(table.column_names, table.columns, strict=True)
+    fields = [(name, values) for name, values in named if name or not pa.types.is_null(values.type)]
+    for name, values in fields:
+        if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):
+            raise BadInputError(f"{path} line {wrong[0] + 2}: {name}: expected a number, got {wrong[1]!r}")
+    numbers = {
+        name: _as_numbers(values, is_numbered=bool(numbered.fullmatch(plain_name(name))))
+        for name, values in fields
+    }
+    names = [name for name, _ in fields]
+    usable = [name for name, values in numbers.items() if np.isfinite(values).any()]
+    if len(table) < 2 or not usable or any(names.count(name) > 1 for name in usable):
+        raise BadInputError(
+            f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
+        )
+    return numbers
+
+
+def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
+    """Return a field (T,) as numbers; texts and dates are NaN, or numbered."""
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    if any(kind(values.type) for kind in kinds):
+        numbers: Floats = values.cast(pa.float64(), safe=False).to_numpy()
+        return numbers
+    if is_numbered and not values.null_count:
+        return np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
+    return np.full(len(values), np.nan)
+
+
+def plain_name(name: str) -> str:
+    """Return a field's name in small letters, digits and single underscores."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
+    """Return the row and the text of the first of `values` that is no number, if nearly all others are."""
+    wrong = [(row, value) for row, value in enumerate(values) if value and not _NUMBER.fullmatch(value)]
+    return wrong[0] if wrong and len(wrong) < (1 - MOSTLY) * len(values) else None
