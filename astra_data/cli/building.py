@@ -130,8 +130,6 @@ def collect(
         "target_encoder": target_encoder,
         "plan": plan,
     }
-    if plan is not None and behavior is None:
-        settings["behavior"] = "planned"
     given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
     if task.endswith(".toml"):
         refuse(given | _given(name=name, out=out, resume=resume), "collect")
@@ -146,7 +144,8 @@ def collect(
     from astra_data.stages.collect import CollectConfig
     from astra_data.stages.collect import collect as collect_dataset
 
-    config = validated(given, CollectConfig, "collect")
+    planned = {"behavior": "planned"} if plan is not None and behavior is None else {}
+    config = validated(given | planned, CollectConfig, "collect")
     seed = seeds[0] if seeds else 0
     # The networks' idle threads would slow down the physics.
     torch.set_num_threads(1)

@@ -16,12 +16,14 @@ from astra_data.core.errors import AstraDataError
 from astra_data.core.manifest import read_manifest
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import open_dataset
 from astra_data.experiments.execution import Item
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment
 from astra_data.experiments.plan import stage_of
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.reports.artefacts import Evaluation, read_json
 from astra_data.reports.choice import Judged
+from astra_data.stages.label import is_address
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.training.policy_file import PolicyFile
 
@@ -117,6 +119,8 @@ def can_be_made_again(key: str, experiment: Experiment) -> bool:
     stage = _stage(key)
     if not stage.makes_dataset:
         return True
+    if (link := experiment.place(key)).is_symlink() and _other_data(link, experiment.recipe.data):
+        return True
     with suppress(AstraDataError):
         return bool(read_description(experiment.place(key))["stage"] == stage.name)
     return False
@@ -144,6 +148,8 @@ def _unreadable(key: str, experiment: Experiment) -> str:
 def _replaced(item: Item, experiment: Experiment) -> str:
     """Return which of the artefacts that `item` is made from it was not made from."""
     folder = experiment.place(item.key)
+    if stage_of(item) == "label" and (data := _other_data(folder, experiment.recipe.data)):
+        return f"made from another dataset than {data}"
     made_from: Collection[str]
     if _stage(item.key).makes_dataset:
         made_from = [parent["hash"] for parent in read_description(folder)["parents"]]
@@ -158,6 +164,17 @@ def _replaced(item: Item, experiment: Experiment) -> str:
     digests = {key: _digest(key, experiment) for key in item.inputs if experiment.has(key)}
     others = [key for key, digest in digests.items() if digest and digest not in made_from]
     return f"made from another {others[0]}" if others else ""
+
+
+def _other_data(labelled: Path, data: str | None) -> str:
+    """Return the reference of the dataset that a recipe names, if another one was labelled."""
+    if data is None or is_address(data):
+        return ""
+    with suppress(AstraDataError):
+        named, made = open_dataset(data), read_description(labelled)
+        known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
+        return "" if named.content_hash in known else named.reference
+    return ""
 
 
 def _digest(key: str, experiment: Experiment) -> str | None:

@@ -7,7 +7,7 @@ difference are not run again: links in its folder lead to the other recipe's art
 task with the same target; then it shares the collected episodes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -60,7 +60,9 @@ class Experiment:
         absent = set() if self.recipe.sweep.percent else {"subset"}
         asked = {stage.name: stage.asked_by for stage in STAGES.values() if stage.asked_by}
         absent |= {stage for stage, key in asked.items() if not getattr(self.recipe, key)}
-        return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed)
+        sizes, theirs = (set(one.sweep.percent) for one in (self.recipe, self.base.recipe))
+        resized = {"subset"} if bool(sizes) != bool(theirs) or not sizes <= theirs else set()
+        return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed, resized)
 
     def maker(self, stage: str) -> "Experiment":
         """Return the experiment that makes the artefacts of `stage`."""
@@ -216,9 +218,9 @@ def _reads(row: str, table: str) -> bool:
     return table == ours or (method.initial is not None and _reads(method.initial, table))
 
 
-def _stale_stages(changed: set[str]) -> set[str]:
-    """Return the stages that are affected when the keys `changed` of a recipe change."""
-    stale: set[str] = set()
+def _stale_stages(changed: set[str], begun: Collection[str] = ()) -> set[str]:
+    """Return the stages that are affected when the keys `changed` of a recipe change, or those `begun`."""
+    stale = set(begun)
     for stage in STAGES:
         more = {"collect": ("sweep",), "label": ("data",), "train": ("plus",)}
         sections = {"task", stage, *more.get(stage, ())}
@@ -241,9 +243,20 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
     elsewhere = {"methods", "own_methods", "seeds", "based_on"}
     changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}
+    changed -= {key for key in ("task", "data") if _is_same_place(before.get(key), now.get(key))}
     if "task" in changed and _share_target(str(before.get("task")), recipe.task):
         return changed - {"task"} | {_SIMULATOR}
     return changed - {"plus"} if "train" in changed else changed  # which "plus" takes over
+
+
+def _is_same_place(before: object, now: object) -> bool:
+    """Return whether two names of a file or folder of the user's are of one, told from different folders.
+
+    Whether it holds the same is compared by digests: of code in code.json, of data as of other artefacts.
+    """
+    file, is_code, _ = str(now).partition(".py:")
+    there = Path(f"{file}.py").is_file() if is_code else Path(file).is_dir()
+    return there and Path(str(before)).name == Path(str(now)).name
 
 
 def _share_target(task: str, other: str) -> bool:

@@ -34,9 +34,9 @@ def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
 
 
 def record_code(recipe: Recipe, folder: Path) -> None:
-    """Write down in `folder` what the code is now, if there is any."""
+    """Write down in `folder` what the code is now, if there is any; that of other methods stays written."""
     if digests := _digests(recipe):
-        write_file(folder / CODE, json.dumps(digests, indent=1) + "\n")
+        write_file(folder / CODE, json.dumps(_recorded(folder / CODE) | digests, indent=1) + "\n")
 
 
 def _recorded(path: Path) -> dict[str, str]:

@@ -85,7 +85,7 @@ def with_current_keys(tables: Mapping[str, Any], path: Path) -> dict[str, Any]:
                     raise RecipeError(
                         f"{path}: {name} has both {old} and {new}, its current name: remove {old}"
                     )
-                current[name] = {new if key == old else key: value for key, value in table.items()}
+                current[name] = {new if key == old else key: value for key, value in current[name].items()}
                 _say(f"{path}: {name}.{old} is now called {new}: please rename it")
     return current
 

@@ -110,6 +110,8 @@ def run_stage(
         AstraDataError: an item failed.
     """
     check_stage(stage)
+    if add and seeds:
+        raise BadInputError("--add keeps what is published of all seeds: leave out --seed")
     experiment = load_experiment(recipe_path, root)
     maker = experiment.maker(stage)
     if maker is not experiment:

@@ -1,5 +1,6 @@
 """Choose among the policies of a run without the target: the stage `select` on a run that is there."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,11 @@ from astra_data.experiments.trained_policy import settings_of
 from astra_data.methods import grounded_as
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
+from astra_data.reports.trials import TRIALS
 from astra_data.stages.select import FOLDER, SelectConfig, benches, digests, judge_of
 from astra_data.stages.select import select as judge_all
+
+_log = logging.getLogger(__name__)
 
 
 def select(
@@ -84,5 +88,7 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     same = manifest is not None and manifest.made_from == read and not manifest.faults(out, verify=False)
     if same and settings.read_text() == config.model_dump_json(indent=1):
         return True
-    set_aside(folder, FOLDER)
+    aside = set_aside(folder, FOLDER)
+    if (aside / TRIALS).is_file():
+        _log.warning("the choice is made anew; the old one, with its trials in the target, is in %s", aside)
     return False

@@ -11,7 +11,7 @@ from typing import Any
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 RECIPES = next(folder for folder in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes") if folder.is_dir())
 """The folder of recipes: in the installed package, or beside it in a checkout."""
@@ -97,11 +97,11 @@ def copy_recipe(name: str, folder: Path) -> list[Path]:
     for source, place in places.items():
         if place.exists() and (not place.is_file() or place.read_bytes() != source.read_bytes()):
             raise BadInputError(f"{place} is there and differs from the shipped one: choose another folder")
-    new = [place for place in places.values() if not place.exists()]
-    for source, place in places.items():
+    new = {place: source for source, place in places.items() if not place.exists()}
+    for place, source in new.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, place)
-    return new
+    return list(new)
 
 
 def _about(text: str) -> str:

@@ -83,6 +83,10 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")
+    sizes = settings.get("sweep", {}).get("percent", ())
+    if (percent is None) == bool(sizes) or (sizes and percent not in sizes):
+        wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
+        raise BadInputError(f"{run}: percent: expected {wanted}, got {percent or 'none'}")
     folder, base, where = Path(run), grounded_as(row), place(seed, percent)
     files = {"train": folder / "train" / row / where / POLICY}
     if method.grounds:

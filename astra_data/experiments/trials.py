@@ -10,7 +10,7 @@ from astra_data.core.artefact import finished_folder
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.core.manifest import read_manifest, write_manifest
-from astra_data.core.progress import Progress, silent
+from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
 from astra_data.experiments.selecting import select
 from astra_data.experiments.trained_policy import load_policy, settings_of, task_of
@@ -58,7 +58,7 @@ def choose_by_trials(
     if not task_named(task).has_target:
         raise BadInputError(f"{folder}: expected a task with a target, got {task}: leave out --trials")
     _check_enough(trials, 2 if field is None else field)
-    judged = select(run, rows=rows, judge=judge, episodes=episodes, progress=progress)
+    judged = select(run, rows=rows, judge=judge, episodes=episodes, progress=part(progress, 0.0, 0.5))
     candidates = _candidates(judged, percent)
     if not 2 <= (field or len(candidates)) <= len(candidates):
         raise BadInputError(
@@ -69,7 +69,7 @@ def choose_by_trials(
     with held(folder) as ours:
         if not ours:
             raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
-        return _halve(folder, judged, candidates, begun, progress)
+        return _halve(folder, judged, candidates, begun, part(progress, 0.5, 1.0))
 
 
 def _check_enough(trials: int, field: int) -> None:

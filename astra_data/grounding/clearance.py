@@ -10,7 +10,7 @@ _CLOSEST_SHARE = 0.01
 
 
 def recorded_clearance_m(task: Task, episodes: PairedEpisodes) -> float | None:
-    """Return the distance in m from walls that 99 of 100 steps kept, those of copies too; None without walls."""
+    """Return the distance in m from walls that 99 of 100 steps kept, also of copies; None without walls."""
     if task.plane is None:
         return None
     positions = episodes.steps(episodes.windows.state)[:, :2].numpy(force=True)

@@ -13,6 +13,8 @@ from astra_data.reports.tested import where
 
 _PERCENT = "\N{NO-BREAK SPACE}%"
 _SURE = f"95{_PERCENT}"
+_ENOUGH_SEEDS = 4
+"""With fewer, an interval over seeds is no wider than the seeds lie apart."""
 _MOSTLY = 0.5
 """Share of episodes that fail from which on a verdict warns of it."""
 
@@ -162,6 +164,11 @@ def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iter
         yield (
             f"The {_SURE} intervals of {row.title} and {floor.title} overlap: so few seeds leave open "
             "whether they differ."
+        )
+    elif (seeds := min(len(row.seeds), len(floor.seeds))) < _ENOUGH_SEEDS:
+        yield (
+            f"{row.title} and {floor.title} have {seeds} seeds to compare: by chance, equal rows may lie as "
+            "far apart."
         )
 
 
