@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from importlib.metadata import entry_points
+from pathlib import Path
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
@@ -20,7 +21,7 @@ from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.policy_file import add_policy_kind
-from astra_data.worlds.own_code import own_object
+from astra_data.worlds.own_code import own_object, place_beside
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -64,7 +65,8 @@ def add_method(name: str, place: str) -> None:
     Raises:
         BadInputError: the name is taken or cannot be that of a folder; or what is there is no method.
     """
-    if (known := _PLACES.get(name)) == place:
+    found = place_beside(place, Path.cwd())
+    if (known := _PLACES.get(name)) == found:
         return
     if known is not None:
         raise BadInputError(f"method '{name}' is {known} already: give {place} another name")
@@ -89,7 +91,7 @@ def add_method(name: str, place: str) -> None:
     if isinstance(method.learn, OwnLearner):
         add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)
-    _PLACES[name] = place
+    _PLACES[name] = found
 
 
 def tables() -> dict[str, Table]:

@@ -7,7 +7,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -73,7 +73,19 @@ def code_digest(name: str) -> str | None:
     place = Path(name.rpartition(":")[0])
     if place.suffix != ".py" or not place.is_file():
         return None
-    digest, todo, seen = hashlib.sha256(), [place], set()
+    digest = hashlib.sha256()
+    for path, tree in _with_neighbours(place):
+        digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()
+
+
+def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
+    """Yield a file and those beside it that it imports, each once, and what is in it.
+
+    Raises:
+        BadInputError: one of them is no Python.
+    """
+    todo, seen = [place], set[Path]()
     while todo:
         path = todo.pop()
         seen.add(path)
@@ -81,10 +93,9 @@ def code_digest(name: str) -> str | None:
             tree = ast.parse(path.read_bytes())
         except SyntaxError as error:
             raise BadInputError(f"{path}, line {error.lineno}: expected Python, got {error.msg}") from None
-        digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
+        yield path, tree
         beside = {path.with_name(f"{module}.py") for module in sorted(_imported(tree))}
         todo += sorted(file for file in beside - seen - set(todo) if file.is_file())
-    return digest.hexdigest()
 
 
 def _imported(tree: ast.Module) -> set[str]:
@@ -111,15 +122,38 @@ def _of_file(path: Path) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
-    if (folder := str(path.resolve().parent)) not in sys.path:
-        sys.path.append(folder)  # so that a file may import those beside it, as a script may
     try:
         with explained(f"importing {path}"):
+            _make_way(path.resolve())
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
     return module
+
+
+def _make_way(path: Path) -> None:
+    """Let a file import those beside it, as a script may, also where other files of their names were imported.
+
+    Installed packages come first.
+    """
+    folder, loaded = path.parent, dict(sys.modules)
+    known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)}
+    with suppress(BadInputError):  # what is no Python is told where it is run
+        for file, _ in _with_neighbours(path):
+            if file.stem in loaded and _folder_of(loaded[file.stem]) in known - {folder}:
+                del sys.modules[file.stem]
+    if f"{folder}" not in sys.path or folder in known:
+        places = [place for place in sys.path if place != f"{folder}"]
+        behind = len(places)
+        while behind and Path(places[behind - 1]) in known:
+            behind -= 1
+        sys.path[:] = [*places[:behind], f"{folder}", *places[behind:]]
+
+
+def _folder_of(module: ModuleType) -> Path | None:
+    file = getattr(module, "__file__", None)
+    return Path(file).resolve().parent if file else None
 
 
 def _own_names(module: ModuleType) -> list[str]:

@@ -95,6 +95,27 @@ def test_what_differs_and_what_reads_it_is_made_anew(
     assert experiment.place("pair/seed_0").parts[-3] == ("other" if borrowed == [] else "base")
 
 
+@pytest.mark.parametrize(
+    ("theirs", "ours", "is_borrowed"),
+    [
+        ("", "[25, 100]", False),
+        ("[25, 100]", "[25, 50, 100]", False),
+        ("[25, 100]", "[100]", True),
+        ("[25, 100]", "[25, 100]", True),
+        ("[25, 100]", "[]", False),
+    ],
+)
+def test_sizes_that_the_base_has_not_are_made_of_its_pairs(
+    base: Path, theirs: str, ours: str, is_borrowed: bool
+) -> None:
+    base.write_text(BASE + (f"[sweep]\npercent = {theirs}\n" if theirs else ""))
+    path = base.with_name("other.toml")
+    path.write_text(f'based_on = "base"\n[sweep]\npercent = {ours}\n')
+    borrowed = load_experiment(path, base.parent).borrowed
+    every = {"collect", "pair", "subset", "ground", "train", "align", "evaluate"}
+    assert borrowed == (every if is_borrowed else {"collect", "pair"})
+
+
 def sketch(base: Path, monkeypatch: pytest.MonkeyPatch, *targets: str | None) -> Path:
     """Write a recipe based on `base` of another task; both have these targets."""
     maze = TASKS["antmaze-umaze"]

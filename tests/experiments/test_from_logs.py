@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
+from astra_data.experiments.run import check, set_aside
 from astra_data.experiments.trained_policy import load_policy
 from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
 
@@ -123,3 +125,24 @@ def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
     assert f"{gap['raw']['heading_x']['mean'][0]:.3g} [" in of_yaw[2]
     assert f"{gap['grounded']['heading_x']['mean'][0]:.3g} [" in of_yaw[3]
     assert sum(line.startswith("- NAS, `") for line in lines) == 4
+
+
+def test_other_data_of_the_same_name_are_labelled_anew(logs: Path, tmp_path: Path) -> None:
+    shutil.copy(logs / "cart.py", tmp_path / "cart.py")
+    drives = sorted((logs / "csv").glob("*.csv"))
+    import_dataset(drives, CART / "logs.toml", out=tmp_path / "logs")
+    made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
+    path = tmp_path / "again.toml"
+
+    def labelled() -> tuple[str, str]:
+        found = check(path, root=tmp_path / "runs")["label/seed_0"]
+        return found.state, found.why
+
+    assert labelled() == ("finished", "")
+    shutil.rmtree(tmp_path / "logs")
+    import_dataset(drives[:4], CART / "logs.toml", out=tmp_path / "logs")
+    assert labelled() == ("stale", "made from another dataset than cart-logs@data-1.0.0")
+    set_aside(tmp_path / "runs/again", "label/seed_0")
+    made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
+    assert labelled() == ("finished", "")
+    assert len(Dataset.open(tmp_path / "runs/again/label/seed_0")) == 4

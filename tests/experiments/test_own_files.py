@@ -1,5 +1,6 @@
 """Artefacts that were made with other code of the user's."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -97,6 +98,30 @@ def test_a_method_that_the_recipe_has_no_more_outdates_nothing(made: Path) -> No
     (experiment.folder / "train/gone/seed_0").mkdir(parents=True)
     experiment.check_unchanged()
     assert experiment.outdated("train/gone/seed_0") == ""
+
+
+def test_what_it_was_is_known_once_the_method_is_back(made: Path) -> None:
+    whole = (made / "rail.toml").read_text()
+    edit(made / "rail.toml", '[own_methods]\nmine = "mine.py:METHOD"\n', "")
+    edit(made / "rail.toml", '["nas", "mine"]', '["nas"]')
+    record_code(load(made).recipe, load(made).folder)
+    edit(made / "mine.py", "class ", "class Other:\n    pass\n\n\nclass ")
+    (made / "rail.toml").write_text(whole)
+    assert "mine.py" in load(made).outdated("train/mine/seed_0")
+
+
+def test_a_recipe_is_the_same_from_every_folder(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (made / "logs").mkdir()
+    record = made / "runs/rail/recipe.json"
+    settings = json.loads(record.read_text()) | {"data": None}
+    for place in ("rail.py:TASK", f"{made}/rail.py:TASK", "recipes/rail.py:TASK"):
+        record.write_text(json.dumps(settings | {"task": place}))
+        for folder, path in ((made, "rail.toml"), (made.parent, f"{made.name}/rail.toml")):
+            monkeypatch.chdir(folder)
+            load_experiment(Path(path), made / "runs").check_unchanged()
+    record.write_text(json.dumps(settings | {"task": "rail.py:LOGS_ALONE"}))
+    with pytest.raises(RecipeError, match="task changed in the recipe"):
+        load(made).check_unchanged()
 
 
 def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:

@@ -37,6 +37,12 @@ def test_old_keys_are_taken_with_a_message_each(capsys: pytest.CaptureFixture[st
     ]
 
 
+def test_a_table_may_have_several_old_keys() -> None:
+    old = {"plus": {"doubt_penalty": 1.0, "command_limit_m_s": 0.5, "ramp": 0.1}}
+    new = {"disagreement_penalty": 1.0, "command_limit": 0.5, "ramp": 0.1}
+    assert with_current_keys(old, Path("older.toml")) == {"plus": new}
+
+
 def test_current_keys_are_taken_without_a_word(capsys: pytest.CaptureFixture[str]) -> None:
     tables = {"train": {"disagreement_penalty": 0.5}, "plus": {}}
     assert with_current_keys(tables, Path("new.toml")) == tables

@@ -209,6 +209,8 @@ def test_a_report_is_published_beside_the_recipe_and_added_to_what_is_there(
     run_stage(recipe, "report", root=tmp_path, jobs=1, add=True)
     told = asked(tmp_path / "r/report")
     assert (told["publish"], told["add_to"]) == (None, str(results / "r.json"))
+    with pytest.raises(BadInputError, match="--add keeps what is published of all seeds: leave out --seed"):
+        run_stage(recipe, "report", root=tmp_path, add=True, seeds=[1])
     recipe.write_text(recipe.read_text() + "[evaluate]\nsteps = 7\n")
     with pytest.raises(RecipeError, match=r"^evaluate changed in .* since its results in"):
         run_stage(recipe, "report", root=tmp_path, add=True)

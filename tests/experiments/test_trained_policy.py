@@ -77,6 +77,19 @@ def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> No
         load_policy(run, "astra_plus", seed=1)
 
 
+def test_a_run_of_several_sizes_is_asked_for_one(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "recipe.json").write_text(
+        json.dumps({"task": "antmaze-umaze", "sweep": {"percent": [25, 100]}})
+    )
+    for percent, got in ((None, "none"), (50, "50")):
+        with pytest.raises(BadInputError, match=rf"percent: expected one of 25, 100, got {got}"):
+            load_policy(tmp_path, "astra", percent=percent)
+    with pytest.raises(BadInputError, match=r"train/astra/percent_025/seed_0/policy.safetensors"):
+        load_policy(tmp_path, "astra", percent=25)
+    with pytest.raises(BadInputError, match=r"percent: expected none, as the recipe has one size, got 25"):
+        load_policy(run, "astra_plus", percent=25)
+
+
 def test_no_run_and_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected the folder of a run, which holds recipe\.json"):
         load_policy(tmp_path, "astra")

@@ -94,6 +94,16 @@ def test_candidates_of_a_round_meet_the_same_starts_and_goals(folder: Path, trie
     assert not set(seeds) & {derive(seed, "evaluation") for seed in range(9)}
 
 
+def test_progress_goes_on_from_the_choice_to_the_trials(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
+    shares: list[float] = []
+    choose_by_trials(folder, 20, field=4, episodes=7, progress=lambda share, note: shares.append(share))
+    assert shares == sorted(shares) and shares[-1] == 1.0 and 0.5 in shares
+    assert sum(share > 0.5 for share in shares) == len(tries.made)
+
+
 @pytest.mark.parametrize("encoder", ["target", "source"])
 def test_policies_are_deployed_as_they_are_evaluated(folder: Path, tries: Tries, encoder: str) -> None:
     recipe = folder / "recipe.json"

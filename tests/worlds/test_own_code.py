@@ -73,6 +73,18 @@ def test_files_of_one_name_are_two(tmp_path: Path) -> None:
     assert [own_object(f"{tmp_path}/{folder}/mine.py:VALUE") for folder in "ab"] == [1, 2]
 
 
+def test_each_file_imports_those_beside_it(tmp_path: Path) -> None:
+    """Also where another file of that name was imported."""
+    for folder, value in (("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text("from own_dynamics import TOLD\n")
+        (tmp_path / folder / "own_dynamics.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
+        (tmp_path / folder / "own_facts.py").write_text(f"VALUE = {value}")
+    assert [own_object(f"{tmp_path}/{folder}/mine.py:TOLD") for folder in "ab"] == [1, 2]
+    (tmp_path / "a" / "again.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
+    assert own_object(f"{tmp_path}/a/again.py:TOLD") == 1
+
+
 def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text("import sys\nfrom pathlib import Path\nTASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
