@@ -133,7 +133,7 @@ def _of_file(path: Path) -> ModuleType:
 
 
 def _make_way(path: Path) -> None:
-    """Let a file import those beside it, as a script may, also where other files of their names were imported.
+    """Let a file import those beside it, as a script may, whatever files of their names were imported before.
 
     Installed packages come first.
     """
