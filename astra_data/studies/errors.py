@@ -38,6 +38,8 @@ class Trial:
     def of(cls, sequences: Sequences, history: int, horizons: Sequence[int]) -> "Trial":
         """Start at every row of `sequences` with a history before it; of too many, at `MOST_STARTS` evenly.
 
+        Horizons that no start reaches are left out.
+
         Raises:
             BadInputError: nowhere do all steps of the shortest horizon, after a history, count.
         """
@@ -52,7 +54,9 @@ class Trial:
         order = order[torch.linspace(0, len(order) - 1, min(len(order), MOST_STARTS)).long()]
         sequence, step = sequence[order], step[order]
         stretch = sequences.stretches(sequence, step, history, max(horizons))
-        return cls(stretch, sequences.piece[sequence].numpy(), tuple(horizons))
+        counts = stretch.counts.long().cumprod(1)
+        reached = tuple(horizon for horizon in horizons if counts[:, horizon - 1].any())
+        return cls(stretch, sequences.piece[sequence].numpy(), reached)
 
     @torch.no_grad()
     def squared_errors(self, model: Predictor) -> Tensor:

@@ -109,7 +109,8 @@ def _ridge(sequences: Sequences, history: int, config: FitConfig, progress: Prog
     is_late = late_step > 0.75 * sequences.lengths[late_sequence]
     test = sequences.stretches(late_sequence[is_late], late_step[is_late], history, config.steps)
     end = sequences.body.chained(test.motion)[:, -1]
-    spread = end.std(0).clamp_min(_LEAST)
+    can_choose = len(early) > 0 and len(test) > 1
+    spread = end.std(0).clamp_min(_LEAST) if can_choose else torch.ones(())
 
     def error(strength: float) -> float:
         model.solve(early, strength)
@@ -117,7 +118,6 @@ def _ridge(sequences: Sequences, history: int, config: FitConfig, progress: Prog
 
     model = WindowModel(history, sequences.body).requires_grad_(False)
     model.set_scales(everything)
-    can_choose = len(early) > 0 and len(test) > 1
     model.solve(everything, min(STRENGTHS, key=error) if can_choose else STRENGTHS[-1])
     return model
 

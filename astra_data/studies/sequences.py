@@ -13,7 +13,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.studies.body import Body
 from astra_data.studies.recordings import Piece
 
-_KINDS = {"action": "action", "given": "action", "seen": "seen"}
+_KINDS = {"action": "action", "seen": "seen"}
 """What of `Body.mirror` the columns follow; all others are motions."""
 
 

@@ -184,9 +184,9 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     steps_config = recipe.steps
     step_s = steps_config.rows / fps
     rounded = [max(1, round(seconds / step_s)) for seconds in recipe.horizons_s]
-    horizons = tuple(dict.fromkeys([1, *rounded]))
-    horizons_s = [horizon * step_s for horizon in horizons]
-    trial = Trial.of(Sequences.of_pieces(case.test, fps, steps_config), steps_config.history, horizons)
+    asked = tuple(dict.fromkeys([1, *rounded]))
+    trial = Trial.of(Sequences.of_pieces(case.test, fps, steps_config), steps_config.history, asked)
+    horizons_s = [horizon * step_s for horizon in trial.horizons]
     body = trial.stretch.body
     fits = list(_fits(recipe, case, fps))
     squared: dict[float, dict[str, list[Any]]] = {}
@@ -228,7 +228,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         }
         for minutes, models in sorted(squared.items())
     ]
-    all_count = trial.stretch.counts.long().cumprod(1)[:, [horizon - 1 for horizon in horizons]]
+    all_count = trial.stretch.counts.long().cumprod(1)[:, [horizon - 1 for horizon in trial.horizons]]
     return {
         "name": case.name,
         "title": case.title,

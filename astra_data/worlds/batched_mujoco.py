@@ -39,7 +39,7 @@ class BatchedPhysics:
         qvel: velocities, (B, nv) float64, likewise.
         state: the full state of each copy, warm start included, (B, N) float64; a copy of it can be written
             back.
-        touching: whether anything touched a watched geom when the copy was last stepped, (B,) bool.
+        touching: whether anything touched a watched geom at the end of the copy's last step, (B,) bool.
         measured: the numbers that `measure` read off each copy when it was last stepped or set, (B, M)
             float64.
     """

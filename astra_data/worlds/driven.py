@@ -86,7 +86,7 @@ class VariedCommands(VariedSimulator):
         return self.simulator.settle(before, landed)
 
     def step(self, action: Tensor) -> Tensor:
-        """Apply `action` (B, A), longer or shorter by an error of the row and with noise."""
+        """Apply `action` (B, A), longer or shorter by an error of the row and with noise, clipped to ±1."""
         parameters = self.by_name()
         scaled = action.clamp(-1.0, 1.0) * (1.0 + parameters["action_scale"])
         return self.simulator.step(noisy_command(scaled, parameters["action_noise"]))

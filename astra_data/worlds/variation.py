@@ -138,7 +138,7 @@ class CommandVariation(Variation):
     steering: ClassVar[tuple[str, ...]] = ("action_scale",)
 
     action_scale: Range = (0.0, 0.0)
-    """Relative error of commands: 0.1 makes them 10 % longer."""
+    """Relative error of commands: 0.1 makes them 10 % longer, up to their bounds, beyond which none is."""
     action_noise: NoiseRange = (0.0, 0.0)
     """Standard deviation of Gaussian noise on commands, which range over ±1."""
 

@@ -3,6 +3,7 @@ import pytest
 import torch
 from toy_walks import FPS, piece
 
+from astra_data.core.errors import BadInputError
 from astra_data.studies.errors import Trial, summary
 from astra_data.studies.predictors import Gains
 from astra_data.studies.sequences import Sequences, StepsConfig
@@ -30,6 +31,16 @@ def test_of_too_many_starts_an_even_share_of_all_pieces_is_taken(monkeypatch: py
     monkeypatch.setattr("astra_data.studies.errors.MOST_STARTS", 30)
     some = Trial.of(sequences, 4, (1,))
     assert len(some.piece) == 30 and np.bincount(some.piece).min() >= 9
+
+
+def test_horizons_that_no_recording_reaches_are_left_out() -> None:
+    """120 rows are 12 steps, of which 4 are the history."""
+    sequences = Sequences.of_pieces([piece(120, 0)], FPS, CONFIG)
+    trial = Trial.of(sequences, 4, (1, 3, 8, 9, 40))
+    assert trial.horizons == (1, 3, 8)
+    assert trial.squared_errors(Gains()).isfinite().any(0).all()
+    with pytest.raises(BadInputError, match="expected 20 control steps that count"):
+        Trial.of(sequences, 4, (20, 40))
 
 
 def test_summaries_weigh_starts_and_compare_with_the_raw_simulator() -> None:

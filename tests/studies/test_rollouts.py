@@ -49,6 +49,12 @@ def test_a_late_robot_is_better_predicted_by_its_past() -> None:
     assert (ridge < 0.35 * gains).all()
 
 
+def test_a_ridge_of_too_little_to_choose_from_is_fitted_all_the_same() -> None:
+    """Of one start in the last quarter nothing can be compared; no warning says so."""
+    short = Sequences.of_pieces([piece(120, 0)], FPS, CONFIG)
+    assert torch.isfinite(TEST.squared_errors(fit("ridge", short, 4, QUICK, 0, silent))[:, 0]).any()
+
+
 @pytest.mark.parametrize("name", ["mlp", "nas", "astra"])
 def test_networks_learn_that_the_robot_is_late(name: str) -> None:
     # Unfitted, they are the raw simulator, which is worse than it with gains.

@@ -130,6 +130,8 @@ class AntMazeEnv:
         after = self.position
         self.failed = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
         success = self.objective.reached(after, self.goal)
+        if self.objective.ends_at_walls:
+            self.failed |= self.wall_contact & ~success
         return Step(
             observation=self._observe(),
             reward=self.objective.reward(before, after, self.goal, self.failed),

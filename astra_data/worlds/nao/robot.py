@@ -157,6 +157,10 @@ class BatchedNao:
         self._steps += 1
         self.gait = targets.reached(self.bodies.step(rows, targets, noise))
 
+    def reseed(self, seed: int) -> None:
+        """Restart the noise of the sensors at `seed`."""
+        self._seed, self._steps = seed, 0
+
     def _kicking_feet(self, kick: Bools | None) -> Bools | None:
         if kick is None or not self.has_ball:
             return None
@@ -221,13 +225,14 @@ class BatchedNao:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of what `load_state_dict` needs to continue exactly from here."""
-        return {name: value.copy() for name, value in self._arrays().items()} | {"steps": self._steps}
+        noise = {"seed": self._seed, "steps": self._steps}
+        return {name: value.copy() for name, value in self._arrays().items()} | noise
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state` of robots that were built with the same arguments."""
         for name, value in self._arrays().items():
             value[:] = state[name]
-        self._steps = int(state["steps"])
+        self._seed, self._steps = int(state["seed"]), int(state["steps"])
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays that change from step to step, by name."""

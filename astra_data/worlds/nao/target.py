@@ -132,8 +132,9 @@ class NaoEnv:
         return torch.from_numpy(self.robots.touching.copy())
 
     def reseed(self, seed: int) -> None:
-        """Restart the random numbers of starts, goals, headings, traits and errors at `seed`."""
+        """Restart the random numbers of starts, goals, headings, traits, errors and sensors at `seed`."""
         self._rng = np.random.default_rng(seed)
+        self.robots.reseed(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Set the robots in `mask` (B,), by default all, to new starts with random headings."""

@@ -138,7 +138,7 @@ class BallAgent(PlanarStates):
         rolled = torch.cat(roll(ball, direction * leaving, self.period_s, self._deceleration_m_s2), dim=-1)
         touched = self._rolls & lay & (speed > _NOTHING_M_S)
         needed, evidence = self.memory.split(1, dim=-1)
-        evidence = _FADES * evidence + touched * speed / (leaving - slowed_m_s)
+        evidence = _FADES * evidence + touched * speed / (leaving - slowed_m_s).clamp_min(_NOTHING_M_S)
         rolls = torch.where(lay, touched & (evidence > needed), self._rolls & (speed > _LIES_M_S))
         undecided = self._undecided(self.num_envs)
         self.memory = torch.where(rolls, undecided, torch.cat([needed, evidence], dim=-1))

@@ -54,7 +54,8 @@ class FreeSpace:
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Move points from `start` to `end`, both (B, 2) in m, stopping each axis at blocked cells.
 
-        A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
+        Only the cells where a move begins and ends are looked at; one that is stopped ends where its own
+        cell does. A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
 
         Returns:
             the points' new positions (B, 2), and which points were stopped (B,).

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -144,6 +146,24 @@ def test_success_ends_the_episode() -> None:
     step = env.step(torch.zeros(2, 2))
     assert step.success.tolist() == step.terminated.tolist() == [True, False]
     assert float(step.reward[0]) > 9.0
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_touching_a_wall_fails_where_that_is_asked(ends: bool) -> None:
+    """One stands at a wall, one in the open; who reaches the goal in the same step has not failed."""
+    env, touches, fails = placed([[-4.0, 5.45], [-4.0, 4.0]]), 0, 0
+    env.objective = replace(TASK, ends_at_walls=ends)
+    for _ in range(6):
+        step = env.step(torch.zeros(2, 2))
+        touches += int(env.wall_contact[0])
+        fails += int(env.failed[0])
+        assert not env.wall_contact[1] and not env.failed[1]
+        assert torch.equal(step.terminated, env.failed)
+    assert touches > 0 and fails == ends * touches
+    for _ in range(6):
+        env.goal[0] = env.position[0]
+        step = env.step(torch.zeros(2, 2))
+        assert step.success[0] and not env.failed[0]
 
 
 def test_zero_command_stands_still() -> None:

@@ -153,6 +153,31 @@ def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed() -> None:
         assert torch.equal(one.step(action).observation, fresh.step(action).observation)
 
 
+def test_reseeding_starts_all_that_is_random_anew() -> None:
+    """Also the noise of the gyroscope, in robots that were built with another seed and have walked."""
+    action = torch.tensor([[0.7, 0.2]] * 3)
+    seen = []
+    for seed in (1, 2):
+        made = TASKS["nao-navigation"].target(3, seed=seed, num_threads=1)
+        for _ in range(seed):
+            made.step(action)
+        for _ in range(2):
+            made.reseed(5)
+            made.reset()
+            seen.append(torch.stack([made.step(action).observation for _ in range(3)]))
+    assert all(torch.equal(seen[0], other) for other in seen[1:])
+
+
+def test_a_state_has_the_noise_that_comes_next() -> None:
+    one, action = env(), torch.tensor([[0.7, 0.2]] * 3)
+    one.step(action)
+    other = TASKS["nao-navigation"].target(3, seed=9, num_threads=1)
+    assert isinstance(other, NaoEnv)
+    other.reset()
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(one.step(action).observation, other.step(action).observation)
+
+
 def test_robots_can_be_stood_where_a_state_believes_them() -> None:
     one = env("nao-kick", 2)
     state = one.state.double().numpy()

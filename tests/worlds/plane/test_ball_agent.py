@@ -179,6 +179,17 @@ def test_a_correction_that_all_but_stops_a_ball_leaves_it_where_it_was() -> None
     assert settled[1, 6].item() == pytest.approx(0.16)
 
 
+def test_a_ball_that_a_correction_stops_can_roll_again() -> None:
+    simulator = one()
+    rolling = START.clone()
+    rolling[:, 6] = 0.3
+    simulator.reset_to(rolling)
+    simulator.step(STAY)
+    landed = torch.tensor([[0.1, 0.1, 0.2, 0.2, 0.5, 0.0, 0.0, 0.0]])
+    simulator.settle(rolling, landed)
+    assert simulator.memory.isfinite().all()
+
+
 @pytest.mark.parametrize("before_m_s", [0.0, 0.1])
 @pytest.mark.parametrize("friction", [1.0, 2.0])
 def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_speed(
