@@ -124,7 +124,7 @@ def test_what_is_no_number_is_not_the_policys_command() -> None:
 def test_states_without_an_abstraction_are_not_compared(tmp_path: Path) -> None:
     """A graph is only told wrong by states of which there is an angle."""
     task = replace(CART, abstraction=lambda state: torch.asin(state[..., :1]))
-    written = write_graphs(RunningPolicy(task, actor(2, 1)), tmp_path)
+    written = write_graphs(RunningPolicy(task, actor(2, 1, memory_size=4)), tmp_path)
     assert max(written.apart.values()) < 1e-4
     nowhere = replace(CART, abstraction=lambda state: torch.asin(2 + state[..., :1].square()))
     with pytest.raises(BadInputError, match=r"rail-cart: the policy gives no finite command for 100 random"):

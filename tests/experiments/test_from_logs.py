@@ -13,8 +13,10 @@ import torch
 
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import GOAL, REWARD
+from astra_data.dataset.edit import delete, subset
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.importing import import_dataset
+from astra_data.experiments.condition import can_be_made_again, condition
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.plan import plan
@@ -146,3 +148,24 @@ def test_other_data_of_the_same_name_are_labelled_anew(logs: Path, tmp_path: Pat
     made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
     assert labelled() == ("finished", "")
     assert len(Dataset.open(tmp_path / "runs/again/label/seed_0")) == 4
+    # Data that lack nothing are linked to.
+    whole = subset(Dataset.open(tmp_path / "runs/again/label/seed_0"), percent=100, out=tmp_path / "whole")
+    path = path.rename(tmp_path / "linked.toml")
+    path.write_text(path.read_text().replace('data = "logs"', 'data = "whole"'))
+    experiment = load_experiment(path, tmp_path / "runs")
+    (item,) = [
+        item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"
+    ]
+    item.call(progress=silent)
+    assert (experiment.folder / "label/seed_0").is_symlink()
+    assert condition(item, experiment).is_finished and not can_be_made_again(item.key, experiment)
+    # As where data is a name, of which there is a newer version.
+    older = shutil.copytree(whole, tmp_path / "older")
+    shutil.rmtree(whole)
+    delete(Dataset.open(older), Dataset.open(older).uids[:1].tolist(), out=whole)
+    assert condition(item, experiment).is_finished  # the link is to what is there now
+    link = experiment.folder / "label/seed_0"
+    link.unlink()
+    link.symlink_to(older)
+    assert condition(item, experiment).why.startswith("made from another dataset than cart-logs@")
+    assert can_be_made_again(item.key, experiment)
