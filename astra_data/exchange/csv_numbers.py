@@ -59,7 +59,8 @@ def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
         numbers: Floats = values.cast(pa.float64(), safe=False).to_numpy()
         return numbers
     if is_numbered and not values.null_count:
-        return np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
+        numbers = np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
+        return numbers
     return np.full(len(values), np.nan)
 
 

@@ -43,8 +43,10 @@ def episodes() -> PairedEpisodes:
 def model(given: PairedEpisodes) -> GroundingModel:
     torch.manual_seed(1)
     made = GroundingModel(GroundingShape(4, 2, 2, latent_size=6, head_sizes=(8,), position_octaves=0))
-    rewards = given.steps(given.windows.reward)
-    made.set_reward_scales(rewards, *map(given.steps, (given.windows.goes_on, given.windows.failed)))
+    windows = given.windows
+    made.set_reward_scales(
+        given.steps(windows.reward), given.steps(windows.goes_on), given.steps(windows.failed)
+    )
     with torch.no_grad():
         list(made.corrections.parameters())[-2].normal_(std=0.05)
     return made.requires_grad_(False)

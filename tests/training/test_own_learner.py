@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,26 +69,30 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
     assert success or [point["steps"] for point in points if point["success"] == 0.0] == [160, 320]
 
 
-def test_penalties_ramp_up_as_in_other_trainings(tmp_path: Path) -> None:
-    """Over the first half; while nobody arrives they do not grow."""
-    for settings, command, expected in (
+@pytest.mark.parametrize(
+    ("settings", "command", "expected"),
+    [
         ({"ramp": 0.5}, 1.0, [step / 50 for step in range(50)] + [1.0] * 50),
         ({"ramp": 0.5, "ramp_while": 0.5}, -1.0, [0.0] * 100),
         ({}, 1.0, [1.0] * 100),
-    ):
-        given, scales = training(tmp_path), list[float]()
-        config = PpoTrainConfig(num_envs=4, total_steps=400, **settings)
-        object.__setattr__(given, "config", config)
+    ],
+)
+def test_penalties_ramp_up_as_in_other_trainings(
+    tmp_path: Path, settings: dict[str, Any], command: float, expected: list[float]
+) -> None:
+    """Over the first half; while nobody arrives they do not grow."""
+    given, scales = training(tmp_path), list[float]()
+    object.__setattr__(given, "config", PpoTrainConfig(num_envs=4, total_steps=400, **settings))
 
-        def learn(env: WatchedEnv, training: Training, of: float = command) -> Constant:
-            env.reset()
-            for _ in range(100):
-                env.step(np.full((4, 1), of))
-                scales.append(env.env.env.penalty_scale)  # type: ignore[attr-defined] # noqa: B023
-            return Constant(of)
+    def learn(env: WatchedEnv, training: Training) -> Constant:
+        env.reset()
+        for _ in range(100):
+            env.step(np.full((4, 1), command))
+            scales.append(env.env.env.penalty_scale)  # type: ignore[attr-defined]
+        return Constant(command)
 
-        OwnLearner(learn=learn, policy=Constant)(given)
-        assert scales == pytest.approx(expected)
+    OwnLearner(learn=learn, policy=Constant)(given)
+    assert scales == pytest.approx(expected)
 
 
 def test_a_curve_that_stops_between_two_points_ends_with_its_last_step(tmp_path: Path) -> None:

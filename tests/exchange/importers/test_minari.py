@@ -69,10 +69,10 @@ fields = ["infos/qpos", "infos/cost"]
 fields = ["next_infos/qpos", "infos/cost"]
 """
     dataset, _ = imported(tmp_path, path, mapping)
-    for episode, length in zip(dataset.episodes(), LENGTHS, strict=True):
+    for got, length in zip(dataset.episodes(), LENGTHS, strict=True):
         steps = np.arange(length, dtype=np.float32)
-        np.testing.assert_array_equal(episode.columns[STATE], np.stack([steps, -steps], axis=1))
-        np.testing.assert_array_equal(episode.columns[NEXT_STATE], np.stack([steps + 1, -steps], axis=1))
+        np.testing.assert_array_equal(got.columns[STATE], np.stack([steps, -steps], axis=1))
+        np.testing.assert_array_equal(got.columns[NEXT_STATE], np.stack([steps + 1, -steps], axis=1))
 
 
 def test_fields_that_are_missing_are_told(tmp_path: Path) -> None:

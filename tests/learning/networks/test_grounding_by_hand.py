@@ -52,7 +52,8 @@ def model(heads: int = 1, target: TargetKind = "ema", dropout: float = 0.0) -> G
         "correction": 0.5 * (given.next_state - given.simulated_next),
     }
     made.set_scales({name: values.flatten(0, 1) for name, values in columns.items()})
-    made.set_reward_scales(*(one[given.mask.bool()] for one in (given.reward, given.goes_on, given.failed)))
+    real = given.mask.bool()
+    made.set_reward_scales(given.reward[real], given.goes_on[real], given.failed[real])
     with torch.no_grad():
         for head in made.corrections:
             list(head.parameters())[-2].normal_(std=0.2)
@@ -216,7 +217,7 @@ def test_what_a_success_pays_counts_nowhere() -> None:
         given = windows()
         given.goes_on[2, -1], given.reward[2, -1, 0] = 0.0, paid
         used, real_steps = model(), given.mask.bool()
-        used.set_reward_scales(*(one[real_steps] for one in (given.reward, given.goes_on, given.failed)))
+        used.set_reward_scales(given.reward[real_steps], given.goes_on[real_steps], given.failed[real_steps])
         found.append((used.reward_mean, used.reward_std, used.losses(given, LossWeights())[0]))
     assert all(map(torch.equal, *found))
 
