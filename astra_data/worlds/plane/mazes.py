@@ -55,7 +55,7 @@ class Maze:
         per_cell = self.scale / self.fine_m if self.fine_m > 0 else 0.0
         if self.scale <= 0 or round(per_cell) < 2 or abs(per_cell - round(per_cell)) > 1e-6:
             faults.append(
-                f"fine_m: expected a half of the scale, {self.scale} m, or a smaller part, got {self.fine_m} m"
+                f"fine_m: expected a half of the scale, {self.scale} m, or a smaller part, got {self.fine_m}"
             )
         if faults:
             raise BadInputError(f"maze: {'; '.join(faults)}")

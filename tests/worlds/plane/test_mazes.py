@@ -98,7 +98,7 @@ def test_a_margin_keeps_paths_away_from_corners() -> None:
         ({"rows": ("111", "1x1", "111")}, "rows: expected 1 for a wall and 0 for free space"),
         ({"start": (0, 1)}, r"start: expected \(row, column\) of a free cell, got \(0, 1\)"),
         ({"goal": (1, 9)}, r"goal: expected \(row, column\) of a free cell, got \(1, 9\)"),
-        ({"fine_m": 0.3}, "fine_m: expected a half of the scale, 4.0 m, or a smaller part, got 0.3 m"),
+        ({"fine_m": 0.3}, "fine_m: expected a half of the scale, 4.0 m, or a smaller part, got 0.3"),
         ({"fine_m": 8.0}, "fine_m: expected a half of the scale"),
         ({"fine_m": 4.0}, "fine_m: expected a half of the scale"),
         ({"fine_m": 0.0}, "fine_m: expected a half of the scale"),
