@@ -37,6 +37,7 @@ def toy_episodes(
         next_state=next_state,
         reward=none if parts is None else parts,
         goes_on=1.0 - ended.float(),
+        failed=nothing if parts is None else (parts[..., 1] != 0).float(),
         topples_soon=nothing,
         mask=torch.ones_like(nothing) if mask is None else mask,
     )
@@ -52,4 +53,4 @@ def toy_episodes(
 
 def no_episodes() -> PairedEpisodes:
     empty = torch.zeros(1, 1)
-    return PairedEpisodes(empty, empty, empty.bool(), PairedWindows(*[empty] * 10), "toy@data-1.0.0", "abc")
+    return PairedEpisodes(empty, empty, empty.bool(), PairedWindows(*[empty] * 11), "toy@data-1.0.0", "abc")

@@ -105,7 +105,7 @@ def _put(partial: Path, out: Path, old: Path) -> None:
 def _begin(partial: Path, config: str) -> None:
     """Write the settings to `partial`, unless it was begun with them."""
     settings = partial / _SETTINGS
-    if not any(partial.iterdir()):
+    if {path.name for path in partial.iterdir()} <= {_SETTINGS}:
         write_file(settings, config)
     elif not (settings.exists() and settings.read_text() == config):
         raise BadInputError(

@@ -2,10 +2,12 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 
@@ -58,6 +60,12 @@ def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
     if any(kind(values.type) for kind in kinds):
         numbers: Floats = values.cast(pa.float64(), safe=False).to_numpy()
         return numbers
+    if pa.types.is_string(values.type):
+        with suppress(pa.ArrowInvalid):
+            trimmed = pc.utf8_trim_whitespace(values)
+            given = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
+            numbers = given.cast(pa.float64()).to_numpy()
+            return numbers
     if is_numbered and not values.null_count:
         numbers = np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
         return numbers
@@ -71,5 +79,6 @@ def plain_name(name: str) -> str:
 
 def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
     """Return the row and the text of the first of `values` that is no number, if nearly all others are."""
-    wrong = [(row, value) for row, value in enumerate(values) if value and not _NUMBER.fullmatch(value)]
+    texts = [(row, value) for row, value in enumerate(values) if value and value.strip()]
+    wrong = [(row, value) for row, value in texts if not _NUMBER.fullmatch(value)]
     return wrong[0] if wrong and len(wrong) < (1 - MOSTLY) * len(values) else None

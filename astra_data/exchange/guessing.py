@@ -129,10 +129,13 @@ def guess(paths: Sequence[Path]) -> Logs:
     """
     files = [file for path in paths for file in csv_files(path)]
     tables = {file: read_numbers(file, _EPISODE) for file in files}
-    header = list(next(iter(tables.values())))
+    first = next(iter(tables.values()))
+    header = [name for name in first if all(name in table for table in tables.values())]
     for file, table in tables.items():
-        if table.keys() != set(header):
-            raise BadInputError(f"{file}: expected the fields of {files[0]}, {header}: got {list(table)}")
+        if {*_filled(table), *_filled(first)} - (table.keys() & first.keys()):
+            raise BadInputError(
+                f"{file}: expected the fields of {files[0]}, {_filled(first)}: got {_filled(table)}"
+            )
     joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
     try:
         fields = _distinct([_field(name, values) for name, values in joined.items()])
@@ -153,6 +156,11 @@ def guess(paths: Sequence[Path]) -> Logs:
                 f"{files[0]}: found no {role} among {listed}: name one in the header, such as {example}"
             )
     return found
+
+
+def _filled(table: dict[str, Floats]) -> list[str]:
+    """Return the fields that hold numbers."""
+    return [name for name, values in table.items() if np.isfinite(values).any()]
 
 
 def _distinct(fields: list[Field]) -> tuple[Field, ...]:

@@ -5,7 +5,7 @@ it was made from something else than what lies there now, or with other settings
 manifests: what it finished counts as finished, if its result is there.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Literal
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError
 from astra_data.core.manifest import read_manifest
+from astra_data.dataset.lineage import Ancestor, lineage
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
@@ -173,8 +174,15 @@ def _other_data(labelled: Path, data: str | None) -> str:
     with suppress(AstraDataError):
         named, made = open_dataset(data), read_description(labelled)
         known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
-        return "" if named.content_hash in known else named.reference
+        # What was made of it since, and has its name, is no other.
+        return "" if known & set(_hashes(lineage(named))) else named.reference
     return ""
+
+
+def _hashes(ancestor: Ancestor) -> Iterator[str]:
+    yield ancestor.content_hash
+    for parent in ancestor.parents:
+        yield from _hashes(parent)
 
 
 def _digest(key: str, experiment: Experiment) -> str | None:

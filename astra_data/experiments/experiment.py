@@ -130,7 +130,12 @@ class Experiment:
         """What changed since the artefacts were made, and the folders made with the old."""
         if not (self.folder / RECORD).is_file():
             return "", []
-        changed = _differences(recorded_settings(self.folder), self.recipe)
+        recorded = recorded_settings(self.folder)
+        for key in ("task", "data"):
+            now = getattr(self.recipe, key)
+            if _is_same_place(recorded.get(key), now):
+                recorded[key] = now
+        changed = _differences(recorded, self.recipe)
         code = changed_code(self.recipe, self.folder)
         whole = _stale_stages((changed - _ROWS_TABLES) | ({"task"} & code.keys()))
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
@@ -243,16 +248,15 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
     elsewhere = {"methods", "own_methods", "seeds", "based_on"}
     changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}
-    changed -= {key for key in ("task", "data") if _is_same_place(before.get(key), now.get(key))}
     if "task" in changed and _share_target(str(before.get("task")), recipe.task):
         return changed - {"task"} | {_SIMULATOR}
     return changed - {"plus"} if "train" in changed else changed  # which "plus" takes over
 
 
 def _is_same_place(before: object, now: object) -> bool:
-    """Return whether two names of a file or folder of the user's are of one, told from different folders.
+    """Return whether two names of a file or folder of the user's, told from different folders, may be of one.
 
-    Whether it holds the same is compared by digests: of code in code.json, of data as of other artefacts.
+    Whether it holds what it held then is told by digests: of code in code.json, of data as of artefacts.
     """
     file, is_code, _ = str(now).partition(".py:")
     there = Path(f"{file}.py").is_file() if is_code else Path(file).is_dir()

@@ -16,6 +16,9 @@ def folds(fails: Tensor, recordings: Tensor | None = None) -> list[Tensor]:
     if recordings is None:
         recordings = torch.arange(len(fails), device=fails.device)
     known, recording = recordings.unique(return_inverse=True)
+    # Numbered as they come, so that without copies each episode is drawn for in turn.
+    first = torch.stack([(recording == number).nonzero()[0, 0] for number in range(len(known))])
+    recording = first.argsort().argsort()[recording]
     failing = torch.bincount(recording[fails], minlength=len(known)) > 0
     count = min(_MOST_FOLDS, int(failing.sum()))
     if count < 2:

@@ -231,15 +231,15 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     own = objective.reward(before, after, goal, torch.zeros_like(decided))
     going_on, failing = windows.reward.unbind(-1)
     own, decided = own.reshape(going_on.shape), decided.reshape(going_on.shape)
-    goes_on = windows.goes_on * ~decided
+    goes_on, failed = windows.goes_on * ~decided, windows.failed * ~decided
     residual = torch.stack(
         [
             torch.where(goes_on.bool(), going_on - own, 0.0),
-            torch.where(~decided & (failing != 0), failing - own, 0.0),
+            torch.where(failed.bool(), failing - own, 0.0),
         ],
         dim=-1,
     )
-    return replace(episodes, windows=replace(windows, reward=residual, goes_on=goes_on))
+    return replace(episodes, windows=replace(windows, reward=residual, goes_on=goes_on, failed=failed))
 
 
 def _optimise(

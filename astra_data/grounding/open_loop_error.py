@@ -57,7 +57,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
                 if not apart[~beyond].isfinite().all():
                     raise BadInputError(
                         f"the {name} simulator of {task.name} diverges: its states are not finite in step "
-                        f"{step + 1} of recorded commands"
+                        f"{step + 1} of recorded commands: bound them in its `step`"
                     )
                 apart[beyond] = torch.nan
                 errors[name][step + 1] = apart

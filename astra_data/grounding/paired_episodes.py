@@ -126,6 +126,7 @@ class PairedEpisodes:
                 next_state=padded[ABSTRACT_NEXT_STATE],
                 reward=torch.stack([reward * ~terminated, reward * failed], dim=-1),
                 goes_on=(mask & ~terminated).float(),
+                failed=failed.float(),
                 topples_soon=before_failures(failed.any(1), mask, RISK_STEPS),
                 mask=mask.float(),
             ),

@@ -21,7 +21,7 @@ from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.policy_file import add_policy_kind
-from astra_data.worlds.own_code import own_object, place_beside
+from astra_data.worlds.own_code import own_object
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -65,7 +65,8 @@ def add_method(name: str, place: str) -> None:
     Raises:
         BadInputError: the name is taken or cannot be that of a folder; or what is there is no method.
     """
-    found = place_beside(place, Path.cwd())
+    file, is_file, attribute = place.partition(".py:")
+    found = f"{Path(f'{file}.py').resolve()}:{attribute}" if is_file else place
     if (known := _PLACES.get(name)) == found:
         return
     if known is not None:

@@ -185,6 +185,11 @@ def check_fits(source: Dataset, task: Task) -> None:
         else:
             recorded = Column.from_feature(expected.name, source.features[expected.name])
             faults += _contradictions(recorded, expected)
+    goal_size = task.goal.size if task.goal else 0
+    if GOAL in source.features and (found := source.features[GOAL]["shape"][0]) != goal_size:
+        faults.append(
+            f"{GOAL} has {found} values, goals of {task.name} have {goal_size}: import it without that column"
+        )
     if NEXT_STATE not in source.features:
         faults.append(f"has no column {NEXT_STATE}")
     if faults:

@@ -123,8 +123,7 @@ def _of_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
     try:
-        with explained(f"importing {path}"):
-            _make_way(path.resolve())
+        with explained(f"importing {path}"), _among_neighbours(path.resolve()):
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
@@ -132,23 +131,32 @@ def _of_file(path: Path) -> ModuleType:
     return module
 
 
-def _make_way(path: Path) -> None:
-    """Let a file import those beside it, as a script may, whatever files of their names were imported before.
+@contextmanager
+def _among_neighbours(path: Path) -> Iterator[None]:
+    """Let a file import those beside it, whatever files of their names other files of the user's imported.
 
-    Installed packages come first.
+    Installed packages come first. What the others imported is theirs again afterwards.
     """
-    folder, loaded = path.parent, dict(sys.modules)
-    known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)}
+    folder, loaded, places = path.parent, dict(sys.modules), [*sys.path]
+    known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)} - {folder}
+    theirs = {}
     with suppress(BadInputError):  # what is no Python is told where it is run
         for file, _ in _with_neighbours(path):
-            if file.stem in loaded and _folder_of(loaded[file.stem]) in known - {folder}:
-                del sys.modules[file.stem]
-    if f"{folder}" not in sys.path or folder in known:
-        places = [place for place in sys.path if place != f"{folder}"]
-        behind = len(places)
-        while behind and Path(places[behind - 1]) in known:
-            behind -= 1
-        sys.path[:] = [*places[:behind], f"{folder}", *places[behind:]]
+            if file.stem in loaded and _folder_of(loaded[file.stem]) in known:
+                theirs[file.stem] = sys.modules.pop(file.stem)
+    behind = len(places)
+    while behind and Path(places[behind - 1]) in known:
+        behind -= 1
+    sys.path.insert(behind, f"{folder}")
+    try:
+        yield
+    finally:
+        sys.modules.update(theirs)
+        sys.path.reverse()
+        sys.path.remove(f"{folder}")  # the last, which is ours
+        sys.path.reverse()
+        if f"{folder}" not in sys.path:
+            sys.path.append(f"{folder}")  # what is imported later, too
 
 
 def _folder_of(module: ModuleType) -> Path | None:

@@ -63,6 +63,14 @@ def test_a_failure_before_anything_is_made_leaves_nothing(
     assert [path.name for path in tmp_path.rglob("*")] == ["train"]
 
 
+def test_what_was_only_begun_with_other_settings_is_begun_anew(tmp_path: Path) -> None:
+    (tmp_path / ".out.partial").mkdir()
+    (tmp_path / ".out.partial/config.json").write_text("1")
+    with finished_folder(tmp_path / "out", config="2"):
+        pass
+    assert (tmp_path / "out/config.json").read_text() == "2"
+
+
 @pytest.mark.parametrize("replace", [False, True])
 def test_what_another_is_making_is_left_to_it(tmp_path: Path, replace: bool) -> None:
     out = tmp_path / "out"

@@ -243,6 +243,25 @@ def test_texts_and_dates_are_left_out_with_the_reason(tmp_path: Path) -> None:
     ]
 
 
+def test_a_field_that_one_log_alone_has_is_left_out_if_it_holds_no_numbers(tmp_path: Path) -> None:
+    for name, more in (("a.csv", ",note"), ("b.csv", "")):
+        rows = "".join(f"{row},{row}{more}\n" for row in range(6))
+        (tmp_path / name).write_text(f"x,cmd_x{more}\n{rows}")
+    assert [field.name for field in guess([tmp_path]).fields] == ["x", "cmd_x"]
+    (tmp_path / "c.csv").write_text("x,cmd_x,y\n" + "".join(f"{row},{row},{row}\n" for row in range(6)))
+    with pytest.raises(BadInputError, match=r"c.csv: expected the fields of .*\['x', 'cmd_x'\]: got \['x', "):
+        guess([tmp_path])
+
+
+def test_blanks_are_no_numbers_as_in_an_import(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("x,cmd_x\n" + "".join(f"{' ' if row == 7 else row}, {row} \n" for row in range(40)))
+    logs = guess([log])
+    assert logs.left_out == {"x": 1}
+    (commands,) = logs.values(logs.of("command"))
+    assert commands[:, 0].tolist() == [row for row in range(40) if row != 7]
+
+
 def test_texts_tell_episodes_apart(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("run,x,cmd_x\n" + "".join(f"{'b' if row < 8 else 'a'},{row},{row}\n" for row in range(20)))

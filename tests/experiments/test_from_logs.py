@@ -24,6 +24,7 @@ from astra_data.experiments.points import Selection
 from astra_data.experiments.run import check, set_aside
 from astra_data.experiments.trained_policy import load_policy
 from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
+from astra_data.stages.label import label
 
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
 SMALL = """
@@ -159,13 +160,16 @@ def test_other_data_of_the_same_name_are_labelled_anew(logs: Path, tmp_path: Pat
     item.call(progress=silent)
     assert (experiment.folder / "label/seed_0").is_symlink()
     assert condition(item, experiment).is_finished and not can_be_made_again(item.key, experiment)
-    # As where data is a name, of which there is a newer version.
+    # What was made of it since is no other; what was made of another is.
+    link = experiment.folder / "label/seed_0"
     older = shutil.copytree(whole, tmp_path / "older")
     shutil.rmtree(whole)
     delete(Dataset.open(older), Dataset.open(older).uids[:1].tolist(), out=whole)
-    assert condition(item, experiment).is_finished  # the link is to what is there now
-    link = experiment.folder / "label/seed_0"
     link.unlink()
     link.symlink_to(older)
+    assert condition(item, experiment).is_finished
+    import_dataset(drives[4:], CART / "logs.toml", out=tmp_path / "others")
+    link.unlink()
+    link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labelled"))
     assert condition(item, experiment).why.startswith("made from another dataset than cart-logs@")
     assert can_be_made_again(item.key, experiment)

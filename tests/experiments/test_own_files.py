@@ -124,6 +124,14 @@ def test_a_recipe_is_the_same_from_every_folder(made: Path, monkeypatch: pytest.
         load(made).check_unchanged()
 
 
+def test_another_file_of_the_same_name_is_no_base(made: Path) -> None:
+    (made / "two").mkdir()
+    shutil.copy(made / "rail.py", made / "two/rail.py")
+    (made / "other.toml").write_text('based_on = "rail"\ntask = "two/rail.py:TASK"\n')
+    with pytest.raises(RecipeError, match=r"task: expected that of rail, .*rail\.py:TASK', or one with"):
+        load_experiment(made / "other.toml", made / "runs")
+
+
 def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
     (load(made).folder / CODE).unlink()

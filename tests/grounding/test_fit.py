@@ -42,6 +42,7 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     torch.testing.assert_close(residual.reward[0, :, 0], torch.tensor([3.0 - ahead, 0.0, 0.0, 0.0, 0.0]))
     torch.testing.assert_close(residual.reward[0, :, 1], torch.tensor([0.0, 0.0, -9.0 - ahead, 0.0, 0.0]))
     assert residual.goes_on[0, :4].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert residual.failed[0].tolist() == [0.0, 0.0, 1.0, 0.0, 0.0]
 
 
 def test_balls_that_leave_the_field_are_no_failures_to_foresee() -> None:
@@ -62,7 +63,7 @@ def test_balls_that_leave_the_field_are_no_failures_to_foresee() -> None:
     )
     residual = residual_rewards(task, given).windows
     assert residual.reward[0, :, 1].tolist() == pytest.approx([0.0, -9.9])
-    assert residual.goes_on.sum() == 0
+    assert residual.goes_on.sum() == 0 and residual.failed.tolist() == [[0.0, 1.0]]
 
 
 def episodes(seed: int, count: int = 4) -> PairedEpisodes:

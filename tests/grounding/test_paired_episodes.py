@@ -136,6 +136,7 @@ def test_rewards_of_steps_that_end_the_task_badly_stand_apart(episodes: PairedEp
         assert shown[-1] == (0.0 if episode == 2 else expected[-1])
         goes_on = [1.0] * (length - 1) + [0.0 if episode in (2, 3) else 1.0]
         assert episodes.windows.goes_on[episode].tolist() == goes_on + [0.0] * (30 - length)
+    assert episodes.windows.failed.nonzero().tolist() == [[3, 29]]
 
 
 def test_only_the_last_second_before_a_bad_end_topples_soon(episodes: PairedEpisodes) -> None:

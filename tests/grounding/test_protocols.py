@@ -59,6 +59,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
         next_state=torch.stack(states[1:], dim=1),
         reward=torch.zeros(COUNT, STEPS, 2),
         goes_on=torch.ones_like(nothing),
+        failed=nothing,
         topples_soon=nothing,
         mask=torch.ones(COUNT, STEPS),
     )

@@ -73,7 +73,7 @@ def test_files_of_one_name_are_two(tmp_path: Path) -> None:
     assert [own_object(f"{tmp_path}/{folder}/mine.py:VALUE") for folder in "ab"] == [1, 2]
 
 
-def test_each_file_imports_those_beside_it(tmp_path: Path) -> None:
+def test_each_file_imports_those_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where another file of that name was imported."""
     for folder, value in (("a", 1), ("b", 2)):
         (tmp_path / folder).mkdir()
@@ -82,7 +82,13 @@ def test_each_file_imports_those_beside_it(tmp_path: Path) -> None:
         (tmp_path / folder / "own_facts.py").write_text(f"VALUE = {value}")
     assert [own_object(f"{tmp_path}/{folder}/mine.py:TOLD") for folder in "ab"] == [1, 2]
     (tmp_path / "a" / "again.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
+    first = [f"{tmp_path}/b", *sys.path]  # as the folder of a script is
+    monkeypatch.setattr(sys, "path", [*first])
     assert own_object(f"{tmp_path}/a/again.py:TOLD") == 1
+    (tmp_path / "b" / "again.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
+    assert own_object(f"{tmp_path}/b/again.py:TOLD") == 2
+    assert sys.path == first
+    assert sys.modules["own_facts"].VALUE == 1  # what was imported first stays so for all else
 
 
 def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:

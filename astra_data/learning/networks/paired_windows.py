@@ -21,6 +21,7 @@ class PairedWindows:
         reward: r_i, or the residual reward, in two parts, (B, T, 2): of steps that go on, and of steps that
             end in failure; 0 in the other. Reaching the goal is detected and rewarded by the simulator.
         goes_on: (B, T), 1 where the step ends nothing: only there the first part of the reward is known.
+        failed: (B, T), 1 where the step ends in a failure that R_pred is to foresee, whatever it pays.
         mask: (B, T), 1 on real steps.
     """
 
@@ -32,14 +33,9 @@ class PairedWindows:
     next_state: Tensor
     reward: Tensor
     goes_on: Tensor
+    failed: Tensor
     topples_soon: Tensor
     mask: Tensor
-
-    @property
-    def failed(self) -> Tensor:
-        """(B, T), 1 where the step ends in failure, also where that pays nothing."""
-        ends = self.topples_soon.bool() & ~self.goes_on.bool()
-        return (ends | (self.reward[..., 1] != 0)).float()
 
 
 def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:

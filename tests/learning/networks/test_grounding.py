@@ -33,6 +33,7 @@ def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
         next_state=state[:, 1:],
         reward=torch.stack([state[:, 1:].norm(dim=-1), torch.zeros(episodes, steps)], dim=-1),
         goes_on=torch.ones(episodes, steps),
+        failed=torch.zeros(episodes, steps),
         topples_soon=torch.zeros(episodes, steps),
         mask=torch.ones(episodes, steps),
     )
@@ -174,7 +175,7 @@ def test_failing_is_predicted_as_often_as_it_happens_and_never_pays(paid: float,
     falls = (TRAINING.action[..., 0] > 0) & (torch.rand(TRAINING.mask.shape) < 0.1)
     going_on = (paid - cost) * ~falls
     reward = torch.stack([going_on, paid * falls], dim=-1)
-    windows = replace(TRAINING, reward=reward, goes_on=(~falls).float())
+    windows = replace(TRAINING, reward=reward, goes_on=(~falls).float(), failed=falls.float())
     model = untrained()
     set_reward_scales(model, windows)
     with torch.no_grad():
@@ -200,7 +201,7 @@ def failing(share: float) -> PairedWindows:
     torch.manual_seed(0)
     fails = -10.0 * (torch.rand(TRAINING.mask.shape) < share)
     reward = torch.stack([torch.zeros_like(fails), fails], dim=-1)
-    return replace(TRAINING, reward=reward, goes_on=(fails == 0).float())
+    return replace(TRAINING, reward=reward, goes_on=(fails == 0).float(), failed=(fails != 0).float())
 
 
 def test_failures_count_as_much_as_they_are_told_to() -> None:

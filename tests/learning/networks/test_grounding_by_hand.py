@@ -34,6 +34,7 @@ def windows() -> PairedWindows:
         next_state=draw(4),
         reward=torch.stack([draw() * (failing == 0), failing], dim=-1),
         goes_on=(failing == 0).float(),
+        failed=(failing != 0).float(),
         topples_soon=(draw() > 0).float(),
         mask=mask,
     )
@@ -184,16 +185,13 @@ def test_each_head_learns_from_its_own_half_of_the_windows() -> None:
 def test_failures_that_pay_nothing_are_failures() -> None:
     """As where every step pays 1 but that of the fall."""
     given = windows()
-    given.reward[:], given.topples_soon[:], given.goes_on[:] = torch.tensor([1.0, 0.0]), 0.0, given.mask
-    given.goes_on[2, -1], given.reward[2, -1] = 0.0, 0.0
-    assert not given.failed.any()  # the goal was reached
-    given.topples_soon[2, -3:] = 1.0
-    assert given.failed.nonzero().tolist() == [[2, 6]]
+    given.reward[:], given.failed[:], given.goes_on[:] = torch.tensor([1.0, 0.0]), 0.0, given.mask
+    given.goes_on[2, -1], given.failed[2, -1], given.reward[2, -1] = 0.0, 1.0, 0.0
     used, real = model(), given.mask.bool()
     used.set_reward_scales(given.reward[real], given.goes_on[real], given.failed[real])
     assert (float(used.reward_mean), float(used.failure_cost)) == (1.0, -1.0)
     known = used.losses(given, LossWeights())[1]["reward"]
-    given.topples_soon[:] = 0.0
+    given.failed[:] = 0.0
     assert not torch.equal(known, used.losses(given, LossWeights())[1]["reward"])
 
 
