@@ -176,6 +176,13 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
             else field
             for field in fields
         ]
+    ends = set[Role]()
+    for number, field in enumerate(fields):
+        if field.role in ("failure", "success", "reward"):
+            if field.role in ends:
+                why = f"a second {field.role}: make one field of both"
+                fields[number] = replace(field, role="left out", why=why)
+            ends.add(field.role)
     seen: dict[str, str] = {}
     for field in fields:
         if field.role not in ("state", "command"):

@@ -1,11 +1,13 @@
 """A folder for a robot of one's own: a task, a recipe, a mapping of its logs, a test and a page."""
 
+import importlib.util
 import json
 import keyword
 import math
 import re
 import shlex
 import sys
+import sysconfig
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +19,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, TERMINATED
 from astra_data.exchange.guessing import Logs, Role, guess
-from astra_data.experiments.robot_kinds import Direct, Planar, texts
+from astra_data.experiments.robot_kinds import Direct, Planar, significant, texts
 
 _COLUMNS: dict[Role, str] = {
     "state": STATE,
@@ -43,7 +45,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
-    if name in _TAKEN or keyword.iskeyword(name):
+    if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
         raise BadInputError(f"'{name}': expected a name that nothing else in Python has, such as my_{name}")
     with atomic_folder(out) as folder:
         places = [path.resolve() for path in logs]
@@ -62,28 +64,36 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
             "README.md": "README.md",
         }.items():
             text = (files("astra_data.experiments") / f"robot_files/{template}.template").read_text()
-            (folder / written).write_text(Template(text).substitute(values))
+            (folder / written).write_text(Template(text).substitute(values), encoding="utf-8")
     return kind
+
+
+def _is_installed(name: str) -> bool:
+    spec = importlib.util.find_spec(name)
+    places = [Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib")]
+    return bool(spec and spec.origin and any(Path(spec.origin).is_relative_to(place) for place in places))
 
 
 def _common(name: str, logs: Logs) -> dict[str, str]:
     """Return what the templates of every kind name."""
     states, commands = logs.of("state"), logs.of("command")
     given = np.concatenate(logs.values(commands))
-    lows, highs = np.floor(given.min(axis=0) * 1e3) / 1e3, np.ceil(given.max(axis=0) * 1e3) / 1e3
+    lows, highs = given.min(axis=0), given.max(axis=0)
+    unit = 10.0 ** np.floor(np.log10(highs - lows)) / 1e3  # a thousandth or less of the range, outwards
+    lows, highs = np.floor(lows / unit) * unit, np.ceil(highs / unit) * unit
     bounds = {
-        field.short: (float(low), float(high)) for field, low, high in zip(commands, lows, highs, strict=True)
+        field.short: (significant(low), significant(high))
+        for field, low, high in zip(commands, lows, highs, strict=True)
     }
     horizon = max(len(values) for values in logs.values(states))
-    time = [
-        f"time = {json.dumps(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")[:1]
-    ]
-    split = [f"field = {json.dumps(field.name)}\n" for field in logs.of("episode")[:1]]
+    time = [f"time = {_toml(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")[:1]]
+    split = [f"field = {_toml(field.name)}\n" for field in logs.of("episode")[:1]]
     if time:
         split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
     lines = ["| field | taken for | unit | factor | why |", "|---|---|---|---|---|"]
     for field in logs.fields:
-        taken = f"`{field.name}` | {field.taken_for} | {field.unit} | {field.scale:.4g}"
+        called = field.name.replace("|", r"\|")
+        taken = f"`{called}` | {field.taken_for} | {field.unit} | {field.scale:.4g}"
         lines.append(f"| {taken} | {field.why} |")
     return {
         "name": name,
@@ -102,7 +112,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         "command_size": str(len(commands)),
         "command_names": texts(field.short for field in commands),
         "command_units": texts(field.unit for field in commands),
-        "row": json.dumps([round(float(value), 4) for value in logs.values(states)[0][0]]),
+        "row": json.dumps([significant(value) for value in logs.values(states)[0][0]]),
         "bounds": repr(bounds).replace("'", '"'),
         "horizon": str(horizon),
         "guesses": "\n".join(lines),
@@ -115,14 +125,19 @@ def _column(role: Role, logs: Logs) -> str:
     lines = [f'[columns."{column}"]']
     if role in ("state", "command"):
         lines += [
-            f"fields = {json.dumps([field.name for field in fields])}",
-            f"names = {json.dumps([field.short for field in fields])}",
-            f"unit = {json.dumps([field.unit for field in fields])}",
-            f"scale = {json.dumps([field.scale for field in fields])}",
+            f"fields = {_toml([field.name for field in fields])}",
+            f"names = {_toml([field.short for field in fields])}",
+            f"unit = {_toml([field.unit for field in fields])}",
+            f"scale = {_toml([field.scale for field in fields])}",
         ]
     else:
-        lines.append(f"fields = {json.dumps([fields[0].name])}")
+        lines.append(f"fields = {_toml([fields[0].name])}")
     return "\n".join(lines) + "\n"
+
+
+def _toml(value: str | Sequence[str] | Sequence[float]) -> str:
+    """Return a text, or a list, as TOML."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _drive(folder: Path, drives: int = 60, steps: int = 150) -> None:

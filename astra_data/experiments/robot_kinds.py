@@ -205,12 +205,17 @@ def _typical(episodes: list[Floats]) -> tuple[Floats, float]:
 
 def _numbers(values: Iterable[float] | Floats, brackets: str = "[]") -> str:
     """Return a list, or a tuple, as code."""
-    inside = [repr(round(float(value), 4) + 0.0) for value in values]
+    inside = [repr(significant(value)) for value in values]
     comma = "," if brackets == "()" and len(inside) == 1 else ""
     return f"{brackets[0]}{', '.join(inside)}{comma}{brackets[1]}"
 
 
+def significant(value: float) -> float:
+    """Return a number of the logs as it is written down: to nine digits, as exact as float32."""
+    return float(f"{value:.9g}") + 0.0
+
+
 def texts(values: Iterable[str]) -> str:
     """Return a tuple as code."""
-    inside = [json.dumps(value) for value in values]
+    inside = [json.dumps(value, ensure_ascii=False) for value in values]
     return f"({', '.join(inside)}{',' if len(inside) == 1 else ''})"

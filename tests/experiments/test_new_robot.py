@@ -1,7 +1,9 @@
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -157,7 +159,7 @@ def test_a_name_is_one_of_a_file_and_a_task(name: str) -> None:
     assert not Path("out").exists()
 
 
-@pytest.mark.parametrize("name", ["class", "random", "torch", "logs"])
+@pytest.mark.parametrize("name", ["class", "random", "torch", "logs", "mujoco", "rich"])
 def test_a_name_is_taken_from_nothing_else(name: str) -> None:
     with pytest.raises(BadInputError, match=f"that nothing else in Python has, such as my_{name}"):
         write_robot(name, Path("out"))
@@ -192,3 +194,35 @@ def test_a_hole_in_the_logs_is_marked_and_imported(tmp_path: Path) -> None:
     assert 'not_finite = "split"  # CHECK' in Path("arm/logs.toml").read_text()
     command("import log.csv --mapping arm/logs.toml --out imported")
     assert len(Dataset.open("imported")) == 3  # two trials, one of them in two
+
+
+def test_what_is_written_is_as_exact_as_the_logs(tmp_path: Path) -> None:
+    """At 30 Hz, in places far from the origin, with a command of small values and one of large."""
+    rows = np.arange(90)
+    small, large = 2e-5 * np.sin(rows), 3e4 * np.cos(rows)
+    table = np.column_stack([rows / 30, np.cumsum(small) / 30, 5.4e5 + np.cumsum(large) / 30, small, large])
+    header = "time,x_m,y_🤖,cmd_x_m_s,cmd_y_🤖"
+    with Path("log.csv").open("w", encoding="utf-8") as file:
+        np.savetxt(file, table, "%.9g", ",", header=header, comments="")
+    write_robot("far", Path("far"), [Path("log.csv")])
+    task = task_named("far/far.py:TASK")
+    (least, most), (lowest, highest) = task.limits.values()
+    assert -2.01e-5 < least <= small.min() and small.max() <= most < 2.01e-5
+    assert -3.01e4 < lowest <= large.min() and large.max() <= highest < 3.01e4
+    tests = runpy.run_path("far/test_far.py")
+    for test in ("test_no_piece_of_the_task_is_wrong", "test_a_step_of_the_simulator"):
+        tests[test]()
+    tests["test_phi_of_the_first_row_of_the_logs"]()
+    assert tomllib.loads(Path("far/logs.toml").read_text(encoding="utf-8"))["time"] == "time"
+    shutil.copy("log.csv", "again.csv")
+    command("import log.csv again.csv --mapping far/logs.toml")
+
+
+def test_of_two_fields_that_end_episodes_one_is_left_out_aloud(tmp_path: Path) -> None:
+    rows = "".join(f"{row},{row % 3},{int(row == 8)},{int(row == 9)},{row}\n" for row in range(10))
+    Path("log.csv").write_text("x,cmd_x,fell,collision,|v|\n" + rows)
+    shown = CliRunner().invoke(app, ["new", "slide", "--from", "log.csv"])
+    assert shown.exit_code == 0
+    assert "| left out | 1 | 1 | a second failure: make one field of both |" in Path("slide/README.md").read_text()
+    assert '[columns."next.terminated"]\nfields = ["fell"]' in Path("slide/logs.toml").read_text()
+    assert "| `\\|v\\|` | state v |" in Path("slide/README.md").read_text()

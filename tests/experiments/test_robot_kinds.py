@@ -46,7 +46,7 @@ def test_a_heading_may_be_a_unit_vector(tmp_path: Path) -> None:
     kind = Planar.of(found)
     assert kind is not None
     assert kind.values()["abstraction"] == "return state[..., [2, 3, 0, 1]]"
-    assert kind.values()["lows"] == "[0.0, 0.0, 3.1416]"
+    assert kind.values()["lows"] == "[0.0, 0.0, 3.14159265]"
 
 
 def test_the_second_command_turns_where_no_name_says_which(tmp_path: Path) -> None:
