@@ -48,7 +48,7 @@ def main(source: str, out: Path, truth: Path, kills: int) -> None:
     rng = random.Random(0)
     finished = resumed = 0
     for _ in range(kills):
-        forked(lambda: pull(source, out=out), rng.uniform(0, 1.3 * longest))
+        assert forked(lambda: pull(source, out=out), rng.uniform(0, 1.3 * longest)) in (0, -signal.SIGKILL)
         resumed += any(out.parent.glob(f".{out.name}.pull-*/*"))
         if out.exists():
             finished += 1

@@ -104,6 +104,19 @@ def test_datasets_need_none_of_the_extras(tmp_path: Path) -> None:
     assert python(code, str(tmp_path / "whole"), str(tmp_path / "one")) == "1\n"
 
 
+def test_a_card_with_its_figure_needs_no_more_than_its_own_extra(tmp_path: Path) -> None:
+    write_fake(tmp_path / "whole")
+    code = WITHOUT.format(names=("torch", "safetensors", "mujoco", "gymnasium")) + (
+        "from pathlib import Path\nfrom astra_data import Dataset\n"
+        "from astra_data.exchange.sharing.card import write_card\n"
+        "from astra_data.exchange.sharing.notes import Notes\n"
+        "import astra_data.exchange.sharing.push\n"
+        "write_card(Dataset.open(Path(sys.argv[1])), Path(sys.argv[2]), Notes())\n"
+    )
+    python(code, str(tmp_path / "whole"), str(tmp_path / "card.md"))
+    assert (tmp_path / "card-coverage.png").is_file()
+
+
 def test_what_needs_an_extra_says_which() -> None:
     code = WITHOUT.format(names=("torch",)) + (
         "import astra_data\nfrom astra_data.core.errors import BadInputError\n"

@@ -163,7 +163,7 @@ def drift(seed: int, tick: Tick) -> str:
     rates = np.degrees(turned) / (steps * CONTROL_STEP_S)
     sideways = np.abs(nao.pose[:, 1])
     rows = [
-        ("heading, deg/s", f"{rates.std():.2f}", f"{np.abs(rates).max():.2f}"),
+        ("heading, deg/s", f"{np.sqrt((rates**2).mean()):.2f}", f"{np.abs(rates).max():.2f}"),
         ("off the line at the end, m", f"{np.sqrt((sideways**2).mean()):.2f}", f"{sideways.max():.2f}"),
     ]
     return table(("drift", "root mean square", "largest"), rows)

@@ -78,6 +78,10 @@ def with_falls(pool: Dataset, count: int, out: Path) -> Path:
     fell = ended[TERMINATED][last] & ~ended[SUCCESS][last]
     rng = generator(POOL_SEED, "drives with falls")
     fallen, whole = (rng.permutation(np.flatnonzero(which)) for which in (fell, ~fell))
+    if not DRIVES - len(whole) <= count <= min(DRIVES, len(fallen)):
+        raise typer.BadParameter(
+            f"--falls {count}: {len(fallen)} drives of the pool fell, {len(whole)} did not"
+        )
     kept = {*fallen[:count].tolist(), *whole[: DRIVES - count].tolist()}
     return delete(pool, [int(uid) for row, uid in enumerate(pool.uids) if row not in kept], out=out)
 

@@ -24,7 +24,7 @@ def render(found: Mapping[str, Any], name: str, command: str, image: str) -> str
     recordings = [
         [
             recording["name"],
-            f"{recording['minutes']:.2g}" if of_joints else f"{recording['minutes']:.1f}",
+            f"{recording['minutes']:.3g}" if of_joints else f"{recording['minutes']:.1f}",
             str(recording["pieces"]),
             *([] if of_joints else [f"{100 * recording['broken_share']:.0f} %"]),
         ]

@@ -12,7 +12,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from astra_data.core.naming import base_method, is_plus
-from astra_data.methods import method_role
 from astra_data.reports.figures.style import FAINT, INK, method_colour, method_title, score_axis, style
 from astra_data.worlds.score import Score
 
@@ -159,6 +158,8 @@ def _bar(
 
 
 def _tick_label(method: str) -> str:
+    from astra_data.methods import method_role
+
     title = method_title(method)
     return f"{title} ({role})" if (role := method_role(method)) else title
 

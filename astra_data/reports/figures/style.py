@@ -12,8 +12,6 @@ from matplotlib.style import context
 from PIL import Image
 
 from astra_data.core.naming import base_method, is_plus
-from astra_data.methods import METHODS
-from astra_data.methods import method_title as method_title
 from astra_data.worlds.score import Score
 
 SPARE_COLOURS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
@@ -71,6 +69,8 @@ def style() -> Iterator[None]:
 
 def method_colour(method: str) -> str:
     """Return the colour of a row as "#rrggbb": a variant's is its base row's, darker."""
+    from astra_data.methods import METHODS
+
     base = base_method(method)
     own = METHODS[base].colour if base in METHODS else ""
     colour = own or SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
@@ -78,6 +78,13 @@ def method_colour(method: str) -> str:
         red, green, blue = to_rgb(colour)
         return to_hex((0.68 * red, 0.68 * green, 0.68 * blue))
     return colour.lower()
+
+
+def method_title(method: str) -> str:
+    """Return what a row is called."""
+    from astra_data import methods
+
+    return methods.method_title(method)
 
 
 def score_axis(axes: Axes, score: Score) -> None:
