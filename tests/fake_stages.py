@@ -155,6 +155,11 @@ READ = ("dataset", "policy", "grounding", "target_encoder", "reference", "initia
 """Parameters that are folders of artefacts."""
 
 
+def asked(folder: Path) -> dict[str, Any]:
+    """Return what the stage that made `folder` was given."""
+    return dict(json.loads((folder / "asked.json").read_text()))
+
+
 def _digest(folder: Path) -> str:
     if (folder / "dataset.json").exists():
         return str(read_description(folder)["content_hash"])

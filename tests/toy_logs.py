@@ -54,10 +54,6 @@ def toy_columns(seed: int, steps: int = STEPS) -> Columns:
     }
 
 
-def toy_episode(uid: int, steps: int = STEPS) -> Episode:
-    return Episode(uid, toy_columns(uid, steps))
-
-
 def write_logs(root: Path, alter: Callable[[int, Columns], Columns | None] | None = None) -> Dataset:
     """Write 30 episodes of 100 steps with times, each as `alter` leaves or returns it."""
     description = {"name": "logs", "stage": "import"}

@@ -22,6 +22,7 @@ from fake_dataset import (
     staged_writer,
     write_fake,
 )
+from shared_files import contents
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset
@@ -29,10 +30,6 @@ from astra_data.dataset.columns import Episode
 
 STEPS_OF_THE_RECORDED = 20
 EPISODES_OF_THE_RECORDED = 30
-
-
-def files(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -43,7 +40,7 @@ def test_a_recording_is_the_dataset_that_is_written_at_once(tmp_path: Path) -> N
     with staged_writer(tmp_path / "set") as writer:
         for episode in fake_episodes():
             writer.add(episode)
-    assert files(tmp_path / "set") == files(write_fake(tmp_path / "whole").root)
+    assert contents(tmp_path / "set") == contents(write_fake(tmp_path / "whole").root)
     assert leftovers(tmp_path) == []
 
 
@@ -72,7 +69,7 @@ def test_an_interrupted_recording_goes_on(tmp_path: Path) -> None:
             writer.add(episodes[0])
         for episode in episodes[3:]:
             writer.add(episode)
-    assert files(tmp_path / "set") == files(write_fake(tmp_path / "whole").root)
+    assert contents(tmp_path / "set") == contents(write_fake(tmp_path / "whole").root)
 
 
 def test_another_recording_is_not_mixed_in(tmp_path: Path) -> None:
@@ -106,7 +103,7 @@ def test_a_refused_episode_changes_nothing(tmp_path: Path) -> None:
             writer.add(episode)
         with pytest.raises(BadInputError, match=r"next.reward: missing"):
             writer.add(Episode(7, {"mode": np.arange(4)}))
-    assert files(tmp_path / "set") == files(write_fake(tmp_path / "whole").root)
+    assert contents(tmp_path / "set") == contents(write_fake(tmp_path / "whole").root)
 
 
 def test_without_episodes_nothing_is_left(tmp_path: Path) -> None:
@@ -202,7 +199,7 @@ def test_an_episode_is_on_the_disk_itself_before_it_counts(
 
 def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
     record(tmp_path / "whole")
-    whole = files(tmp_path / "whole")
+    whole = contents(tmp_path / "whole")
     rng = np.random.default_rng(0)
     for trial in range(10):
         root = tmp_path / f"set_{trial}"
@@ -221,7 +218,7 @@ def test_a_kill_at_any_moment_loses_no_finished_episode(tmp_path: Path) -> None:
             staged = {path.stem for path in root.with_name(f".{root.name}.staged").glob("*.arrow")}
             assert staged >= set(added)
             record(root)
-        assert files(root) == whole
+        assert contents(root) == whole
 
 
 def test_a_kill_in_any_operation_never_mixes_two_recordings(
@@ -229,8 +226,8 @@ def test_a_kill_in_any_operation_never_mixes_two_recordings(
 ) -> None:
     other = {**DESCRIPTION, "seeds": {"collect": 1}}
     episodes, others = fake_episodes()[:2], [fake_episode(uid, 9) for uid in (20, 21, 22)]
-    whole = files(write_episodes(tmp_path / "whole", episodes))
-    second = files(write_episodes(tmp_path / "second", others, description=other))
+    whole = contents(write_episodes(tmp_path / "whole", episodes))
+    second = contents(write_episodes(tmp_path / "second", others, description=other))
     for at in count():
         root = tmp_path / f"at_{at}" / "set"
         with suppress(Killed), failing("mkdir rename replace unlink rmdir", at, Killed(), Killed()) as calls:
@@ -245,7 +242,7 @@ def test_a_kill_in_any_operation_never_mixes_two_recordings(
                 write_episodes(root, episodes)
         else:
             write_episodes(root, episodes)
-        assert files(root) == whole
+        assert contents(root) == whole
         assert leftovers(root.parent) == []
 
         try:
@@ -255,7 +252,7 @@ def test_a_kill_in_any_operation_never_mixes_two_recordings(
             assert not without.exists()
             shutil.rmtree(without.with_name(".set.staged"))
             write_episodes(without, others, description=other)
-        assert files(without) == second
+        assert contents(without) == second
         assert leftovers(without.parent) == []
         if len(calls) <= at:
             break
@@ -320,7 +317,7 @@ def test_a_disk_that_is_full_when_the_dataset_is_written_costs_no_episode(tmp_pa
     ):
         write_episodes(tmp_path / "set", episodes)
     assert leftovers(tmp_path) == [".set.staged"]
-    assert files(write_episodes(tmp_path / "set", episodes)) == files(
+    assert contents(write_episodes(tmp_path / "set", episodes)) == contents(
         write_episodes(tmp_path / "whole", episodes)
     )
 
@@ -331,7 +328,7 @@ def test_a_disk_that_fails_at_any_operation_loses_no_episode(
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda handle: None)
     episodes = fake_episodes()[:2]
-    whole = files(write_episodes(tmp_path / "whole", episodes))
+    whole = contents(write_episodes(tmp_path / "whole", episodes))
     at = 0
     while True:
         root = tmp_path / f"at_{at}" / "set"
@@ -343,7 +340,7 @@ def test_a_disk_that_fails_at_any_operation_loses_no_episode(
                 assert f"{root.parent}" in str(error)
         if not root.exists():
             write_episodes(root, episodes)
-        assert files(root) == whole
+        assert contents(root) == whole
         if len(calls) <= at:
             break
         at += 1 if calls[at] != "fsync" else 3  # most are the finished dataset's files, one after another
@@ -353,7 +350,7 @@ def test_a_disk_that_fails_at_any_operation_loses_no_episode(
 def test_ctrl_c_and_a_second_error_in_the_clean_up_lose_no_episode(
     tmp_path: Path, second: BaseException
 ) -> None:
-    whole = files(write_episodes(tmp_path / "whole", [fake_episode(1, 4)]))
+    whole = contents(write_episodes(tmp_path / "whole", [fake_episode(1, 4)]))
     for at in count():
         root = tmp_path / f"at_{at}" / "set"
         with ExitStack() as stack, suppress(KeyboardInterrupt, DiskError), staged_writer(root) as writer:
@@ -364,7 +361,7 @@ def test_ctrl_c_and_a_second_error_in_the_clean_up_lose_no_episode(
         if not root.exists():
             assert (root.parent / ".set.staged" / "000000.arrow").exists()
             write_episodes(root, [fake_episode(1, 4)])
-        assert files(root) == whole
+        assert contents(root) == whole
         if len(calls) <= at:
             break
     assert at > 10

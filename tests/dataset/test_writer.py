@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fake_dataset import COLUMNS, fake_episode, fake_episodes, staged_writer, write_fake, writer
+from shared_files import contents
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset, DatasetWriter, episode_rows, parquet
@@ -18,15 +19,11 @@ from astra_data.dataset.columns import STATE, Column
 from astra_data.dataset.format import DATASET_PATH
 
 
-def files(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 def test_the_same_episodes_give_the_same_bytes_in_every_file(tmp_path: Path) -> None:
     write_fake(tmp_path / "one")
     write_fake(tmp_path / "two" / "deeper")
-    assert files(tmp_path / "one") == files(tmp_path / "two" / "deeper")
-    assert sorted(files(tmp_path / "one")) == [
+    assert contents(tmp_path / "one") == contents(tmp_path / "two" / "deeper")
+    assert sorted(contents(tmp_path / "one")) == [
         "data/chunk-000/file-000.parquet",
         "meta/astra/dataset.json",
         "meta/astra/digests.parquet",
@@ -49,7 +46,7 @@ def test_how_it_was_made_is_told_beside_the_content_hash_only(tmp_path: Path) ->
     sums = timed.description["sums"]
     assert timed.description == plain.description | {"wall_seconds": 2.5, "sums": sums}
     assert {path for path in sums if sums[path] != plain.description["sums"][path]} == {DATASET_PATH}
-    before, after = files(plain.root), files(timed.root)
+    before, after = contents(plain.root), contents(timed.root)
     assert {name for name in before if before[name] != after[name]} == {"meta/astra/dataset.json"}
 
 
@@ -110,10 +107,10 @@ def test_an_exception_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    before = files(write_fake(tmp_path / "set").root)
+    before = contents(write_fake(tmp_path / "set").root)
     with pytest.raises(BadInputError, match="exists already; delete it or choose another"):
         write_fake(tmp_path / "set")
-    assert files(tmp_path / "set") == before
+    assert contents(tmp_path / "set") == before
 
 
 def test_two_writers_do_not_meet(tmp_path: Path) -> None:
@@ -130,7 +127,7 @@ def test_a_refused_episode_leaves_the_others_alone(tmp_path: Path) -> None:
             open_writer.add(episode)
             with pytest.raises(BadInputError):
                 open_writer.add(episode)
-    assert files(tmp_path / "set") == files(write_fake(tmp_path / "other").root)
+    assert contents(tmp_path / "set") == contents(write_fake(tmp_path / "other").root)
 
 
 def test_a_dataset_needs_an_episode(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import fake_stages
 import pytest
+from fake_stages import asked
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
@@ -35,11 +36,6 @@ def longer(base: Path) -> Path:
     path = base.with_name("longer.toml")
     path.write_text(LONGER)
     return path
-
-
-def asked(folder: Path) -> dict[str, object]:
-    content: dict[str, object] = json.loads((folder / "asked.json").read_text())
-    return content
 
 
 def attempts(folder: Path) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from fake_runs import bare_results, write_json
+from fake_stages import asked
 
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
@@ -19,11 +20,6 @@ def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "r.toml"
     path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[plus]\nsteps = 5\n')
     return path
-
-
-def asked(folder: Path) -> dict[str, object]:
-    content: dict[str, object] = json.loads((folder / "asked.json").read_text())
-    return content
 
 
 def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
