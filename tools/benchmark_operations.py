@@ -22,6 +22,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import typer
+from door import run_tool
 from rich.console import Console
 from rich.table import Table
 
@@ -151,4 +152,4 @@ def write(root: Path, uids: range, steps: int) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

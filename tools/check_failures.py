@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import torch
 import typer
+from door import run_tool
 
 from astra_data.grounding.calibration import folds
 from astra_data.grounding.failures import (
@@ -138,4 +139,4 @@ def _print_rates(task: Task, grounding: HistoryGrounding, measured: Mapping[int,
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

@@ -20,10 +20,9 @@ from typing import Annotated
 
 import torch
 import typer
-from timing import complain
+from door import run_tool
 from torch import Tensor, nn
 
-from astra_data.core.errors import AstraDataError
 from astra_data.core.naming import base_method
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import load_grounding, load_history_model
@@ -245,18 +244,6 @@ def main(
     rounds: Annotated[int, typer.Option(help="Rounds of teaching.")] = 40,
 ) -> None:
     """Print why policies of the humanoid fall."""
-    try:
-        check(run, seed, rounds)
-    except AstraDataError as error:
-        raise typer.Exit(complain(str(error))) from None
-
-
-def check(run: Path, seed: int, rounds: int) -> None:
-    """Print the results of one seed of a run.
-
-    Raises:
-        AstraDataError: something that is needed has not been run.
-    """
     recipe = settings_of(run)
     task = task_named(recipe["task"])
     torch.manual_seed(seed)
@@ -278,4 +265,4 @@ def check(run: Path, seed: int, rounds: int) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import torch
 import typer
+from door import run_tool
 from torch import Tensor
 
 from astra_data.core.naming import place
@@ -117,4 +118,4 @@ def told(way: Tensor, ahead: Tensor) -> tuple[str, str, str]:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    typer.run(main)
+    run_tool(main)

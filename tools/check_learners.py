@@ -20,6 +20,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from door import run_tool
 from numpy.typing import NDArray
 from pendulums import ENV, HORIZON, Pendulums, Recorder
 from rich.console import Console
@@ -219,4 +220,4 @@ CHECKS: dict[Learner, tuple[Callable[[int], Returns], str, Callable[[int], str]]
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

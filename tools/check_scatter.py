@@ -14,6 +14,7 @@ from typing import Annotated
 
 import torch
 import typer
+from door import run_tool
 from torch import Tensor
 
 from astra_data.grounding.files import load_grounding
@@ -135,4 +136,4 @@ def _held(task: Task, episodes: PairedEpisodes, steps: int) -> Iterator[tuple[in
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

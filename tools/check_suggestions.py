@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 import typer
+from door import run_tool
 from scipy import stats
 
 from astra_data.core.naming import place
@@ -242,4 +243,4 @@ def grounded(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

@@ -17,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 import typer
+from door import run_tool
 
 from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError
@@ -105,4 +106,4 @@ def trained(run: Path, row: str, seed: int, changes: dict[str, Any], policy: int
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

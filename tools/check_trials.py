@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from timing import complain
+from door import run_tool
 from trial_regret import Pool, at_random, by_equal_shares, by_halving, estimate, pools_of
 
-from astra_data.core.errors import AstraDataError
 from astra_data.reports.files import read_published
 from astra_data.reports.formatting import interval, table
 from astra_data.reports.sizes import by_size
@@ -30,16 +29,13 @@ def main(
 ) -> None:
     """Print a table for each report and size."""
     counts = (0, *(trials or (10, 20, 50, 100, 200)))
-    try:
-        for report in reports:
-            for percent, results in by_size(read_published(report)).items():
-                pools = pools_of(results)
-                size = f", {percent} %" if percent else ""
-                head = f"{results.recipe}{size}: {len(pools)} candidates, regret by trials, 95 % over seeds"
-                lines = [line(pools, count, repeats, resamples) for count in counts]
-                print(f"{head}\n\n{table(['trials', *WAYS], lines)}\n", flush=True)
-    except AstraDataError as error:
-        raise typer.Exit(complain(str(error))) from None
+    for report in reports:
+        for percent, results in by_size(read_published(report)).items():
+            pools = pools_of(results)
+            size = f", {percent} %" if percent else ""
+            head = f"{results.recipe}{size}: {len(pools)} candidates, regret by trials, 95 % over seeds"
+            lines = [line(pools, count, repeats, resamples) for count in counts]
+            print(f"{head}\n\n{table(['trials', *WAYS], lines)}\n", flush=True)
 
 
 def line(pools: Sequence[Pool], count: int, repeats: int, resamples: int) -> list[str]:
@@ -49,4 +45,4 @@ def line(pools: Sequence[Pool], count: int, repeats: int, resamples: int) -> lis
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

@@ -12,6 +12,7 @@ from statistics import fmean
 from typing import Annotated
 
 import typer
+from door import run_tool
 
 from astra_data.core.seeding import derive
 from astra_data.experiments.trained_policy import policy_files, settings_of
@@ -64,4 +65,4 @@ def outcomes(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

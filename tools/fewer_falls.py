@@ -12,6 +12,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from door import run_tool
 
 from astra_data.core.config import load_tables
 from astra_data.core.seeding import generator
@@ -87,4 +88,4 @@ def with_falls(pool: Dataset, count: int, out: Path) -> Path:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from door import run_tool
 from numpy.typing import NDArray
 
 from astra_data.studies.planar_walker import walk_command
@@ -90,4 +91,4 @@ def _followed(pieces: tuple[Piece, ...], fps: int, axis: int) -> list[float]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

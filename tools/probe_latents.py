@@ -18,6 +18,7 @@ from typing import Annotated
 import torch
 import typer
 from altered_latents import ALTERATIONS, AlteredLatents, in_target
+from door import run_tool
 from probes import Probed, dropped_values, picking_split, probe, recent_actions, way_to_goal
 from torch import Tensor
 
@@ -108,4 +109,4 @@ def successes(run: Path, row: str, seed: int, where: Where, episodes: int) -> di
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)

@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from door import run_tool
 from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
@@ -92,4 +93,4 @@ def _rms(errors: NDArray[np.float64]) -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_tool(main)
