@@ -78,6 +78,11 @@ def train(
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
     episodes.check(world)
+    sees_data = base.grounds or base.learns_from == "episodes" or config.data_start_share > 0
+    if sees_data and world.goal and not episodes.windows.goal.shape[-1]:
+        raise BadInputError(
+            f"{episodes.reference} has no goals, those of {world.name}: run `astra-data label` first"
+        )
     grounding_file = grounding and grounding / GROUNDING
     initial_file = initial and initial / POLICY
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING

@@ -258,13 +258,18 @@ def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> N
     sizes = {STATE: 29, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
     ant = TASKS["antmaze-umaze"]
     PairedEpisodes.load(write(tmp_path / "ant", sizes)).check(ant)
-    other = PairedEpisodes.load(write(tmp_path / "toy", {STATE: 3, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)))
+    other = PairedEpisodes.load(
+        write(tmp_path / "toy", {STATE: 3, GOAL: 5, ACTION: 2} | dict.fromkeys(ABSTRACT, 4))
+    )
     with pytest.raises(BadInputError) as caught:
         other.check(ant)
     assert str(caught.value) == (
-        "toy@data-1.0.0 has 3 values in a state, antmaze-umaze 29; has 0 values in a goal, antmaze-umaze 2: "
+        "toy@data-1.0.0 has 3 values in a state, antmaze-umaze 29; has 5 values in a goal, antmaze-umaze 2: "
         "pair it again, with the simulator of this task"
     )
+    PairedEpisodes.load(
+        write(tmp_path / "none", {name: size for name, size in sizes.items() if name != GOAL})
+    ).check(ant)  # a simulator is corrected without goals
     wide = write(tmp_path / "wide", {STATE: 29, GOAL: 2, ACTION: 3} | dict.fromkeys(ABSTRACT, 3))
     with pytest.raises(
         BadInputError, match=r"3 values in an abstract state, .* 4; has 3 values in an action"

@@ -11,6 +11,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
+from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.adaptation import Student
 from astra_data.learning.networks.soft_actor import SoftActor
@@ -276,6 +277,23 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")
     assert "\n" not in str(caught.value)
+
+
+def test_data_without_goals_are_refused_where_policies_meet_them(
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = PairedEpisodes.load
+
+    def without_goals(root: Path, device: str) -> PairedEpisodes:
+        episodes = loaded(root, device)
+        return replace(episodes, windows=replace(episodes.windows, goal=episodes.windows.goal[..., :0]))
+
+    monkeypatch.setattr(PairedEpisodes, "load", without_goals)
+    from_data, from_the_start = (TRAIN.model_copy(update={"data_start_share": share}) for share in (0.5, 0.0))
+    for method, config in (("iql", from_the_start), ("direct_transfer", from_data)):
+        with pytest.raises(BadInputError, match=r"has no goals, those of .*: run `astra-data label` first"):
+            make(task, method, paired, None, tmp_path / "out", config)
+    assert make(task, "direct_transfer", paired, None, tmp_path / "out", from_the_start)
 
 
 def test_a_simulator_that_is_not_mastered_is_trained_in_again(
