@@ -12,9 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from astra_data.core.durable import (
-    write_file,
-)
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 
 type Nested = (

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.exchange.importers.csv import delimiter_of
+from astra_data.exchange.importers.csv import delimiter_of, without_blanks
 
 Floats = NDArray[np.float64]
 MOSTLY = 0.9
@@ -62,9 +61,7 @@ def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
         return numbers
     if pa.types.is_string(values.type):
         with suppress(pa.ArrowInvalid):
-            trimmed = pc.utf8_trim_whitespace(values)
-            given = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
-            numbers = given.cast(pa.float64()).to_numpy()
+            numbers = without_blanks(values).cast(pa.float64()).to_numpy()
             return numbers
     if is_numbered and not values.null_count:
         numbers = np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)

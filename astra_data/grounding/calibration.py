@@ -13,12 +13,10 @@ def folds(fails: Tensor, recordings: Tensor | None = None) -> list[Tensor]:
     Copies stay with the episode that they are of: `recordings` (E,) are the same for them; None where there
     are no copies. There are as many folds as recordings with a failure, at most five; none with a single one.
     """
-    if recordings is None:
-        recordings = torch.arange(len(fails), device=fails.device)
-    known, recording = recordings.unique(return_inverse=True)
     # Numbered as they come, so that without copies each episode is drawn for in turn.
-    first = torch.stack([(recording == number).nonzero()[0, 0] for number in range(len(known))])
-    recording = first.argsort().argsort()[recording]
+    known: dict[int, int] = {}
+    names = range(len(fails)) if recordings is None else recordings.tolist()
+    recording = torch.tensor([known.setdefault(name, len(known)) for name in names], device=fails.device)
     failing = torch.bincount(recording[fails], minlength=len(known)) > 0
     count = min(_MOST_FOLDS, int(failing.sum()))
     if count < 2:

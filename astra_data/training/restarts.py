@@ -40,16 +40,12 @@ def with_restarts(
         made.append((reached, policy, curve))
         if _masters(reached, training):
             break
-    kept = len(made) - 1
-    if not _masters(made[kept][0], training):
-        kept = max(range(len(made)), key=lambda number: made[number][0].success)
-    _, policy, curve = made[kept]
+    _, policy, curve = max(made, key=lambda one: (_masters(one[0], training), one[0].success))
     tries = [
         {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": of_try["points"]}
         for seed, (one, _, of_try) in zip(seeds, made, strict=False)
     ]
-    curves = [of_try for _, _, of_try in made]
-    spent = {clock: sum(of_try[clock] for of_try in curves) for clock in CLOCKS if clock in curve}
+    spent = {clock: sum(of_try[clock] for _, _, of_try in made) for clock in CLOCKS if clock in curve}
     for number in range(1, len(made)):
         shutil.rmtree(_attempt(training, 0, number).folder)
     return policy, curve | spent | {"tries": tries}

@@ -90,8 +90,7 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
 
 def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Array:
     """Return the numbers of a field's `texts`, without blanks around them; the first is in `row`."""
-    texts = pc.utf8_trim_whitespace(texts)
-    texts = pc.if_else(pc.equal(texts, ""), pa.scalar(None, pa.string()), texts)
+    texts = without_blanks(texts)
     whole = [] if texts.null_count else [pa.int64()]  # An empty cell has no integer value.
     for kind in (*whole, pa.float64(), pa.bool_()):
         try:
@@ -108,6 +107,12 @@ def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Arr
         f"{source} line {row + number + 2}: field '{field}': expected numbers, or true and false, "
         f"got '{text}'"
     )
+
+
+def without_blanks(texts: pa.StringArray | pa.ChunkedArray) -> pa.StringArray | pa.ChunkedArray:
+    """Return cells without blanks around them; those of nothing else are empty."""
+    trimmed = pc.utf8_trim_whitespace(texts)
+    return pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
 
 
 def _is(text: str | None, kind: pa.DataType) -> bool:
