@@ -21,6 +21,7 @@ from damaged import DATA, EPISODES
 from fake_dataset import write_fake
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from nested import places
 
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset import Dataset
@@ -160,13 +161,6 @@ HOSTILE: st.SearchStrategy[object] = st.one_of(
     st.floats(),
     st.text(max_size=4),
 )
-
-
-def places(value: object, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    if path:
-        yield path
-    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
-        yield from places(value[key], (*path, key))  # type: ignore[index]
 
 
 @given(name=st.sampled_from(JSON), share=st.floats(0, 1, exclude_max=True), value=HOSTILE)

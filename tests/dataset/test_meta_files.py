@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from fake_dataset import write_fake
+from nested import places
 
 from astra_data.core.errors import AstraDataError, CorruptDatasetError
 from astra_data.dataset import Dataset
@@ -22,18 +23,10 @@ VALUES: tuple[object, ...] = (
 )
 
 
-def places(content: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the path of everything in `content`."""
-    inner: list[tuple[Any, Any]] = []
-    if isinstance(content, dict | list):
-        inner = list(content.items() if isinstance(content, dict) else enumerate(content))
-    return [path, *(place for key, value in inner for place in places(value, (*path, key)))]
-
-
 def mutated(content: Any, rng: random.Random) -> Any:  # noqa: ANN401 - JSON
     """Replace or remove something in `content`, rather near its top than deep inside."""
     depth = rng.choice([1, 1, 2, 3, 4])
-    *path, last = rng.choice([place for place in places(content) if 0 < len(place) <= depth])
+    *path, last = rng.choice([place for place in places(content) if len(place) <= depth])
     at = content
     for key in path:
         at = at[key]

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nested import places
 
 from astra_data.core.config import validated
 from astra_data.core.errors import RecipeError
@@ -74,13 +74,6 @@ HOSTILE: st.SearchStrategy[object] = st.one_of(
     st.sampled_from([True, "", "..", "x" * 300, "\0", [], {}, [[]], [0] * 50, ["nas"] * 3, {"x": 1}]),
     VALUES,
 )
-
-
-def places(value: object, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    if path:
-        yield path
-    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
-        yield from places(value[key], (*path, key))  # type: ignore[index]
 
 
 def without_none(value: object) -> Any:  # noqa: ANN401 - JSON

@@ -1,3 +1,4 @@
+import copy
 from typing import Any
 
 import pytest
@@ -83,7 +84,7 @@ def test_resumed_it_does_what_an_uninterrupted_one_does() -> None:
     whole, begun, resumed = (Noisy(one, 4) for one in worlds)
     expected = [whole.iterate() for _ in range(4)]
     found: list[dict[str, Any]] = [begun.iterate(), begun.iterate()]
-    state, at = _cloned(begun.state_dict()), _cloned(worlds[1].state_dict())
+    state, at = copy.deepcopy(begun.state_dict()), copy.deepcopy(worlds[1].state_dict())
     assert state.keys() == {"layer", "steps", "iteration", "acting"}
     begun.iterate()  # must not reach into what was kept
     resumed.load_state_dict(state, worlds[2].load_state_dict(at))
@@ -92,15 +93,6 @@ def test_resumed_it_does_what_an_uninterrupted_one_does() -> None:
     assert found == expected
     assert torch.equal(resumed.layer.weight, whole.layer.weight)
     assert torch.equal(resumed.acting.hidden, whole.acting.hidden)
-
-
-def _cloned(state: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: _cloned(value)
-        if isinstance(value, dict)
-        else (value.clone() if torch.is_tensor(value) else value)
-        for name, value in state.items()
-    }
 
 
 def test_where_the_episodes_cannot_go_on_new_ones_begin() -> None:

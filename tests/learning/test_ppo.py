@@ -68,8 +68,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int, normalize: b
     begun = ppo(world, 6, horizon=7, memory=memory)
     for _ in range(3):
         begun.iterate()
-    saved = unflatten(flatten({"ppo": begun.state_dict(), "world": world.state_dict()}))
-    saved = {name: _cloned(state) for name, state in saved.items()}
+    saved = copy.deepcopy(unflatten(flatten({"ppo": begun.state_dict(), "world": world.state_dict()})))
     begun.iterate()  # goes on elsewhere; must not reach into what was saved
     resumed = ppo(other_world, 6, horizon=7, memory=memory)
     resumed.load_state_dict(saved["ppo"], other_world.load_state_dict(saved["world"]))
@@ -77,10 +76,6 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int, normalize: b
     train(resumed)
     for name, value in whole.policy.state_dict().items():
         assert torch.equal(value, resumed.policy.state_dict()[name]), name
-
-
-def _cloned(state: dict[str, Any]) -> dict[str, Any]:
-    return unflatten({name: tensor.clone() for name, tensor in flatten(state).items()})
 
 
 @pytest.mark.parametrize(("terminates_after", "expected"), [(float("inf"), 10.0), (10.0, 4.1)])

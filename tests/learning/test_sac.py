@@ -96,7 +96,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
     begun = sac(world, 60, **settings)
     for _ in range(3):
         begun.iterate()
-    saved = _cloned({"sac": begun.state_dict(), "world": world.state_dict()})
+    saved = copy.deepcopy(unflatten(flatten({"sac": begun.state_dict(), "world": world.state_dict()})))
     resumed = sac(other_world, 60, **settings)
     resumed.load_state_dict(saved["sac"], other_world.load_state_dict(saved["world"]))
     assert resumed.steps == whole.steps / 2
@@ -125,10 +125,6 @@ def test_recorded_actions_are_imitated_where_rewards_leave_the_choice(memory: in
         hidden = learner.policy.initial_hidden(1)
         features, _ = learner.policy.remember(torch.ones(1, 1), torch.zeros(1, 1), hidden)
         assert float(learner.policy.act(features)) == pytest.approx(0.6, abs=0.1)
-
-
-def _cloned(state: dict[str, Any]) -> dict[str, Any]:
-    return unflatten({name: tensor.clone() for name, tensor in flatten(state).items()})
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,7 @@
 import numpy as np
-from matplotlib.figure import Figure
+from figures_shown import legend
 
 from astra_data.reports.figures.open_loop import OpenLoop, open_loop_error
-
-
-def legend(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_open_loop_error_is_logarithmic_and_draws_a_shared_raw_simulator_once() -> None:

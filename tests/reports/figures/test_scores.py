@@ -2,17 +2,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from figures_shown import legend
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.style import method_colour
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS, Score
-
-
-def legend(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_success_bars_show_bars_seeds_and_intervals() -> None:

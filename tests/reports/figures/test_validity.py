@@ -1,12 +1,8 @@
 import numpy as np
-from matplotlib.figure import Figure
+from figures_shown import legend
 
 from astra_data.reports.figures.style import method_colour, png
 from astra_data.reports.figures.validity import SimulatorReturns, predictive_validity
-
-
-def legend(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_validity_draws_a_dot_per_policy_in_its_rows_colour() -> None:
