@@ -50,7 +50,7 @@ TASK = "antmaze-umaze"
 
 def main(
     episodes: Annotated[int, typer.Option(help="Episodes.")] = 200,
-    steps: Annotated[int, typer.Option(help="Steps of each.")] = 500,
+    steps: Annotated[int, typer.Option(help="Steps of each.", min=LENGTH + 1)] = 500,
     rounds: Annotated[int, typer.Option(help="Turns that each candidate takes.")] = 5,
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures there.")] = None,
 ) -> None:

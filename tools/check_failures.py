@@ -33,7 +33,7 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.fit import HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.methods import method_named
+from astra_data.methods import grounded_as, method_named
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -52,9 +52,8 @@ def main(
     """Print a line for each model and dataset."""
     world = task_named(task)
     measured = {one: PairedEpisodes.load(run / "pair" / f"seed_{one}") for one in fresh or ()}
-    windows = [(int(first), int(last)) for first, _, last in (one.partition("-") for one in ahead or ())]
-    windows = windows or list(AHEAD_STEPS)
-    grounding = load_grounding(run / "ground" / row / f"seed_{seed}" / "grounding.safetensors")
+    windows = [_window(one) for one in ahead or ()] or list(AHEAD_STEPS)
+    grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / "grounding.safetensors")
     if not isinstance(grounding, HistoryGrounding):
         raise typer.BadParameter(f"{row} has no history grounding")
     whole = PairedEpisodes.load(run / "pair" / f"seed_{seed}")
@@ -82,6 +81,13 @@ def main(
             print(f"| {row}: {head} | | {name} {_figures(found, len(windows))}")
     if grounding.failures is not None:
         _print_rates(world, grounding, measured)
+
+
+def _window(told: str) -> tuple[int, int]:
+    first, _, last = told.partition("-")
+    if not (first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last)):
+        raise typer.BadParameter(f'--ahead: expected first and last steps such as "1-5", got {told!r}')
+    return int(first), int(last)
 
 
 def _print_likelihoods(

@@ -21,6 +21,7 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.methods import grounded_as
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -40,7 +41,7 @@ def main(
 ) -> None:
     """Print two tables for each fresh seed."""
     world = task_named(task)
-    grounding = load_grounding(run / "ground" / row / f"seed_{seed}" / "grounding.safetensors")
+    grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / "grounding.safetensors")
     if not isinstance(grounding, HistoryGrounding) or grounding.scatters is None:
         raise typer.BadParameter(f"{row} has no scatter model: expected [ground] scatter = true")
     torch.manual_seed(0)

@@ -94,6 +94,8 @@ def main(
     seed: Annotated[list[int] | None, typer.Option(help="By default 1 to 5.")] = None,
 ) -> None:
     """Run the study in `folder`."""
+    if which not in SETTINGS:
+        raise typer.BadParameter(f"expected {' or '.join(SETTINGS)}, got {which!r}")
     setting, found = SETTINGS[which], {}
     torch.set_num_threads(1)
     for one in seed or range(1, 6):

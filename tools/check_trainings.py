@@ -56,7 +56,7 @@ def main(
     ] = None,
 ) -> None:
     """Print a line for each row."""
-    changes = {name: json.loads(value) for name, _, value in (one.partition("=") for one in settings or [])}
+    changes = dict(map(_setting, settings or []))
     print("| row | success by policy | steps | processor time |\n|---|---|---|---|")
     for name in row:
         train = partial(trained, run, name, seed, changes)
@@ -69,6 +69,14 @@ def main(
             f"{sum(seconds) / len(seconds):.0f} s",
         )
         print(f"| {name} | {' | '.join(shown)} |", flush=True)
+
+
+def _setting(told: str) -> tuple[str, Any]:
+    name, _, value = told.partition("=")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        raise BadInputError(f"--set: expected key=value, the value as in JSON, got {told!r}") from None
 
 
 def trained(run: Path, row: str, seed: int, changes: dict[str, Any], policy: int) -> Trained:

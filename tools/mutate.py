@@ -140,6 +140,9 @@ def main(
 ) -> None:
     """Draw mutants of the rooms and count those that the tests notice."""
     console = Console()
+    unknown = [room for room in rooms if not (ROOT / "astra_data" / room).exists()]
+    if unknown:
+        raise typer.BadParameter(f"expected rooms or files below astra_data, got {', '.join(unknown)}")
     files = [
         file.relative_to(ROOT)
         for room in rooms

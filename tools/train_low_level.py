@@ -78,7 +78,7 @@ def save(actor: SoftActor, torque_scale: float, path: Path) -> None:
 @app.command()
 def evaluate(
     checkpoint: Annotated[Path | None, typer.Argument(help="By default the one shipped.")] = None,
-    steps: Annotated[int, typer.Option(help="Control steps per ant.")] = 1000,
+    steps: Annotated[int, typer.Option(help="Control steps per ant.", min=5 * SETTLED_STEPS)] = 1000,
     num_envs: Annotated[int, typer.Option(help="Ants.")] = 256,
 ) -> None:
     """Print tracking error, lag and falls of a checkpoint as JSON."""
