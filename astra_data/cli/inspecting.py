@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName
+from astra_data.cli.showing import show_table
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 
@@ -72,7 +73,6 @@ def list_(
         return
     if folders:
         raise BadInputError("list: folders are for --clean; the datasets that are listed are those at home")
-    from rich.console import Console
     from rich.table import Table
 
     from astra_data.core.errors import AstraDataError, CorruptDatasetError
@@ -92,7 +92,7 @@ def list_(
             steps = int(found.lengths.sum())
             facts = (found.description["stage"], f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
             table.add_row(found.reference, *facts)
-    Console().print(table)
+    show_table(table)
     if faults:
         raise CorruptDatasetError("\n".join(faults))
 

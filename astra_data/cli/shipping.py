@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
+from astra_data.cli.showing import show_table
+
 app = typer.Typer(no_args_is_help=True)
 
 
 @app.command("list")
 def list_() -> None:
     """List the recipes that come with the package."""
-    from rich.console import Console
     from rich.table import Table
 
     from astra_data.experiments.shipped import shipped_recipes
@@ -19,7 +20,7 @@ def list_() -> None:
     table = Table("recipe", "task", "what it is")
     for recipe in shipped_recipes():
         table.add_row(recipe.name, recipe.task, recipe.about)
-    Console().print(table)
+    show_table(table)
 
 
 @app.command()

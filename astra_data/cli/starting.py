@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from astra_data.cli.showing import show_table
+
 
 def new(
     name: Annotated[
@@ -19,7 +21,6 @@ def new(
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:
     """Begin with a robot of your own: a task, a recipe, a mapping of its logs, a test and a page."""
-    from rich.console import Console
     from rich.table import Table
 
     from astra_data.experiments.new_robot import write_robot
@@ -30,7 +31,7 @@ def new(
     table = Table("field", "taken for", "unit", "factor", "why")
     for field in found.fields:
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
-    Console().print(table)
+    show_table(table)
     typer.echo(f"abstract simulator: {kind.simulator}")
     if not found.of("time"):
         typer.echo(f"none of them is a time: {found.rate} rows a second were taken; set fps and TIMESTEP_S")

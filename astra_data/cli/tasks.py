@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName, NewName, Out
+from astra_data.cli.showing import show_table
 
 if TYPE_CHECKING:
     from astra_data.worlds.task import Task
@@ -25,7 +26,6 @@ def tasks(
     ] = None,
 ) -> None:
     """List the tasks that can be named, and what they have; or walk through one."""
-    from rich.console import Console
     from rich.table import Table
 
     from astra_data.core.errors import BadInputError
@@ -51,7 +51,7 @@ def tasks(
             "yes" if known.has_target else "no",
             str(known.fps),
         )
-    Console().print(table)
+    show_table(table)
     typer.echo(
         "`astra-data tasks TASK` tells all of one. A task of your own is named by its place, cart.py:TASK or "
         "package.module:TASK; it is run."

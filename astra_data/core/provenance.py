@@ -50,7 +50,9 @@ def git_commit() -> str | None:
 
 def _git(*arguments: str) -> str:
     command = ["git", "-C", str(ROOT), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    # In a hook, Git's variables point at the repository of the hook.
+    free = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=free).stdout.strip()
 
 
 def origin(device: str = "cpu") -> dict[str, Any]:

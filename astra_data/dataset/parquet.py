@@ -18,6 +18,8 @@ UNREADABLE = (OSError, ValueError, pa.ArrowException)
 """Raised by pyarrow for damaged files; ValueError where names are not valid UTF-8."""
 BLOCK_ROWS = 2**16
 """Rows read at once, rounded up to whole row groups."""
+BLOCK_VALUES = 2**23
+"""Values of arrays that are read at once, where that is fewer rows; rounded up, too."""
 
 
 def to_arrow(values: Array, kind: pa.DataType) -> pa.Array:
@@ -70,7 +72,10 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 
 
 def read_blocks(
-    paths: Sequence[Path], names: Sequence[str] | None = None, wanted: NDArray[np.bool_] | None = None
+    paths: Sequence[Path],
+    names: Sequence[str] | None = None,
+    wanted: NDArray[np.bool_] | None = None,
+    most_rows: int | None = None,
 ) -> Iterator[pa.Table]:
     """Yield columns of all files in order, in blocks of whole row groups; memory stays bounded.
 
@@ -78,11 +83,12 @@ def read_blocks(
         paths: the files.
         names: the columns, by default all.
         wanted: mask over all rows of all files, by default all; row groups without a wanted row are skipped.
+        most_rows: rows of a block, rounded up to whole row groups; by default `BLOCK_ROWS`.
 
     Raises:
         CorruptDatasetError: a file cannot be read.
     """
-    end = 0
+    end, enough = 0, most_rows or BLOCK_ROWS
     for path in paths:
         try:
             with open_parquet(path) as file:
@@ -96,7 +102,7 @@ def read_blocks(
                         groups.append(group)
                         rows += end - begin
                         masks += [] if wanted is None else [wanted[begin:end]]
-                    if groups and (rows >= BLOCK_ROWS or group == metadata.num_row_groups - 1):
+                    if groups and (rows >= enough or group == metadata.num_row_groups - 1):
                         table = file.read_row_groups(groups, columns=names, use_threads=False)
                         yield table if all(mask.all() for mask in masks) else table.filter(np.hstack(masks))
                         groups, masks, rows = [], [], 0
@@ -109,7 +115,8 @@ def read_arrays(
     paths: Sequence[Path], columns: Sequence[Column], wanted: NDArray[np.bool_] | None = None
 ) -> Iterator[dict[str, Array]]:
     """Yield the blocks of `read_blocks` as contiguous arrays by name, (n,) or (n, size)."""
-    for table in read_blocks(paths, [column.name for column in columns], wanted):
+    most_rows = min(BLOCK_ROWS, max(1, BLOCK_VALUES // sum(column.size for column in columns)))
+    for table in read_blocks(paths, [column.name for column in columns], wanted, most_rows):
         yield {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
 
 

@@ -13,19 +13,18 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from astra_data.core.disk import writing
 from astra_data.core.durable import discard, make_folder, move, remove_empty, sweep, sync, write_file
-from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short
+from astra_data.core.errors import AstraDataError, BadInputError, DiskError
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import changed_values
-from astra_data.dataset.parquet import to_arrow, to_numpy
 from astra_data.dataset.plain import read_object
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.staged_episode import load_staged, write_staged
 from astra_data.dataset.writer import DatasetWriter
 
 _PLAN = "plan.json"
@@ -155,7 +154,7 @@ class StagedWriter:
         self._writer.made, self._writer.policy = self.made, self.policy
         with self._keeping(), self._writer:
             for position in sorted(self.staged):
-                self._writer.add(self._load(self._path(position)))
+                self._writer.add(load_staged(self._path(position), self._columns))
 
     @contextmanager
     def _keeping(self) -> Iterator[None]:
@@ -185,14 +184,10 @@ class StagedWriter:
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
         self._admission.check(episode)
-        metadata = json.dumps({"uid": episode.uid, "metadata": dict(episode.metadata)})
-        schema = self._schema.with_metadata({"episode": metadata})
-        arrays = [to_arrow(episode.columns[field.name], field.type) for field in schema]
         path = self._path(place)
         partial = path.with_suffix(".partial")
         with self._keeping(), writing(path):
-            with partial.open("wb") as sink, pa.ipc.new_file(sink, schema) as file:
-                file.write_table(pa.Table.from_arrays(arrays, schema=schema))
+            write_staged(partial, episode, self._schema)
             sync(partial)
             move(partial, path)
         self._admission.admit(episode)
@@ -235,10 +230,10 @@ class StagedWriter:
             dataset = Dataset.open(self.root)
             if not paths:
                 return all(dataset.description.get(key) == value for key, value in self._described().items())
-            staged = {episode.uid: path for path in paths for episode in [self._load(path)]}
+            staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
             for stored in dataset.episodes([column.name for column in self._columns]):
                 path = staged.pop(stored.uid, None)
-                if path and not _is_same(self._load(path), stored):
+                if path and not _is_same(load_staged(path, self._columns), stored):
                     return False
         except AstraDataError:
             return False
@@ -253,21 +248,9 @@ class StagedWriter:
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"
 
-    def _load(self, path: Path) -> Episode:
-        try:
-            with pa.memory_map(str(path)) as source, pa.ipc.open_file(source) as file:
-                table = file.read_all()
-                metadata = json.loads(table.schema.metadata[b"episode"])
-                values = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in self._columns}
-        except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-            raise CorruptDatasetError(
-                f"{path} is no whole episode ({in_short(error)}); delete it and resume the recording."
-            ) from error
-        return Episode(metadata["uid"], values, metadata["metadata"])
-
     def _restore(self, path: Path) -> Episode:
         """Load an episode of the interrupted recording, as if it was added now."""
-        episode = self._load(path)
+        episode = load_staged(path, self._columns)
         try:
             self._admission.admit(episode)
         except BadInputError as error:

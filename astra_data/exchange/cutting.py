@@ -119,6 +119,7 @@ class Cutter:
             self.tally.rejected_first = self.tally.rejected_first or f"{block.origin} row {first}"
             self.tally.rejected_rows += int(rejected.sum())
         counters = self._count(block, row, columns, rejected, is_apart=is_apart)
+        self._keep_ends(columns, counters[:-1], finite)
         if not finite.any():
             return
         kept = {name: values[finite] for name, values in columns.items()}
@@ -132,6 +133,24 @@ class Cutter:
                 self._metadata = {"source": block.origin, "source_row": int(rows[first])}
             if first < last:
                 self._pieces.append({name: values[first:last] for name, values in kept.items()})
+
+    def _keep_ends(self, columns: dict[str, Array], counters: NDArray[np.int64], finite: Mask) -> None:
+        """Where a rejected row terminates an episode, let the last row that is kept of it do so.
+
+        `counters` are those of all reasons but rejected rows.
+        """
+        if TERMINATED not in columns:
+            return
+        kept_before = np.maximum.accumulate(np.where(finite, np.arange(len(finite)), -1))
+        for row in np.flatnonzero(~finite & columns[TERMINATED]):
+            last, at, then = columns, kept_before[row], counters[:, kept_before[row]]
+            if at < 0:
+                if not self._pieces or self._kept_before is None:
+                    continue
+                last, then = self._pieces[-1], self._kept_before[0][:-1, 0]
+            if (then == counters[:, row]).all():
+                for name in {TERMINATED, SUCCESS} & columns.keys():
+                    last[name][at] = columns[name][row]
 
     def finish(self) -> Iterator[Cut]:
         """Yield the current episode, if there is one, and begin the next."""

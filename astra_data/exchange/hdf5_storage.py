@@ -1,6 +1,7 @@
 """What an HDF5 file really holds: one by a stranger may point elsewhere, or claim more than there is."""
 
 from collections.abc import Mapping
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def refuse_links(h5py: Any, file: Any, origin: str) -> None:  # noqa: ANN401 - o
 
 
 def check_storage(datasets: Mapping[str, Any], origin: str) -> None:
-    """Check that all `datasets` are in their own file, and as large as they claim.
+    """Check that all `datasets` are in their own file, as large as they claim, and written as a whole.
 
     Raises:
         BadInputError: one is not; lists every fault.
@@ -54,8 +55,18 @@ def check_storage(datasets: Mapping[str, Any], origin: str) -> None:
             faults.append(f"field '{field}' lies in another file; copy it into this one")
         elif dataset.nbytes > MOST_COMPRESSED * (dataset.id.get_storage_size() + 2**10):
             faults.append(f"field '{field}' claims the shape {dataset.shape}, but the file does not hold it")
+        elif not _is_written(dataset):
+            faults.append(f"field '{field}' was not written as a whole: what is missing reads as 0")
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
+
+
+def _is_written(dataset: Any) -> bool:  # noqa: ANN401 - of h5py
+    """Return whether all values are in the file; others would be read as the fill value."""
+    if dataset.chunks is None:
+        return bool(dataset.size == 0 or dataset.id.get_storage_size() > 0)
+    wanted = prod(-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    return bool(dataset.id.get_num_chunks() >= wanted)
 
 
 def unpacked_bytes(datasets: Mapping[str, Any]) -> int:

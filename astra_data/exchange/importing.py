@@ -168,7 +168,7 @@ def _format_of(recording: Path) -> str:
         return "minari"
     names = [str(source) for source in find_sources(recording, [""])]
     for name, module in FORMATS.items():
-        if any(file.endswith(_suffixes(module)) for file in names):
+        if any(file.lower().endswith(_suffixes(module)) for file in names):
             return name
     raise BadInputError(
         f"{recording}: its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"

@@ -11,6 +11,7 @@ from typing import IO
 from astra_data.core.config import did_you_mean
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, in_short
+from astra_data.core.files import files_below
 from astra_data.dataset.columns import Array
 
 BLOCK_ROWS = 2**13
@@ -98,7 +99,8 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
 
     Args:
         recording: a file, a folder, or an archive, whose members must be plain files inside of it.
-        suffixes: endings of the names of files in a folder or archive that are listed.
+        suffixes: endings of the names of files in a folder or archive that are listed, in small letters;
+            names may have capitals.
 
     Raises:
         BadInputError: it does not exist, cannot be read, is unsafe or holds no such file.
@@ -108,14 +110,14 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
     if not (recording.is_file() or recording.is_dir()):
         raise BadInputError(f"{recording} is a device or a pipe, expected a file or a folder")
     if recording.is_dir():
-        files = [path for path in recording.rglob("*") if path.is_file()]
-        sources = [Source(path, None, recording) for path in files if _is_seen(path.relative_to(recording))]
+        files = [path for path in files_below(recording) if _is_seen(path.relative_to(recording))]
+        sources = [Source(path, None, recording) for path in files]
     elif is_archive(recording):
         members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]
         sources = [Source(recording, member, recording) for member in members]
     else:
         return [Source(recording, None, recording)]
-    sources = [source for source in sources if str(source).endswith(tuple(suffixes))]
+    sources = [source for source in sources if str(source).lower().endswith(tuple(suffixes))]
     if not sources:
         endings = " or ".join(filter(None, suffixes))
         expected = f"files that end with {endings}" if endings else "files"
@@ -125,7 +127,7 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
 
 def is_archive(path: Path) -> bool:
     """Return whether `path` has the name of an archive."""
-    return path.name.endswith(ARCHIVES)
+    return path.name.lower().endswith(ARCHIVES)
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -139,9 +141,10 @@ def _is_seen(path: PurePath) -> bool:
 
 
 def _members(archive: Path) -> list[tarfile.TarInfo]:
+    """Return the files in an archive; of those of one name the last, which unpacking it leaves, too."""
     try:
         with tarfile.open(archive) as opened:
-            members = [member for member in opened if not member.isdir()]
+            members = list({member.name: member for member in opened if not member.isdir()}.values())
     except (tarfile.TarError, OSError, EOFError, ValueError, ArithmeticError) as error:
         raise BadInputError(f"{archive} cannot be read as an archive: {in_short(error)}") from error
     faults = []
@@ -203,8 +206,7 @@ def _files_of(sources: Sequence[Source]) -> dict[Path, Path]:
     """Return the files, each with the recording that it is of."""
     files: dict[Path, Path] = {}
     for path, recording in dict.fromkeys((source.path, source.recording) for source in sources):
-        found = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-        files |= dict.fromkeys(found, recording)
+        files |= dict.fromkeys(files_below(path) if path.is_dir() else [path], recording)
     return files
 
 

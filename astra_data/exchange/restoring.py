@@ -114,6 +114,11 @@ def write_restored(
         for episode in episodes:
             writer.add(episode)
             frames += len(episode)
+        if options.get("fps", record.fps) == record.fps and writer.content_hash != record.content_hash:
+            raise CorruptDatasetError(
+                f"the record of {record.name}@data-{record.version} was altered: with its uids, lengths and "
+                "names, the values are not those that were exported; export it again, or restore a copy"
+            )
         writer.made = {"wall_seconds": time.perf_counter() - began}
     return root, frames
 

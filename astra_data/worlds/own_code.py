@@ -65,7 +65,7 @@ def file_of(name: str) -> dict[str, str]:
 def code_digest(name: str) -> str | None:
     """Return a digest of the code that `name` begins with; None where it is no file.
 
-    The files beside it that it imports count too; comments and layout do not.
+    The files and packages beside it that it imports count too; comments and layout do not.
 
     Raises:
         BadInputError: one of these files is no Python.
@@ -75,12 +75,13 @@ def code_digest(name: str) -> str | None:
         return None
     digest = hashlib.sha256()
     for path, tree in _with_neighbours(place):
-        digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
+        name = path.relative_to(place.parent).as_posix()
+        digest.update(f"{name}\n{ast.dump(tree)}\n".encode())
     return digest.hexdigest()
 
 
 def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
-    """Yield a file and those beside it that it imports, each once, and what is in it.
+    """Yield a file and those beside it that it imports, of packages all, each once, and what is in it.
 
     Raises:
         BadInputError: one of them is no Python.
@@ -94,7 +95,11 @@ def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
         except SyntaxError as error:
             raise BadInputError(f"{path}, line {error.lineno}: expected Python, got {error.msg}") from None
         yield path, tree
-        beside = {path.with_name(f"{module}.py") for module in sorted(_imported(tree))}
+        beside = {
+            file
+            for module in _imported(tree)
+            for file in (place.with_name(f"{module}.py"), *place.with_name(module).rglob("*.py"))
+        }
         todo += sorted(file for file in beside - seen - set(todo) if file.is_file())
 
 

@@ -52,6 +52,12 @@ def test_without_a_checkout_there_is_no_commit(checkout: Path) -> None:
     assert git_commit() is None
 
 
+def test_a_hook_of_another_repository_is_not_asked(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = git(checkout, "rev-parse", "HEAD")
+    monkeypatch.setenv("GIT_DIR", str(checkout / "another/.git"))
+    assert git_commit() == first
+
+
 def test_a_gpu_is_named_where_the_networks_are_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device}")
     assert origin("cuda:1")["machine"]["gpu"] == "GPU cuda:1"

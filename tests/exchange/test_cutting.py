@@ -358,3 +358,27 @@ def test_only_dropped_rows_that_succeeded_are_counted_as_successes() -> None:
 def test_a_jump_is_longer_than_its_bound_not_as_long() -> None:
     cutting = cutter(split={"jump": {"column": STATE, "values": (0,), "above": 0.5}})
     assert rows(cut(cutting, x=[0.0, 0.5, 1.0, 1.75, 2.0])) == [[0, 1], [3]]
+
+
+@BLOCKS
+@pytest.mark.parametrize("not_finite", ["drop", "split"])
+def test_a_failure_whose_row_is_rejected_is_that_of_the_last_row(block_rows: int, not_finite: str) -> None:
+    flags = {name: {"fields": (field,)} for name, field in ((TERMINATED, "fell"), (SUCCESS, "won"))}
+    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | flags, not_finite=not_finite)
+    nan, fell = float("nan"), [0, 0, 1, 0, 0, 0, 1, 0]
+    episodes = cut(cutting, block_rows, x=[0, 1, nan, 3, 4, nan, nan, 7], fell=fell, won=fell)
+    assert rows(episodes) == [[0, 1], [3, 4], [7]]
+    for name in (TERMINATED, SUCCESS):
+        assert [episode[name].tolist() for episode in episodes] == [[False, True], [False, True], [False]]
+
+
+@BLOCKS
+def test_a_rejected_failure_right_after_an_end_is_of_no_episode(block_rows: int) -> None:
+    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    columns[TERMINATED] = {"fields": ("fell",)}
+    cutting = cutter(columns=columns, not_finite="drop", split={"ends": ("end",)})
+    nan = float("nan")
+    episodes = cut(cutting, block_rows, x=[0, 1, nan, 3], fell=[0, 0, 1, 0], end=[0, 1, 0, 0])
+    assert rows(episodes) == [[0, 1], [3]]
+    assert not any(episode[TERMINATED].any() for episode in episodes)

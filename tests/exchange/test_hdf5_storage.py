@@ -22,3 +22,15 @@ def test_only_what_the_file_holds_is_taken(tmp_path: Path) -> None:
         file["link"] = h5py.SoftLink("/group/x")
         with pytest.raises(BadInputError, match=r"a.hdf5: link: expected no links"):
             refuse_links(h5py, file, "a.hdf5")
+
+
+def test_what_was_never_written_is_not_read_as_zeros(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file.create_dataset("never", (100, 2), "f4")
+        file.create_dataset("partly", (100, 2), "f4", chunks=(30, 1))[:60] = 1
+        file.create_dataset("whole", (100, 2), "f4", chunks=(30, 1), compression="gzip")[:] = 0
+        file.create_dataset("empty", (0, 2), "f4")
+        for name in ("never", "partly"):
+            with pytest.raises(BadInputError, match=f"field '{name}' was not written as a whole"):
+                check_storage({name: file[name]}, "a.hdf5")
+        check_storage({name: file[name] for name in ("whole", "empty")}, "a.hdf5")

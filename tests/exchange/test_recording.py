@@ -13,6 +13,7 @@ from astra_data.exchange.recording import (
     bounded,
     find_sources,
     identities,
+    is_archive,
 )
 
 
@@ -130,3 +131,26 @@ def test_small_recordings_may_unpack_to_what_is_small_and_others_to_a_multiple(t
         MOST_UNPACKED * (10 + SMALL_BYTES)
     ] * 2
     assert [source.most_bytes for source in bounded(sources, 7)] == [7, 7]
+
+
+def test_capitals_and_linked_folders_hide_no_log(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "far").mkdir()
+    for name in ("logs/a.csv", "logs/b.CSV", "far/c.Csv"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "logs/day_2").symlink_to(tmp_path / "far", target_is_directory=True)
+    (tmp_path / "far/back").symlink_to(tmp_path / "logs", target_is_directory=True)  # no end of its own
+    found = find_sources(tmp_path / "logs", [".csv"])
+    assert [str(source) for source in found] == ["a.csv", "b.CSV", "day_2/c.Csv"]
+    assert is_archive(Path("LOGS.TGZ"))
+
+
+def test_of_a_member_that_was_appended_again_the_last_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "logs.tar"
+    with tarfile.open(path, "w") as opened:
+        for content in (b"first", b"the last one"):
+            (tmp_path / "log.csv").write_bytes(content)
+            opened.add(tmp_path / "log.csv", "log.csv")
+    (source,) = find_sources(path, [".csv"])
+    with source.open() as stream:
+        assert stream.read() == b"the last one"

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import h5py
@@ -9,6 +10,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.columns import REWARD
 from astra_data.exchange.exporters import export
 from astra_data.exchange.importers import csv, hdf5
+from astra_data.exchange.importing import import_dataset
 from astra_data.exchange.recording import Source
 from astra_data.exchange.restoring import read_record, restored
 
@@ -61,3 +63,16 @@ def test_fields_of_another_kind_are_told(source: Source) -> None:
         file["rewards"] = rewards + 1
     with pytest.raises(CorruptDatasetError, match=f"incomplete: {REWARD} differs"):
         list(restored(hdf5, source, record))
+
+
+def test_a_record_with_another_uid_is_told(source: Source, tmp_path: Path) -> None:
+    with h5py.File(source.path, "r+") as file:
+        record = file["metadata/astra_data"]
+        text = record[()].decode() if isinstance(record[()], bytes) else record[()]
+        altered = json.loads(text)
+        altered["uids"][0] += 1000
+        del file["metadata/astra_data"]
+        file["metadata/astra_data"] = json.dumps(altered)
+    with pytest.raises(CorruptDatasetError, match=r"the record of .* was altered"):
+        import_dataset([source.path], out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -142,6 +142,21 @@ def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> 
         code_digest(f"{tmp_path}/cart.py:TASK")
 
 
+def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
+    (tmp_path / "parts/joints").mkdir(parents=True)
+    (tmp_path / "cart.py").write_text("from parts.joints import knee\nTASK = knee.LIMIT\n")
+    (tmp_path / "parts/__init__.py").write_text("import wheel\n")
+    (tmp_path / "wheel.py").write_text("R = 1\n")
+    (tmp_path / "other.py").write_text("R = 1\n")
+    (tmp_path / "parts/joints/knee.py").write_text("LIMIT = 1\n")
+    digests = [code_digest(f"{tmp_path}/cart.py:TASK")]
+    for path, text in (("other.py", "R = 2"), ("parts/joints/knee.py", "LIMIT = 2"), ("wheel.py", "R = 2")):
+        (tmp_path / path).write_text(text)
+        digests.append(code_digest(f"{tmp_path}/cart.py:TASK"))
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
+
+
 def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) -> None:
     file = tmp_path / "wheel.py"
     file.write_text("import numpy as np\n\n\ndef roll():\n    return np.zeros(3).reshape(2, 2)\n")

@@ -20,7 +20,7 @@ _LONGEST_HEADER = 2**20
 
 def delimiter_of(name: str) -> tuple[str, str]:
     """Return what parts the fields of the file `name`, and what it is called."""
-    return ("\t", "tabs") if name.endswith(".tsv") else (",", "commas")
+    return ("\t", "tabs") if name.lower().endswith(".tsv") else (",", "commas")
 
 
 def csv_files(place: Path) -> list[Path]:
@@ -30,7 +30,7 @@ def csv_files(place: Path) -> list[Path]:
         BadInputError: there is none.
     """
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
-    found = [path for path in inside if path.suffix in SUFFIXES]
+    found = [path for path in inside if path.suffix.lower() in SUFFIXES]
     if not found:
         raise BadInputError(
             f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: `import` takes "

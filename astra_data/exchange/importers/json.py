@@ -5,6 +5,7 @@ A file is read whole, since JSON cannot be parsed in blocks; files larger than `
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -20,15 +21,23 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield all rows as one block.
 
     Raises:
-        BadInputError: the file is too large or not an object; fields are missing or differ in length.
+        BadInputError: the file is too large or no object; fields are missing, doubled or differ in length.
     """
     with source.open() as stream:
         text = stream.read(LIMIT_BYTES + 1)
     if len(text) > LIMIT_BYTES:
         raise BadInputError(f"{source}: expected at most {LIMIT_BYTES // 2**20} MB of JSON, split the file")
-    fields = json.loads(text)
+    fields = json.loads(text, object_pairs_hook=_once)
     if not isinstance(fields, dict):
         raise BadInputError(f"{source}: expected an object of fields, got {type(fields).__name__}")
     shapes = {name: (len(rows),) if isinstance(rows, list) else () for name, rows in fields.items()}
     if row_count(str(source), mapping.all_fields, shapes):
         yield Block({field: np.array(fields[field]) for field in mapping.all_fields}, str(source))
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object whose names are all different."""
+    names = [name for name, _ in pairs]
+    if doubled := sorted({name for name in names if names.count(name) > 1}):
+        raise BadInputError(f"an object has {', '.join(doubled)} more than once")
+    return dict(pairs)

@@ -42,6 +42,9 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
                 for field, (shape, dtype) in headers.items()
             }
             yield Block(values, str(source))
+        for file in files.values():
+            if file.read(1):  # to the end, where the archive's sum is checked
+                raise BadInputError(f"{source}: {file.name} holds more values than its header says")
 
 
 def _header(file: IO[bytes], source: Source) -> tuple[tuple[int, ...], np.dtype[Any]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import SharingError
+from astra_data.core.files import files_below
 
 SUMS_PATH = "SHA256SUMS"
 
@@ -35,7 +36,7 @@ class Listed:
 
 def dataset_files(root: Path) -> list[str]:
     """List the files that belong to the dataset in folder `root`, relative to it, and no others."""
-    paths = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    paths = (path.relative_to(root).as_posix() for path in files_below(root))
     return sorted(path for path in paths if _PATH.fullmatch(path))
 
 

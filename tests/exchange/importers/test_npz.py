@@ -111,3 +111,14 @@ def test_arrays_with_a_header_of_the_second_version_are_read(tmp_path: Path) -> 
     dataset, _ = imported(tmp_path, tmp_path / "log.npz")
     assert dataset.lengths.tolist() == list(STEPS)
     assert dataset.columns([STATE])[STATE][0, 0] == np.float32(rows()["x"][0] * 0.001)
+
+
+def test_a_header_that_claims_less_than_there_is_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.npz", {name: values[:12] for name, values in rows().items()})
+    with ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content.replace(b"(12,", b"(10,", 1))
+    with pytest.raises(BadInputError, match=r"\.npy holds more values than its header says"):
+        imported(tmp_path, path)

@@ -70,3 +70,10 @@ def test_every_fault_is_told() -> None:
         parse_sums("\n".join(lines), "it")
     for fault in ("line 1 is no", f"line 3 lists {DATA} again", "'../c'", "meta/x is listed without"):
         assert fault in str(told.value)
+
+
+def test_files_on_another_disk_belong_to_the_dataset_as_well(fake: Dataset, tmp_path: Path) -> None:
+    expected = make_sums(fake.root)
+    (fake.root / "data").rename(tmp_path / "elsewhere")
+    (fake.root / "data").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    assert make_sums(fake.root) == expected
