@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from astra_data.core.disk import refuse_finished, writing
+from astra_data.core.disk import writing
 from astra_data.core.durable import (
     clean,
     discard,
@@ -22,6 +22,16 @@ from astra_data.core.lock import held
 
 _SETTINGS = "config.json"
 """Name of the file of the settings in a folder."""
+
+
+def refuse_finished(out: Path) -> None:
+    """Refuse to make `out` once more.
+
+    Raises:
+        BadInputError: it exists.
+    """
+    if out.exists():
+        raise BadInputError(f"{out} is finished already: remove it to run the stage again")
 
 
 @contextmanager

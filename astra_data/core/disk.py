@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from astra_data.core.errors import AstraDataError, BadInputError, DiskError
+from astra_data.core.errors import AstraDataError, DiskError
 
 _OF_THE_DISK = {
     errno.ENOSPC: ("the disk is full", "free space"),
@@ -88,13 +88,3 @@ def _is_about(error: Exception, target: Path) -> bool:
     path = Path(os.fsdecode(name))
     hidden = str(target.parent / f".{target.name}.")
     return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
-
-
-def refuse_finished(out: Path) -> None:
-    """Refuse to make `out` once more.
-
-    Raises:
-        BadInputError: it exists.
-    """
-    if out.exists():
-        raise BadInputError(f"{out} is finished already: remove it to run the stage again")

@@ -142,7 +142,7 @@ def _file_faults(root: Path, columns: Sequence[Column], rows: Mapping[Path, int]
     """Compare the footers of the data files with the columns and with the number of rows of each."""
     for path in sorted(set(data_files(root)) - set(rows)):
         yield f"{path.relative_to(root)} does not belong to it"
-    types = {column.name: layout.arrow_type(column) for column in columns}
+    types = {column.name: layout.arrow_type(column.dtype, column.size) for column in columns}
     for path, expected in rows.items():
         name, footer = path.relative_to(root), read_footer(path)
         if isinstance(footer, str):

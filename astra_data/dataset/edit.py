@@ -4,7 +4,6 @@ Nothing is edited in place: every function streams the remaining episodes into a
 folder, which is `out`, or by default the new version's folder under `versions.home()`.
 """
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +11,11 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import Episode, Scalar
+from astra_data.dataset.columns import Scalar
 from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.uids import new_uid, renamed_metadata
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
@@ -190,19 +190,9 @@ def merge(
     with DatasetWriter.like(first, folder, description) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
-                writer.add(_renamed(episode, named))
+                metadata = renamed_metadata(episode.uid, episode.metadata, named)
+                writer.add(replace(episode, uid=named[episode.uid], metadata=metadata))
     return folder
-
-
-def _renamed(episode: Episode, names: Mapping[int, int]) -> Episode:
-    metadata = dict(episode.metadata)
-    origin = metadata.get("source_episode")
-    if isinstance(origin, int):
-        metadata["source_episode"] = names.get(origin, origin)
-    uid = names[episode.uid]
-    if uid != episode.uid:
-        metadata["merged_uid"] = episode.uid
-    return replace(episode, uid=uid, metadata=metadata)
 
 
 def _write(
@@ -281,9 +271,7 @@ def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, i
             name = uid
             if uid in taken:
                 repeated.append(uid)
-                while name in known:
-                    digest = hashlib.sha256(f"{source.content_hash} {name}".encode()).digest()
-                    name = int.from_bytes(digest[:8]) >> 1
+                name = new_uid(uid, f"{source.content_hash} ".encode(), known)
                 known.add(name)
             taken.add(name)
             named[uid] = name

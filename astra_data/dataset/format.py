@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from astra_data.dataset.columns import (
@@ -56,7 +57,6 @@ DEFAULT_COLUMNS = (
 )
 EPISODE_UID_COLUMN = Column(EPISODE_UID, "int64", meaning="names the episode for good")
 
-_VALUE_TYPES = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
 _ENCODINGS = {"float32": "BYTE_STREAM_SPLIT", "int64": "DELTA_BINARY_PACKED"}
 
 
@@ -65,10 +65,10 @@ def stored_columns(columns: Sequence[Column]) -> list[Column]:
     return [*columns, EPISODE_UID_COLUMN, *DEFAULT_COLUMNS]
 
 
-def arrow_type(column: Column) -> pa.DataType:
-    """Return the type of one step of `column`: a scalar, or a list of fixed size."""
-    value = _VALUE_TYPES[column.dtype]
-    return value if column.size == 1 else pa.list_(value, column.size)
+def arrow_type(dtype: str, size: int) -> pa.DataType:
+    """Return the type of one step of `size` values of numpy's `dtype`: a scalar, or a list of fixed size."""
+    value = pa.from_numpy_dtype(np.dtype(dtype))
+    return value if size == 1 else pa.list_(value, size)
 
 
 def data_schema(columns: Sequence[Column]) -> pa.Schema:
@@ -79,7 +79,9 @@ def data_schema(columns: Sequence[Column]) -> pa.Schema:
         listed = {"feature": value, "length": column.size, "_type": "List"}
         features[column.name] = value if column.size == 1 else listed
     metadata = {"huggingface": json.dumps({"info": {"features": features}})}
-    return pa.schema([(column.name, arrow_type(column)) for column in columns], metadata=metadata)
+    return pa.schema(
+        [(column.name, arrow_type(column.dtype, column.size)) for column in columns], metadata=metadata
+    )
 
 
 def data_encodings(columns: Sequence[Column]) -> dict[str, str]:

@@ -13,7 +13,7 @@ import pyarrow as pa
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
-from astra_data.dataset.format import STATS_PATH, TASKS_PATH
+from astra_data.dataset.format import STATS_PATH, TASKS_PATH, arrow_type
 from astra_data.dataset.parquet import UNREADABLE, open_parquet, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4
@@ -40,8 +40,7 @@ class PlainColumn:
     @property
     def arrow_type(self) -> pa.DataType:
         """The type of one step: a scalar, or a list of fixed size."""
-        value = pa.from_numpy_dtype(np.dtype(self.dtype))
-        return value if self.size == 1 else pa.list_(value, self.size)
+        return arrow_type(self.dtype, self.size)
 
     def fits(self, kind: pa.DataType) -> bool:
         """Return whether a file may store it as `kind`; LeRobot's merge writes lists of variable size."""

@@ -3,7 +3,6 @@
 With it, an export is compared with its dataset before it is shown, and imported again with the same values.
 """
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self
@@ -12,7 +11,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from astra_data.core.config import Config, Count, Number, faults_of
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset.columns import Array, Column, Episode
+from astra_data.dataset.columns import Column, Episode
+from astra_data.dataset.description import ContentHash
 from astra_data.dataset.meta_files import NameText, VersionText
 from astra_data.dataset.reader import Dataset
 
@@ -20,7 +20,7 @@ Uid = Annotated[int, Field(ge=0, lt=2**63)]
 Fact = bool | int | float | str | None
 
 
-class Place(Config):
+class Slot(Config):
     """Where a column lies: `size` values of `field` from `first` on."""
 
     field: str
@@ -56,7 +56,7 @@ class ExportRecord(Config):
     """As `episodes` in a mapping."""
     features: dict[str, dict[str, Any]]
     """LeRobot's features of the columns, with our units, frames and roles."""
-    places: dict[str, Place]
+    places: dict[str, Slot]
     """Where each column lies."""
     uids: tuple[Uid, ...]
     """Uid of each episode."""
@@ -106,23 +106,6 @@ class ExportRecord(Config):
             ) from None
 
 
-class Sums:
-    """Running sha256 of columns."""
-
-    def __init__(self) -> None:
-        """Start without columns."""
-        self._digests: dict[str, Any] = {}
-
-    def update(self, columns: Mapping[str, Array]) -> None:
-        """Append `columns`, (n,) or (n, size) and contiguous."""
-        for name, values in columns.items():
-            self._digests.setdefault(name, hashlib.sha256()).update(values.data)
-
-    def hexdigests(self) -> dict[str, str]:
-        """Return the sum of each column."""
-        return {name: digest.hexdigest() for name, digest in self._digests.items()}
-
-
 class Export:
     """A dataset on its way into another format.
 
@@ -149,18 +132,19 @@ class Export:
         """
         self.dataset = dataset
         self.places = {
-            column.name: Place(
+            column.name: Slot(
                 field=fields[column.name], first=(first or {}).get(column.name, 0), size=column.size
             )
             for column in dataset.schema
         }
         self._groups = groups
-        self._sums = Sums()
+        self._sums = ContentHash()
 
     def episodes(self) -> Iterator[Episode]:
         """Yield all episodes with all columns."""
         for episode in self.dataset.episodes(list(self.places)):
-            self._sums.update(episode.columns)
+            for name, values in episode.columns.items():
+                self._sums.update(name, values)
             yield episode
 
     def record(self) -> dict[str, Any]:
@@ -175,11 +159,11 @@ class Export:
             "subset_seed": dataset.subset_seed,
             "groups": self._groups,
             "features": {name: dataset.features[name] for name in self.places},
-            "places": {name: place.model_dump() for name, place in self.places.items()},
+            "places": {name: slot.model_dump() for name, slot in self.places.items()},
             "uids": dataset.uids.tolist(),
             "lengths": dataset.lengths.tolist(),
             "metadata": dataset.metadata,
-            "sums": self._sums.hexdigests(),
+            "sums": self._sums.column_sums(),
         }
 
     def text(self) -> str:

@@ -10,9 +10,10 @@ import numpy as np
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
+from astra_data.dataset.description import ContentHash
 from astra_data.dataset.versions import Version, place, versions_at_home
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.exchange.export_record import ExportRecord, Sums
+from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.mapping import ColumnMapping, ImportMapping
 from astra_data.exchange.recording import Block, Source
 
@@ -43,12 +44,13 @@ def restored(module: ModuleType, source: Source, record: ExportRecord) -> Iterat
         BadInputError: fields are missing.
         CorruptDatasetError: values differ from those that were exported; raised after the last episode.
     """
-    columns, sums = record.columns, Sums()
+    columns, sums = record.columns, ContentHash()
     rest = {column.name: _empty(column) for column in columns}
     number = 0
     for block in module.read(source, _mapping(record)):
         values = {column.name: _values(block, column, record) for column in columns}
-        sums.update(values)
+        for name, column_values in values.items():
+            sums.update(name, column_values)
         rest = {name: np.concatenate([rest[name], values[name]]) for name in values}
         first, rows = 0, len(rest[columns[0].name])
         while number < len(record.lengths) and (last := first + record.lengths[number]) <= rows:
@@ -58,7 +60,7 @@ def restored(module: ModuleType, source: Source, record: ExportRecord) -> Iterat
             yield Episode(record.uids[number], cut, known)
             first, number = last, number + 1
         rest = {name: array[first:] for name, array in rest.items()}
-    found = sums.hexdigests()
+    found = sums.column_sums()
     wrong = [column.name for column in columns if found.get(column.name) != record.sums[column.name]]
     if wrong or number < len(record.lengths):
         raise CorruptDatasetError(
@@ -125,7 +127,7 @@ def write_restored(
 
 def _mapping(record: ExportRecord) -> ImportMapping:
     """Return a mapping that reads every field once."""
-    fields = dict.fromkeys(place.field for place in record.places.values())
+    fields = dict.fromkeys(slot.field for slot in record.places.values())
     return ImportMapping(
         name=record.name,
         task=record.task,
@@ -140,12 +142,12 @@ def _empty(column: Column) -> Array:
 
 
 def _values(block: Block, column: Column, record: ExportRecord) -> Array:
-    place = record.places[column.name]
-    stored = np.asarray(block.values[place.field])
-    rows = stored.reshape(len(block), -1)[:, place.first : place.first + place.size]
+    slot = record.places[column.name]
+    stored = np.asarray(block.values[slot.field])
+    rows = stored.reshape(len(block), -1)[:, slot.first : slot.first + slot.size]
     if stored.dtype.kind not in "biuf" or rows.shape[1] != column.size:
         raise CorruptDatasetError(
-            f"{block.origin}: field '{place.field}' holds {stored.dtype} of shape {stored.shape}, expected "
+            f"{block.origin}: field '{slot.field}' holds {stored.dtype} of shape {stored.shape}, expected "
             f"{column.size} numbers per row"
         )
     values = np.ascontiguousarray(rows, column.dtype)

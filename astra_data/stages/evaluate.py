@@ -15,11 +15,10 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artefact import finished_folder, refuse_finished
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
-from astra_data.core.disk import refuse_finished
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent

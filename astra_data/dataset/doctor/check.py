@@ -18,13 +18,11 @@ from astra_data.dataset.format import (
     DATA_PATH,
     DATASET_PATH,
     DEFAULT_COLUMNS,
-    DIGESTS_PATH,
     INFO_PATH,
     METADATA_PATH,
     POLICY_PATH,
     STATS_PATH,
     SUBSETS_PATH,
-    TASKS_PATH,
 )
 from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
 from astra_data.dataset.plain import (
@@ -40,18 +38,9 @@ from astra_data.dataset.plain import (
     schema_faults,
 )
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.seal import altered_files
+from astra_data.dataset.seal import SEALED, altered_files
 
-_META_FILES = (
-    INFO_PATH,
-    STATS_PATH,
-    TASKS_PATH,
-    DATASET_PATH,
-    METADATA_PATH,
-    SUBSETS_PATH,
-    DIGESTS_PATH,
-    POLICY_PATH,
-)
+_META_FILES = (*SEALED, DATASET_PATH, POLICY_PATH)
 
 
 def check(root: Path) -> Report:

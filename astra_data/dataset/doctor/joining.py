@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from astra_data.dataset.columns import Array, Column, Scalar
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.uids import new_uid, renamed_metadata
 
 
 class Joined(NamedTuple):
@@ -46,8 +47,7 @@ def join(
     for uid, digest in found:
         name = uid
         if uid in taken:
-            while name in reserved:
-                name = int.from_bytes(hashlib.sha256(digest + str(name).encode()).digest()[:8]) >> 1
+            name = new_uid(uid, digest, reserved)
             reserved.add(name)
         taken.add(name)
         names.append(name)
@@ -56,12 +56,7 @@ def join(
     joined = []
     for (uid, digest), name in zip(found, names, strict=True):
         origin, facts = known.get((uid, digest), (None, {}))
-        metadata = dict(facts)
-        parent = metadata.get("source_episode")
-        if isinstance(parent, int):
-            metadata["source_episode"] = renamed[origin].get(parent, parent)
-        if name != uid:
-            metadata["merged_uid"] = uid
+        metadata = renamed_metadata(uid, facts, renamed[origin] | {uid: name})
         joined.append(Joined(name, metadata, (uid, digest) in known))
     return joined
 
