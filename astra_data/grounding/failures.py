@@ -164,6 +164,16 @@ def replayed_inputs(
     return replayed
 
 
+def averages_before(
+    task: Task, grounding: HistoryGrounding, failures: FailureModel, episodes: PairedEpisodes
+) -> Tensor:
+    """Return the averages that a failure model remembers before each step, (E, T, 15), as in replays."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        after = failures.averages_of(replayed_inputs(task, grounding, failures, episodes))
+    return functional.pad(after[:, :-1], (0, 0, 1, 0))
+
+
 @torch.no_grad()
 def compared_foresight(
     task: Task,

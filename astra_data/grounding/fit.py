@@ -73,7 +73,7 @@ class GroundConfig(DescentConfig):
     failure_steps: AtOnce = Field(default=RISK_STEPS, exclude_if=lambda steps: steps == RISK_STEPS)
     """Within how many steps the failure model foresees failures: fewer tell when they come, more warn."""
     recorded_clearance: bool = Field(default=False, exclude_if=lambda used: not used)
-    """Let corrected states come no closer to walls than the robot did in 99 of 100 recorded steps: a body
+    """Let corrected states come no closer to walls than the robot did in 98 of 100 recorded steps: a body
     slimmer than the robot's slides where nothing was recorded. Without effect where a task has no walls."""
     scatter: bool = Field(default=False, exclude_if=lambda used: not used)
     """Scatter corrected states as held-out episodes do around the correction: by how much depends on the

@@ -99,7 +99,11 @@ class GroundedSimulator(EpisodeSimulator):
         hidden: Tensor | None = None,
         previous_action: Tensor | None = None,
     ) -> None:
-        """Start episodes in `rows` (n,); see `EpisodeSimulator.start`."""
+        """Start episodes in `rows` (n,); see `EpisodeSimulator.start`.
+
+        `hidden` is that of the model's encoder and of each member's, followed by the averages of the failure
+        model, if they are known.
+        """
         super().start(state, rows, goal)
         self.goal[rows] = goal
         latent_size, count = self.model.shape.latent_size, len(self.members)
@@ -107,8 +111,10 @@ class GroundedSimulator(EpisodeSimulator):
             previous_action = torch.zeros(len(state), self.model.shape.action_size, device=state.device)
         if hidden is None:
             hidden = torch.zeros(len(state), latent_size * (1 + count), device=state.device)
+        hidden, averages = hidden.tensor_split([latent_size * (1 + count)], dim=-1)
         if self.failures is not None:
-            self._remembered[rows] = self.failures.initial_memory(state, previous_action)
+            known = averages if averages.shape[-1] else None
+            self._remembered[rows] = self.failures.initial_memory(state, previous_action, known)
         first, *others = hidden.split(latent_size, dim=-1)
         self.hidden[rows] = _encoded(self.model, state, goal, previous_action, first)
         if self._own_hidden is not None:

@@ -30,7 +30,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
 
     Replays start every 25 steps, with a grounding's memory of the true history up to there. Errors are
     distances in the task's quantities after 1, 10, 50 and 200 steps: means and 95 % bootstrap intervals over
-    episodes.
+    episodes; None where a single episode is that long.
 
     Raises:
         BadInputError: a simulator's states are not finite, though the recorded ones are.
@@ -73,14 +73,18 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     return report
 
 
-def _interval(errors: Tensor, episode: Tensor, rng: np.random.Generator) -> tuple[float, float, float]:
+def _interval(
+    errors: Tensor, episode: Tensor, rng: np.random.Generator
+) -> tuple[float, float | None, float | None]:
     """Return the mean of `errors` (N,) and its 95 % bootstrap interval, resampling episodes (N,)."""
     values, groups = errors.cpu().numpy(), episode.cpu().numpy()
     keep = np.isfinite(values)
     counts = np.bincount(groups[keep])
     sums = np.bincount(groups[keep], values[keep])
-    present = np.flatnonzero(counts)
+    present, mean = np.flatnonzero(counts), float(sums.sum() / counts.sum())
+    if len(present) == 1:
+        return mean, None, None
     drawn: NDArray[np.intp] = rng.choice(present, (1000, len(present)))
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
     low, high = np.quantile(means, [0.025, 0.975])
-    return float(sums.sum() / counts.sum()), float(low), float(high)
+    return mean, float(low), float(high)

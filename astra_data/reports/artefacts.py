@@ -151,13 +151,13 @@ class Metrics(Artefact):
 
 
 class Band(BaseModel):
-    """An error at each horizon."""
+    """An error at each horizon; no interval where a single episode is that long."""
 
     model_config = ConfigDict(frozen=True)
 
     mean: list[float]
-    low: list[float]
-    high: list[float]
+    low: list[float | None]
+    high: list[float | None]
 
 
 class Gap(Artefact):

@@ -228,12 +228,13 @@ def mean_gap(of_seeds: Mapping[int, Gap]) -> GapMeans:
     def mean(bands: Sequence[Band]) -> BandMeans:
         ends = np.mean(
             [
-                np.array([band.mean, band.low, band.high])[:, kept]
+                np.array([band.mean, band.low, band.high], dtype=float)[:, kept]
                 for band, kept in zip(bands, places, strict=True)
             ],
             axis=0,
         )
-        return BandMeans(mean=ends[0].tolist(), low=ends[1].tolist(), high=ends[2].tolist())
+        low, high = ([None if np.isnan(end) else end for end in of.tolist()] for of in ends[1:])
+        return BandMeans(mean=ends[0].tolist(), low=low, high=high)
 
     return GapMeans(
         seeds=list(of_seeds),

@@ -185,7 +185,7 @@ def _simulator_returns(results: Results) -> list[SimulatorReturns]:
 
 def _gaps(results: Results) -> dict[str, OpenLoop]:
     def stack(band: BandMeans) -> Floats:
-        return np.array([band.mean, band.low, band.high])
+        return np.array([band.mean, band.low, band.high], dtype=float)
 
     return {
         name: OpenLoop(

@@ -75,6 +75,11 @@ def interval(value: float, low: float | None, high: float | None, digits: int = 
     return f"{value:.{digits}f}{ends}"
 
 
+def measured(value: float, low: float | None, high: float | None) -> str:
+    """Return a measured value with three significant digits and, if it has one, its interval."""
+    return f"{value:.3g}" if low is None or high is None else f"{value:.3g} [{low:.3g}, {high:.3g}]"
+
+
 def short(rate: float) -> str:
     """Return a rate with three significant digits, in thousands from 1000 on."""
     return f"{rate / 1000:.3g} k" if rate >= 1000 else f"{rate:.3g}"

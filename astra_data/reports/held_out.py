@@ -13,7 +13,7 @@ from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
 from astra_data.reports.artefacts import Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
-from astra_data.reports.formatting import fill
+from astra_data.reports.formatting import fill, measured
 from astra_data.reports.schema import BandMeans, GapMeans
 
 Floats = NDArray[np.float64]
@@ -159,11 +159,13 @@ def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], hori
     errors = {size: _at(gap.grounded[quantity], gap, horizon) for size, gap in sizes.items()}
     *smaller, largest = errors
     limit, least = errors[largest][2], largest
+    where = f"{title}, `{quantity}`, {horizon} steps ahead: "
+    if limit is None:
+        return f"{where}withheld, as {largest} % have a seed with a single held-out episode of that length."
     for size in reversed(smaller):
         if errors[size][0] > limit:
             break
         least = size
-    where = f"{title}, `{quantity}`, {horizon} steps ahead: "
     if least == largest:
         return f"{where}the error still falls up to {largest} %: more data may help."
     return f"{where}from {least} % on, the error is within the interval of {largest} %."
@@ -184,11 +186,11 @@ def _lines(
         bands |= {title: (gap.grounded[quantity], gap) for title, gap in sized.items()}
         for title, (band, gap) in bands.items():
             ends = [_at(band, gap, horizon) for horizon in horizons]
-            cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]" for mean, low, high in ends]
+            cells = [measured(*end) for end in ends]
             lines.append([*([f"{size} %"] if has_sizes else []), title, *cells])
     return lines
 
 
-def _at(band: BandMeans, gap: GapMeans, horizon: int) -> tuple[float, float, float]:
+def _at(band: BandMeans, gap: GapMeans, horizon: int) -> tuple[float, float | None, float | None]:
     index = gap.horizons.index(horizon)
     return band.mean[index], band.low[index], band.high[index]

@@ -13,7 +13,7 @@ from astra_data.reports.cost_and_origin import (
     row_costs,
     stage_costs,
 )
-from astra_data.reports.formatting import fill, interval, mean_std, spread
+from astra_data.reports.formatting import fill, interval, mean_std, measured, spread
 from astra_data.reports.schema import BandMeans, MethodResults, Results
 from astra_data.reports.statistics import Correlation
 from astra_data.reports.tested import warning, where
@@ -173,7 +173,7 @@ def gap_tables(results: Results) -> dict[str, list[list[str]]]:
 
 def _cells(band: BandMeans) -> list[str]:
     ends = zip(band.mean, band.low, band.high, strict=True)
-    return [f"{mean:.3g} [{low:.3g}, {high:.3g}]" for mean, low, high in ends]
+    return [measured(*end) for end in ends]
 
 
 def correlation_text(found: Correlation | None) -> str:

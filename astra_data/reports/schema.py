@@ -70,11 +70,11 @@ class Learning(Section):
 
 
 class BandMeans(Section):
-    """An error at each horizon, averaged over seeds."""
+    """An error at each horizon, averaged over seeds; no interval where a seed has none."""
 
     mean: list[Number]
-    low: list[Number]
-    high: list[Number]
+    low: list[Number | None]
+    high: list[Number | None]
 
 
 class GapMeans(Section):

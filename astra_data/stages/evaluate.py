@@ -284,7 +284,7 @@ def _careful_in_target(task: Task, goal: Tensor) -> Act:
 def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
-        groundings["grounded"] = load_grounding(reference)
+        groundings["grounded"] = load_grounding(reference).reduced(members=False, failures=True)
     return {
         name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()

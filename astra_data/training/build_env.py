@@ -10,6 +10,8 @@ from pydantic import ConfigDict, Field, model_validator
 from torch import Tensor
 
 from astra_data.core.config import Config, Count, NotNegative, Positive, Share
+from astra_data.grounding.failures import averages_before
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.learning.recorded import Recorded
@@ -143,7 +145,7 @@ def env_parts(
     if config.data_start_share > 0:
         every = grounding.start_stride
         moments = windows.mask[:, ::every].bool()
-        hidden = _used(grounding, config).hidden_before(windows, every)
+        hidden = _remembered(task, _used(grounding, config), episodes, every)
         starts = DataStarts(
             state=windows.state[:, ::every][moments],
             goal=windows.goal[:, ::every][moments],
@@ -175,6 +177,15 @@ def recorded_steps(task: Task, episodes: PairedEpisodes, grounding: Grounding) -
 def _used(grounding: Grounding, config: EnvConfig) -> Grounding:
     """Return what `config` makes use of in a grounding."""
     return grounding.reduced(members=config.keep_member, failures=config.foresees)
+
+
+def _remembered(task: Task, grounding: Grounding, episodes: PairedEpisodes, every: int) -> Tensor | None:
+    """Return what the grounding, and its failure model, remember before each `every`-th recorded step."""
+    hidden = grounding.hidden_before(episodes.windows, every)
+    if hidden is None or not isinstance(grounding, HistoryGrounding) or grounding.failures is None:
+        return hidden
+    averages = averages_before(task, grounding, grounding.failures, episodes)
+    return torch.cat([hidden, averages[:, ::every]], dim=-1)
 
 
 def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:

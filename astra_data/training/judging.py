@@ -9,7 +9,7 @@ from torch import Tensor
 from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.protocols import Grounding
 from astra_data.training.own_world import in_simulator, started
 from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.simulator_env import SimulatorEnv
@@ -21,24 +21,25 @@ class Judge:
     """A grounding of other episodes, and the factor (X, X) of the target's scatter around it."""
 
     task: Task
-    grounding: FittedGrounding
+    grounding: Grounding
     scatter: Tensor
 
     @classmethod
     def of(
         cls,
         task: Task,
-        grounding: FittedGrounding,
+        grounding: Grounding,
         episodes: PairedEpisodes,
         failure_members: int = 0,
         failure_steps: int = 1,
     ) -> "Judge":
         """Return the judge that a grounding makes, with the scatter of the `episodes` it was fitted to.
 
+        It is the model that was fitted to all of these, which the scatter and the failure model are of, too.
         Where these tell failures and it has no failure model, one of `failure_members` networks is fitted,
         which foresees failures within `failure_steps`.
         """
-        scatter = grounding.scatter(episodes)
+        grounding, scatter = grounding.reduced(members=False, failures=True), grounding.scatter(episodes)
         if (
             failure_members
             and isinstance(grounding, HistoryGrounding)

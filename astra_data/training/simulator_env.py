@@ -22,7 +22,7 @@ class DataStarts:
 
     Attributes:
         state: φ(s_i), (N, X). goal: (N, G). previous_action: a_{i-1}, (N, A).
-        hidden: the grounding's memory before s_i, (N, H); None where it remembers nothing.
+        hidden: the grounding's memory before s_i, and its failure model's, (N, H); None where there is none.
     """
 
     state: Tensor

@@ -8,6 +8,7 @@ from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.failures import (
+    averages_before,
     compared_foresight,
     failing,
     fit_failures,
@@ -25,6 +26,7 @@ from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 HERE = torch.tensor([0.0, 4.0, 0.0, 0.0])
+ROW = torch.tensor([0])
 
 
 def grounding_model() -> GroundingModel:
@@ -171,13 +173,36 @@ def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before() 
         state, before = windows.state[episode, begun][None], windows.previous_action[episode, begun][None]
         hidden = grounding.hidden_before(windows)[episode, begun][None]
         goal = windows.goal[episode, begun][None]
-        world.start(state, torch.tensor([0]), goal, hidden=hidden, previous_action=before)
+        world.start(state, ROW, goal, hidden=hidden, previous_action=before)
         memory = failures.initial_memory(state, before)
         for action in windows.action[episode, begun : step + 1]:
             here = world.state
             world.step(action[None])
             inputs, memory = failures.inputs(here, action[None], world.landed, memory)
         torch.testing.assert_close(seen[episode, step], inputs[0], atol=1e-4, rtol=1e-4)
+
+
+def test_a_failure_model_remembers_what_a_replay_showed_it() -> None:
+    episodes, used = hurried(3, 0), HistoryGrounding(grounding_model())
+    windows = episodes.windows
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    failures.set_move_scales(windows)
+    drawn = torch.random.get_rng_state()
+    averages = averages_before(TASK, used, failures, episodes)
+    assert torch.equal(torch.random.get_rng_state(), drawn)
+    assert averages.shape == (3, 100, 15)
+    assert not averages[:, 0].any()
+    for episode, step, begun in ((1, 1, 0), (1, 60, 0), (0, 61, 20), (1, 99, 40)):
+        world = used.corrected(TASK.simulator(1), None)
+        state, before = windows.state[episode, begun][None], windows.previous_action[episode, begun][None]
+        hidden = used.hidden_before(windows)[episode, begun][None]
+        world.start(state, ROW, windows.goal[episode, begun][None], hidden=hidden, previous_action=before)
+        memory = failures.initial_memory(state, before)
+        for action in windows.action[episode, begun:step]:
+            here = world.state
+            world.step(action[None])
+            _, memory = failures.inputs(here, action[None], world.landed, memory)
+        torch.testing.assert_close(averages[episode, step], memory[0, -15:], atol=1e-4, rtol=1e-4)
 
 
 def test_what_the_target_did_later_is_not_seen() -> None:

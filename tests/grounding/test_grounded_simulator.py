@@ -241,7 +241,7 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     assert not torch.allclose(fresh.topple_risk(), wanted)
 
 
-def test_within_a_history_a_failure_model_knows_the_action_before_and_nothing_else() -> None:
+def test_within_a_history_a_failure_model_knows_the_action_before_and_what_it_is_told() -> None:
     used, failures = model(), failure_model()
     hidden, before, action = torch.randn(3, 8), torch.rand(3, 2), actions(1)[0]
     middle = foreseeing(used, failures)
@@ -252,6 +252,15 @@ def test_within_a_history_a_failure_model_knows_the_action_before_and_nothing_el
     memory = failures.initial_memory(HERE.expand(3, 4), before)
     said, _ = failures.step(HERE.expand(3, 4), action, raw.step(action), memory)
     torch.testing.assert_close(middle.topple_risk(), failures.hazard(said))
+    averages = torch.rand(3, 15)
+    middle.start(
+        HERE.expand(3, 4), ROWS, GOAL, hidden=torch.cat([hidden, averages], 1), previous_action=before
+    )
+    middle.step(action)
+    known = failures.initial_memory(HERE.expand(3, 4), before, averages)
+    warm, _ = failures.step(HERE.expand(3, 4), action, raw.state, known)
+    torch.testing.assert_close(middle.topple_risk(), failures.hazard(warm))
+    assert not torch.allclose(warm, said)
     states = torch.zeros(1, 5, 4)
     of = toy_episodes(states, torch.zeros(1, 5, 2), next_state=states).windows
     assert HistoryGrounding(used, failures).hidden_before(of).shape == (1, 5, 8)

@@ -106,15 +106,18 @@ def test_the_last_real_step_counts_and_the_one_after_does_not() -> None:
     mask[0, :50], mask[1, :49], mask[2, :10] = 1.0, 1.0, 1.0
     cut = replace(given, windows=replace(given.windows, mask=mask))
     raw = gap_report(TASK, untrained(), cut, seed=0)["raw"]["position_m"]
-    # 50 steps fit into the first episode alone: the mean over one replay, without any spread.
+    # 50 steps fit into the first episode alone: the mean over one replay, which has no interval.
     assert raw["mean"][2] == pytest.approx(0.1 * 0.5 * 50 * TASK.timestep_s, rel=0.01)
-    assert raw["low"][2] == raw["mean"][2] == raw["high"][2]
+    assert raw["low"][2] is raw["high"][2] is None
+    assert raw["low"][1] < raw["mean"][1] < raw["high"][1]
 
 
 def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     torch.manual_seed(0)
     errors, episode = torch.rand(400, dtype=torch.float64), torch.arange(400)
     mean, low, high = _interval(errors, episode, np.random.default_rng(0))
+    assert low is not None
+    assert high is not None
     assert mean == pytest.approx(float(errors.mean()))
     error = float(errors.std()) / 400**0.5
     assert (mean - low, high - mean) == pytest.approx((1.96 * error, 1.96 * error), rel=0.15)
@@ -127,6 +130,8 @@ def test_long_episodes_weigh_more_also_where_they_are_resampled() -> None:
     """Every other episode has three errors of 0, the others one of 1."""
     episode = torch.arange(400).repeat_interleave(torch.tensor([3, 1]).repeat(200))
     mean, low, high = _interval((episode % 2).double(), episode, np.random.default_rng(0))
+    assert low is not None
+    assert high is not None
     assert mean == 0.25
     assert 0.2 < low < 0.25 < high < 0.3
 

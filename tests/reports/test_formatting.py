@@ -2,7 +2,17 @@ import numpy as np
 import pytest
 from jinja2 import UndefinedError
 
-from astra_data.reports.formatting import duration, fill, inline, interval, mean_std, short, spread, table
+from astra_data.reports.formatting import (
+    duration,
+    fill,
+    inline,
+    interval,
+    mean_std,
+    measured,
+    short,
+    spread,
+    table,
+)
 from astra_data.reports.statistics import Summary
 
 
@@ -24,6 +34,11 @@ def test_a_value_without_an_interval_stands_alone() -> None:
     assert interval(0.5, 0.125, 1.0) == "0.50 [0.12, 1.00]"
     assert interval(61.6, 60.4, 70.0, 0) == "62 [60, 70]"
     assert interval(0.5, None, None, 1) == interval(0.5, None, 1.0, 1) == "0.5"
+
+
+def test_a_measured_value_has_three_digits() -> None:
+    assert measured(0.12345, 0.1, 1234.5) == "0.123 [0.1, 1.23e+03]"
+    assert measured(0.12345, None, None) == "0.123"
 
 
 @pytest.mark.parametrize(

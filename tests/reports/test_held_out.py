@@ -50,6 +50,22 @@ def test_enough_is_where_more_makes_no_difference(
     assert "averaged over seeds 0, 1." in page.read_text()
 
 
+def test_a_single_held_out_episode_settles_nothing(tmp_path: Path) -> None:
+    for percent in (50, 100):
+        for seed in (0, 1):
+            write(tmp_path, percent, seed, 0.1)
+    file = tmp_path / "ground/nas/percent_100/seed_1/gap.json"
+    gap = json.loads(file.read_text())
+    gap["grounded"]["x"] |= {end: [gap["grounded"]["x"][end][0], None] for end in ("low", "high")}
+    file.write_text(json.dumps(gap))
+    page = write_held_out("r", tmp_path, ("nas",), (0, 1), (50, 100), timestep_s=0.05)
+    assert page is not None
+    lines = page.read_text().splitlines()
+    told = "withheld, as 100 % have a seed with a single held-out episode of that length."
+    assert f"- NAS, `x`, 10 steps ahead: {told}" in lines
+    assert any(line.startswith("| 100 % | NAS | 0.1 [0.09, 0.11] | 1 |") for line in lines)
+
+
 def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
     for percent in (25, 100):
         write(tmp_path, percent, 0, 0.1)

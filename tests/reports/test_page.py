@@ -100,8 +100,8 @@ def test_the_papers_figures_stand_beside_ours(results: Results, page: str) -> No
 
 def test_open_loop_errors_have_the_raw_simulator_once_if_all_share_it(results: Results, page: str) -> None:
     assert "| `position_m` | 1 step | 10 steps |" in page
-    assert "| No grounding | 1 [0.5, 2] | 2 [1, nan] |" in page
-    assert "| ASTRA, grounded | 0.2 [0.1, 0.4] | 0.4 [0.2, nan] |" in page
+    assert "| No grounding | 1 [0.5, 2] | 2 |" in page
+    assert "| ASTRA, grounded | 0.2 [0.1, 0.4] | 0.4 |" in page
     gap = results.methods["astra"].gap
     assert gap is not None
     other = gap.model_copy(update={"raw": gap.grounded})

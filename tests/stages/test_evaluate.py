@@ -1,5 +1,7 @@
+import copy
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import torch
 from fake_dataset import writer
 from small_run import TRAIN
 from torch import Tensor
+from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors
 from astra_data.core.digest import file_digest
@@ -17,6 +20,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
+from astra_data.grounding.files import load_grounding, save_grounding
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.rma import RmaConfig
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
@@ -123,6 +128,23 @@ def test_simulators_that_all_rows_share_begin_and_reward_alike(
     follower, _ = make(task, "follower", tmp_path / "follower", {"reference": grounded})
     assert "simulated" not in follower
     assert min(follower["raw"]["return"]) > max(transferred["raw"]["return"])
+
+
+def test_members_have_no_part_in_the_simulator_that_all_rows_share(
+    task: str, grounded: Path, tmp_path: Path
+) -> None:
+    alone = load_grounding(grounded / "grounding.safetensors")
+    assert isinstance(alone, HistoryGrounding)
+    other = copy.deepcopy(alone.model)
+    list(other.corrections.parameters())[-1].add_(0.5)
+    shutil.copytree(grounded, tmp_path / "members")
+    with_members = replace(alone, members=(other, other))
+    save_grounding(tmp_path / "members/grounding.safetensors", with_members, no_episodes())
+    tested = [
+        make(task, "follower", tmp_path / f"follower {place}", {"reference": reference})[0]["grounded"]
+        for place, reference in (("alone", grounded), ("members", tmp_path / "members"))
+    ]
+    assert tested[0] == tested[1]
 
 
 def test_longer_legs_change_the_target_alone(task: str, tmp_path: Path) -> None:

@@ -6,12 +6,14 @@ from pydantic import ValidationError
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
+from astra_data.grounding.failures import averages_before
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.build_env import EnvConfig, env_parts, training_env
 from astra_data.training.ramp import Ramp
@@ -103,6 +105,24 @@ def test_rows_may_differ_by_their_members(episodes: PairedEpisodes) -> None:
         with torch.no_grad():
             landed = world.simulator.step(torch.full((16, 2), 0.5))
         assert len(landed.unique(dim=0)) == (2 if keeps else 1)
+
+
+def test_starts_within_the_data_know_what_a_failure_model_remembers(
+    episodes: PairedEpisodes, grounding: HistoryGrounding
+) -> None:
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    foresees = replace(grounding, failures=failures)
+    seen = {}
+    for reward in ("abstract", "blend"):
+        config = EnvConfig.model_validate({"reward": reward, "data_start_share": 0.5})
+        starts = env_parts(TASK, config, episodes, foresees).starts
+        assert starts is not None
+        assert starts.hidden is not None
+        seen[reward] = starts.hidden
+    averages = averages_before(TASK, foresees, failures, episodes)
+    assert torch.equal(seen["blend"][:, :8], seen["abstract"])
+    assert torch.equal(seen["blend"][:, 8:], averages[episodes.windows.mask.bool()])
+    assert float(averages[:, 50].abs().sum()) > 0
 
 
 def test_scatter_is_what_the_simulator_does_not_explain(

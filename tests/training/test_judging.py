@@ -41,6 +41,15 @@ def policy(folder: Path, judge: Judge) -> RunningPolicy:
     return running(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
 
 
+def test_members_do_not_judge(folder: Path, judge: Judge) -> None:
+    made = judge.grounding
+    assert isinstance(made, HistoryGrounding)
+    with_members = replace(made, members=(made.model, made.model))
+    again = Judge.of(TASK, with_members, PairedEpisodes.load(folder / "pair/seed_0"))
+    assert isinstance(again.grounding, HistoryGrounding)
+    assert again.grounding.members == ()
+
+
 @pytest.mark.parametrize("foresees", [True, False])
 def test_a_judge_ends_episodes_by_its_failure_model_or_else_scatters_states(
     foresees: bool,

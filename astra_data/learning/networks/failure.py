@@ -104,10 +104,20 @@ class FailureModel(nn.Module):
         self.input_mean.copy_(inputs.mean(0))
         self.input_std.copy_(inputs.std(0).clamp_min(1e-3))
 
-    def initial_memory(self, state: Tensor, previous_action: Tensor) -> Tensor:
-        """Return the memory (n, M) of episodes that start in `state` (n, X)."""
-        averages = state.new_zeros(len(state), len(AVERAGED_S) * _MAGNITUDES)
+    def initial_memory(
+        self, state: Tensor, previous_action: Tensor, averages: Tensor | None = None
+    ) -> Tensor:
+        """Return the memory (n, M) of episodes that start in `state` (n, X).
+
+        `averages` (n, 15) are those of the history before; by default there is none.
+        """
+        if averages is None:
+            averages = state.new_zeros(len(state), self.averages_size)
         return torch.cat([state, state, previous_action, averages], dim=-1)
+
+    def averages_of(self, inputs: Tensor) -> Tensor:
+        """Return the averages (..., 15) among what the networks saw of a step, (..., I)."""
+        return inputs[..., _MAGNITUDES : _MAGNITUDES + self.averages_size]
 
     def step(self, state: Tensor, action: Tensor, landed: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the probability (B,) of a failure within `risk_steps`, and the next memory (B, M).
@@ -161,9 +171,14 @@ class FailureModel(nn.Module):
         return sum(self._parts)
 
     @property
+    def averages_size(self) -> int:
+        """Of the averages of each magnitude over each time."""
+        return len(AVERAGED_S) * _MAGNITUDES
+
+    @property
     def _parts(self) -> list[int]:
         shape = self.shape
-        return [shape.state_size, shape.state_size, shape.action_size, len(AVERAGED_S) * _MAGNITUDES]
+        return [shape.state_size, shape.state_size, shape.action_size, self.averages_size]
 
     def _averaged(self, averages: Tensor, magnitudes: Tensor) -> Tensor:
         """Move averages (B, 3 * 5) towards `magnitudes` (B, 5), each at its rate."""
