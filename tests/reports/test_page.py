@@ -108,8 +108,8 @@ def test_open_loop_errors_have_the_raw_simulator_once_if_all_share_it(results: R
     rows = rows_of(results, follower={"grounding": "nas", "gap": other})
     changed = page_of(results, methods=rows)
     assert "No grounding" not in changed
-    assert "| NAS, no grounding | 0.2 [0.1, 0.4] | 0.4 [0.2, nan] |" in changed
-    assert "| ASTRA, no grounding | 1 [0.5, 2] | 2 [1, nan] |" in changed
+    assert "| NAS, no grounding | 0.2 [0.1, 0.4] | 0.4 |" in changed
+    assert "| ASTRA, no grounding | 1 [0.5, 2] | 2 |" in changed
     assert "## Gap" not in page_of(results, methods=rows_of(results, **{key: {"gap": None} for key in ROWS}))
 
 
