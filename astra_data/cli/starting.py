@@ -18,6 +18,12 @@ def new(
             "--from", help="Its logs: CSV files, or folders of them.", show_default="those of a made-up cart"
         ),
     ] = None,
+    more: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG]...", help="More logs, as a shell writes --from logs/*.csv out.", show_default=False
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:
     """Begin with a robot of your own: a task, a recipe, a mapping of its logs, a test and a page."""
@@ -26,7 +32,7 @@ def new(
     from astra_data.experiments.new_robot import write_robot
 
     folder = out or Path(name)
-    kind = write_robot(name, folder, logs or ())
+    kind = write_robot(name, folder, [*(logs or ()), *(more or ())])
     found = kind.logs
     table = Table("field", "taken for", "unit", "factor", "why")
     for field in found.fields:

@@ -96,6 +96,8 @@ def load_tables(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         nearby = [str(file) for file in sorted(path.parent.glob("*.toml"))]
         raise RecipeError(f"{path} does not exist{did_you_mean(str(path), nearby)}") from None
+    except IsADirectoryError:
+        raise RecipeError(f"{path} is a folder: expected a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path} cannot be read as a text file: {error}") from None
     try:
@@ -220,10 +222,15 @@ def _section(model: type[BaseModel], location: Iterable[int | str]) -> type[Base
     """Follow `location` through the nested models; None where it leaves them."""
     section: type[BaseModel] | None = model
     choices: dict[str, type[BaseModel]] = {}
+    names_freely = False
     for part in location:
+        if names_freely:  # the key of a dictionary, whose values are of the section
+            names_freely = False
+            continue
         if part not in choices:
             field = section.model_fields.get(str(part)) if section else None
             choices = _nested_models(field.annotation) if field else {}
+            names_freely = field is not None and get_origin(field.annotation) is dict
             part = _UNNAMED
         section = choices.get(str(part))
     return section

@@ -46,7 +46,11 @@ def read_numbers(path: Path, numbered: re.Pattern[str]) -> dict[str, Floats]:
     }
     names = [name for name, _ in fields]
     usable = [name for name, values in numbers.items() if np.isfinite(values).any()]
-    if len(table) < 2 or not usable or any(names.count(name) > 1 for name in usable):
+    if len(table) < 2:
+        raise BadInputError(
+            f"{path}: expected two rows or more below its header, got {len(table)}: leave it out"
+        )
+    if not usable or any(names.count(name) > 1 for name in usable):
         raise BadInputError(
             f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
         )

@@ -25,7 +25,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.endings import Endings, is_terminated
 from astra_data.exchange.conversion import Converter, Mask
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block
+from astra_data.exchange.recording import Block, row_name
 
 REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
 """Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
@@ -116,7 +116,7 @@ class Cutter:
         rejected = ~finite
         if rejected.any():
             first = row + int(np.argmax(rejected))
-            self.tally.rejected_first = self.tally.rejected_first or f"{block.origin} row {first}"
+            self.tally.rejected_first = self.tally.rejected_first or row_name(block.origin, first)
             self.tally.rejected_rows += int(rejected.sum())
         counters = self._count(block, row, columns, rejected, is_apart=is_apart)
         self._keep_ends(columns, counters[:-1], finite)
@@ -237,7 +237,7 @@ class Cutter:
                 steps_s = np.diff(times[:, 0])
                 masks["back"], masks[key] = steps_s < 0, self._gaps(steps_s)
                 if masks["back"].any():
-                    first = f"{block.origin} row {row + int(np.argmax(masks['back']))}"
+                    first = row_name(block.origin, row + int(np.argmax(masks["back"])))
                     self.tally.back_first = self.tally.back_first or first
                     self.tally.back_rows += int(masks["back"].sum())
                 now[key] = times[1:]

@@ -7,66 +7,32 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
+from astra_data.exchange.field_names import (
+    ANGLE,
+    COMMAND,
+    COMMANDED,
+    EPISODE,
+    FORCE,
+    FULL_TURNS,
+    LENGTH,
+    NAMES,
+    PLACE_TO_GO,
+    TIMES,
+    UNCLEAR,
+    UNITS,
+    Role,
+)
 from astra_data.exchange.importers.csv import csv_files
 
 Floats = NDArray[np.float64]
-Role = Literal["time", "episode", "state", "command", "failure", "success", "reward", "left out"]
-
-_COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref"
-_NAMES: tuple[tuple[Role, str], ...] = (
-    ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
-    ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
-    ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
-    ("failure", r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|colli(sion|ded)|fault|terminated"),
-    ("success", r"success|succeeded|reached|delivered|solved"),
-    ("reward", r"reward"),
-    (
-        "command",
-        r"(.+_)?(cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref)(_.+|\d+)?|u(_.+|\d+)?",
-    ),
-)
-"""Roles by the whole of a field's name, without its unit; all other fields are states."""
-_UNCLEAR = "done|truncated|timeout"
-"""Ends of which the name does not say whether they are successes, failures or neither."""
-_FORCE = re.compile(r"(.+_)?(tau|torque|effort)(_.+|\d+)?")
-"""A command where there is no other."""
 RATE_HZ = 10
 """Of logs without a time."""
-_UNITS: tuple[tuple[str, str, float], ...] = (
-    ("mm_s", "m/s", 1e-3),
-    ("cm_s", "m/s", 1e-2),
-    ("m_s", "m/s", 1.0),
-    ("deg_s", "rad/s", math.pi / 180),
-    ("rad_s", "rad/s", 1.0),
-    ("rpm", "rad/s", math.pi / 30),
-    ("mm", "m", 1e-3),
-    ("cm", "m", 1e-2),
-    ("m", "m", 1.0),
-    ("deg", "rad", math.pi / 180),
-    ("rad", "rad", 1.0),
-    ("nm", "N m", 1.0),
-    ("n", "N", 1.0),
-    ("v", "V", 1.0),
-    ("a", "A", 1.0),
-)
-"""Endings of names, the unit that values are stored in, and the factor to it."""
-_TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
-_ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
-LENGTH = re.compile(
-    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
-)
-_FULL_TURNS = 4 * math.pi
-"""An angle beyond it is taken for degrees."""
-_EPISODE = re.compile(dict(_NAMES)["episode"])
-_COMMAND = re.compile(rf"(^|_)({_COMMANDED}|u)(_|(?=\d)|$)")
 
 
 @dataclass(frozen=True)
@@ -92,8 +58,9 @@ class Logs:
 
     Attributes:
         fields: in the order of the logs.
-        episodes: of each, the scaled values (T,) by a field's name, of the rows with a number in each state.
-        left_out: rows without one: how many by the state's name.
+        episodes: of each, the scaled values (T,) by a field's name, of the rows with a number in each state
+            and command.
+        left_out: rows without one: how many by the name of the state or command.
     """
 
     fields: tuple[Field, ...]
@@ -128,7 +95,7 @@ def guess(paths: Sequence[Path]) -> Logs:
             fields come to the same name, or there are no commands, no states or no episodes of two rows.
     """
     files = [file for path in paths for file in csv_files(path)]
-    tables = {file: read_numbers(file, _EPISODE) for file in files}
+    tables = {file: read_numbers(file, EPISODE) for file in files}
     first = next(iter(tables.values()))
     header = [name for name in first if all(name in table for table in tables.values())]
     for file, table in tables.items():
@@ -137,18 +104,25 @@ def guess(paths: Sequence[Path]) -> Logs:
                 f"{file}: expected the fields of {files[0]}, {_filled(first)}: got {_filled(table)}"
             )
     joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
+    guessed = []
+    for name, values in joined.items():
+        try:
+            guessed.append(_field(name, values))
+        except BadInputError as error:
+            lacking = next(file for file, table in tables.items() if not np.isfinite(table[name]).all())
+            raise BadInputError(f"{lacking}: {error}") from None
     try:
-        fields = _distinct([_field(name, values) for name, values in joined.items()])
+        fields = _goals_apart(_distinct(guessed), list(tables.values()))
     except BadInputError as error:
         raise BadInputError(f"{files[0]}: {error}") from None
-    states = [field.name for field in fields if field.role == "state"]
-    gaps = {name: int((~np.isfinite(joined[name])).sum()) for name in states}
-    episodes = tuple(_episodes(fields, (_whole(table, states) for table in tables.values())))
+    needed = [field.name for field in fields if field.role in ("state", "command")]
+    gaps = {name: int((~np.isfinite(joined[name])).sum()) for name in needed}
+    episodes = tuple(_episodes(fields, (_whole(table, needed) for table in tables.values())))
     if all(len(values) < 2 for episode in episodes for values in episode.values()):
         cut = [field.name for field in fields if field.role == "episode"]
         why = f"{' and '.join(cut)} changes in every row: leave it out" if cut else "record longer"
         raise BadInputError(f"{files[0]}: expected episodes of two rows or more, found none: {why}")
-    found = Logs(fields, episodes, {name: gaps[name] for name in states if gaps[name]})
+    found = Logs(fields, episodes, {name: gaps[name] for name in needed if gaps[name]})
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if not found.of(role):  # type: ignore[arg-type]
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
@@ -172,7 +146,7 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     if not any(field.role == "command" for field in fields):
         fields = [
             replace(field, role="command", why="a force, and no other command")
-            if field.role == "state" and _FORCE.fullmatch(field.short)
+            if field.role == "state" and FORCE.fullmatch(field.short)
             else field
             for field in fields
         ]
@@ -194,6 +168,19 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
+def _goals_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> tuple[Field, ...]:
+    """Return the fields, with places to go as goals where each log has but one."""
+
+    def is_goal(field: Field) -> bool:
+        body, _ = _without_unit(plain_name(field.name), [end for end, _, _ in UNITS])
+        return bool(PLACE_TO_GO.fullmatch(body)) and all(np.ptp(table[field.name]) == 0 for table in tables)
+
+    return tuple(
+        replace(field, role="goal", why="one place in each log") if is_goal(field) else field
+        for field in fields
+    )
+
+
 def _field(name: str, values: Floats) -> Field:
     plain = plain_name(name)
     left_out = partial(Field, name, "left out", plain, "1", 1.0)
@@ -201,31 +188,34 @@ def _field(name: str, values: Floats) -> Field:
         return left_out("no letter a to z and no digit in its name")
     if not np.isfinite(values).any():
         return left_out("texts, dates or nothing: expected numbers, of a time in s, ms, us or ns")
-    body, ending = _without_unit(plain, _TIMES)
-    if re.fullmatch(_NAMES[0][1], body):
+    body, ending = _without_unit(plain, TIMES)
+    if re.fullmatch(NAMES[0][1], body):
         _check_finite(name, "time", values)
         if (np.diff(values) > 0).mean() <= 0.9:
             return left_out("a time that does not rise")
         step = float(np.median(np.diff(values)))
         unit = ending or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
         why = "its ending" if ending else f"steps of {step:g}"
-        return Field(name, "time", "time", unit, _TIMES[unit], why)
-    if re.fullmatch(_UNCLEAR, plain):
+        return Field(name, "time", "time", unit, TIMES[unit], why)
+    if re.fullmatch(UNCLEAR, plain):
         return left_out("an end, but which? name it success or failed")
-    body, ending = _without_unit(plain, [end for end, _, _ in _UNITS])
-    if ending in ("n", "v", "a") and re.fullmatch(f"{_COMMANDED}|u", body):
+    body, ending = _without_unit(plain, [end for end, _, _ in UNITS])
+    if ending in ("n", "v", "a") and re.fullmatch(f"{COMMANDED}|u", body):
         body, ending = plain, None  # an axis, as in cmd_v
     is_flag = bool(np.isin(values, (0, 1)).all())
-    for role, pattern in _NAMES[1:]:
+    for role, pattern in NAMES[1:]:
         if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
-            if role in ("failure", "success") and not is_flag:
+            if is_flag != (role in ("failure", "success")) and role in ("failure", "success", "goal"):
                 continue
+            if role == "goal":
+                return _with_unit(name, role, body, ending, values)
             if role != "command":
                 return Field(name, role, role, "1", 1.0, "its name")
-            _check_finite(name, "command", values)
-            if np.ptp(values) == 0:
+            if np.isfinite(values).mean() <= MOSTLY:
+                _check_finite(name, "command", values)
+            if np.ptp(values[np.isfinite(values)]) == 0:
                 return left_out("never changes")
-            short = _COMMAND.sub("_", body).strip("_") or "command"
+            short = COMMAND.sub("_", body).strip("_") or "command"
             return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
     finite = np.isfinite(values)
     if finite.mean() <= MOSTLY or np.ptp(values[finite]) == 0:
@@ -249,22 +239,22 @@ def _without_unit(name: str, endings: Sequence[str] | dict[str, float]) -> tuple
 
 
 def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Floats) -> Field:
-    for known, unit, scale in _UNITS:
+    for known, unit, scale in UNITS:
         if ending == known:
             return Field(name, role, short, unit, scale, "its ending")
-    if role == "state" and _ANGLE.fullmatch(short):
-        if (largest := np.nanmax(np.abs(values))) > _FULL_TURNS:
+    if role in ("state", "goal") and ANGLE.fullmatch(short):
+        if (largest := np.nanmax(np.abs(values))) > FULL_TURNS:
             return Field(name, role, short, "rad", math.pi / 180, f"an angle up to {largest:.0f}: degrees")
         return Field(name, role, short, "rad", 1.0, "its name")
-    if role == "state" and LENGTH.fullmatch(short):
+    if role in ("state", "goal") and LENGTH.fullmatch(short):
         return Field(name, role, short, "m", 1.0, "its name")
     return Field(name, role, short, "1", 1.0, "no unit in its name")
 
 
-def _whole(table: dict[str, Floats], states: Sequence[str]) -> dict[str, Floats]:
-    """Return the rows of a file with a number in each of its `states`."""
-    kept = np.all([np.isfinite(table[name]) for name in states], axis=0)
-    return {name: values[kept] for name, values in table.items()} if states else table
+def _whole(table: dict[str, Floats], needed: Sequence[str]) -> dict[str, Floats]:
+    """Return the rows of a file with a number in each of the fields `needed`."""
+    kept = np.all([np.isfinite(table[name]) for name in needed], axis=0)
+    return {name: values[kept] for name, values in table.items()} if needed else table
 
 
 def _episodes(fields: Sequence[Field], tables: Iterable[dict[str, Floats]]) -> Iterator[dict[str, Floats]]:

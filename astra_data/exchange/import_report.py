@@ -7,6 +7,9 @@ from astra_data.dataset.columns import TERMINATED
 from astra_data.dataset.endings import Endings
 from astra_data.exchange.cutting import Tally
 
+_SHOWN = 8
+"""Files that are listed."""
+
 
 @dataclass(frozen=True)
 class ImportReport:
@@ -18,6 +21,7 @@ class ImportReport:
         frames: number of steps.
         tally: of the rows that were read and dropped.
         wall_seconds: duration of the import.
+        unused: the files of which no episode was made.
     """
 
     root: Path
@@ -25,6 +29,7 @@ class ImportReport:
     frames: int
     tally: Tally
     wall_seconds: float
+    unused: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Summarise it in a few lines."""
@@ -33,11 +38,13 @@ class ImportReport:
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
+        more = f" and {len(self.unused) - _SHOWN} more" if len(self.unused) > _SHOWN else ""
+        unused = f"files without an episode: {', '.join(self.unused[:_SHOWN])}{more}\n" if self.unused else ""
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
             f"split points: {points}\n"
-            f"{ends}{rate}"
+            f"{ends}{rate}{unused}"
             f"rejected rows: {tally.rejected_rows}{first}\n"
             f"last rows without a next state: {_last_rows(tally)}; "
             f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}"

@@ -113,10 +113,11 @@ def import_dataset(
     first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
-        raise BadInputError(
-            f"{', '.join(map(str, recordings))}: no episodes, "
-            f"each of which needs two rows where logs have no next states ({losses(cutter.tally)})"
-        )
+        leaps = cutter.tally.split_points.get("gap", 0)
+        why = "each of which needs two rows where logs have no next states"
+        if 2 * leaps > cutter.tally.rows:
+            why = f"'{settings.time}' steps by over gap_s in {leaps} rows: correct time_scale or gap_s"
+        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes, {why} ({losses(cutter.tally)})")
     description = {
         "name": settings.name,
         "version": settings.version,
@@ -124,18 +125,27 @@ def import_dataset(
         "config": settings.model_dump(exclude_defaults=True) | {"recordings": identities(sources)},
     }
     root = place(description) if out is None else out
+    if root.exists():
+        raised = f"raise `version` in the mapping (now {settings.version}), " if mapping else ""
+        raise BadInputError(f"{root} exists already: {raised}give another --name or --out, or delete it")
     frames = count = 0
+    origins: set[str] = set()
     with DatasetWriter(
         root, cutter.columns, fps=settings.fps, task=settings.task, description=description
     ) as writer:
         for count, (columns, metadata) in enumerate(chain([first], cuts), start=1):
             writer.add(Episode(count - 1, columns, metadata))
+            origins.add(str(metadata["source"]))
             frames += len(columns[TRUNCATED])
         _refuse_rejected(cutter.tally, settings)
         cutter.check_rate()
         seconds = time.perf_counter() - began
         writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
-    return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began)
+    names = [str(source) for source in sources]
+    # Where episodes are parts of files, their origins are no files' names.
+    are_files = settings.split.files and origins <= set(names)
+    unused = tuple(name for name in names if are_files and name not in origins)
+    return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began, unused)
 
 
 def _record(source: Source, file_format: str) -> ExportRecord | None:
@@ -198,7 +208,10 @@ def _sources(recording: Path, file_format: str) -> list[Source]:
 def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> ImportMapping:
     module = FORMATS[file_format]
     if not hasattr(module, "layout"):
-        raise BadInputError(f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml")
+        written = ", which `astra-data new NAME --from LOGS` writes" if file_format == "csv" else ""
+        raise BadInputError(
+            f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml{written}"
+        )
     with _explained(source, file_format):
         keys = module.layout(source) | options
     missing = [f"--{key}" for key in ("name", "fps") if key not in keys]

@@ -159,6 +159,11 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
     return members
 
 
+def row_name(origin: str, row: int) -> str:
+    """Name a row, counted from 0 in its part of a file; of CSV the line, as an editor numbers it."""
+    return f"{origin} line {row + 2}" if origin.lower().endswith((".csv", ".tsv")) else f"{origin} row {row}"
+
+
 def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:
     """Return how many rows `fields` have.
 

@@ -34,7 +34,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
     try:
         source = open_dataset(recipe.data)
     except BadInputError as error:
-        raise BadInputError(f"data: {error}: import or pull it first") from None
+        raise BadInputError(f"data: {str(error).rstrip('.')}: import or pull it first") from None
     if ABSTRACT_STATE in source.features:
         raise BadInputError(
             f"data: {source.reference} has been paired, and a recipe pairs by itself: give it the dataset "

@@ -17,8 +17,9 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.atomic import atomic_folder
-from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, TERMINATED
-from astra_data.exchange.guessing import Logs, Role, guess
+from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TERMINATED
+from astra_data.exchange.field_names import Role
+from astra_data.exchange.guessing import Logs, guess
 from astra_data.experiments.robot_kinds import Direct, Planar, significant, texts
 
 _COLUMNS: dict[Role, str] = {
@@ -104,7 +105,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         if logs.left_out
         else "",
         "split": "".join(["\n[split]\n", *split]) if split else "",
-        "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)),
+        "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)) + _goals(logs),
         "window": str(max(2, min(20, horizon // 4))),
         "size": str(len(states)),
         "state": texts(field.short for field in states),
@@ -133,6 +134,18 @@ def _column(role: Role, logs: Logs) -> str:
     else:
         lines.append(f"fields = {_toml([fields[0].name])}")
     return "\n".join(lines) + "\n"
+
+
+def _goals(logs: Logs) -> str:
+    """Return what to write into a mapping where a task takes the goals of the logs; nothing without any."""
+    if not (goals := logs.of("goal")):
+        return ""
+    return (
+        "\n# CHECK: the logs have goals, and the task drives to one place. Give its objective goal_size and\n"
+        "# draw_goals, so that it takes them:\n"
+        f'# [columns."{GOAL}"]\n# fields = {_toml([field.name for field in goals])}\n'
+        f"# scale = {_toml([field.scale for field in goals])}\n"
+    )
 
 
 def _toml(value: str | Sequence[str] | Sequence[float]) -> str:

@@ -3,14 +3,15 @@
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.guessing import HEADING, LENGTH, Field, Floats, Logs
+from astra_data.exchange.field_names import HEADING, LENGTH
+from astra_data.exchange.guessing import Field, Floats, Logs
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|rot|steer).*")
 _SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
@@ -46,7 +47,7 @@ class Planar:
         states = {field.short: field for field in logs.of("state")}
         for short, x in states.items():
             y = states.get(f"{short[:-1]}y")
-            if short[-1] != "x" or y is None or not LENGTH.fullmatch(short):
+            if short[-1] != "x" or y is None or not LENGTH.fullmatch(short) or not _moves(logs, (x, y)):
                 continue
             angles = [name for name in states if HEADING.fullmatch(name)]
             pairs = [name[:-2] for name in states if HEADING.fullmatch(name[:-2]) and name.endswith("_x")]
@@ -187,6 +188,11 @@ class Direct:
         }
 
 
+def _moves(logs: Logs, fields: Sequence[Field]) -> bool:
+    """Return whether one of the fields changes within an episode."""
+    return any(np.ptp(values, axis=0).any() for values in logs.values(fields))
+
+
 def _may_move(command: Field, state: Field) -> bool:
     """Return whether the units, where both are known, are the same but for a time."""
     return "1" in (command.unit, state.unit) or command.unit.removesuffix("/s") == state.unit
@@ -197,10 +203,14 @@ def _length(filled: list[Field | None]) -> int:
 
 
 def _typical(episodes: list[Floats]) -> tuple[Floats, float]:
-    """Return the end (D,) of the episode whose way from its start is the median, and a tenth of the way."""
+    """Return the end (D,) of the episode whose way from its start is the median, and a tenth of the way.
+
+    Where that ends as it began, it is a tenth of the farthest way that an episode went.
+    """
     ways = [float(np.linalg.norm(values[-1] - values[0])) for values in episodes]
     typical = int(np.argsort(ways)[len(ways) // 2])
-    return episodes[typical][-1], ways[typical] / 10
+    farthest = max(float(np.linalg.norm(values - values[0], axis=1).max()) for values in episodes)
+    return episodes[typical][-1], (ways[typical] or farthest) / 10
 
 
 def _numbers(values: Iterable[float] | Floats, brackets: str = "[]") -> str:

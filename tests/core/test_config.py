@@ -4,7 +4,7 @@ from typing import Literal
 import pytest
 from pydantic import Field, ValidationError
 
-from astra_data.core.config import Config, did_you_mean, faults_of, load_recipe, own_settings
+from astra_data.core.config import Config, did_you_mean, faults_of, load_recipe, own_settings, validated
 from astra_data.core.errors import BadInputError, RecipeError
 
 
@@ -94,8 +94,11 @@ def test_a_missing_or_unreadable_recipe_is_one_line(tmp_path: Path) -> None:
     write(tmp_path, "")
     with pytest.raises(RecipeError, match=r"recipes\.toml does not exist: did you mean '.*recipe\.toml'\?$"):
         load_recipe(tmp_path / "recipes.toml", Experiment)
-    with pytest.raises(RecipeError, match="cannot be read as a text file"):
+    with pytest.raises(RecipeError, match="is a folder: expected a TOML file"):
         load_recipe(tmp_path, Experiment)
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(RecipeError, match="cannot be read as a text file"):
+        load_recipe(tmp_path / "binary.toml", Experiment)
 
 
 def test_names_without_a_close_match_are_all_listed() -> None:
@@ -150,3 +153,18 @@ def test_of_a_file_that_nobody_wrote_by_hand_the_first_faults_are_told() -> None
     five = "; ".join(f"numbers.{place}: Input should be a valid integer" for place in range(5))
     assert told('{"numbers": ["a", "b", "c", "d", "e"]}') == five
     assert told('{"numbers": ["a", "b", "c", "d", "e", "f", "g"]}') == f"{five}; and 2 more"
+
+
+class Part(Config):
+    unit: str = ""
+
+
+class Parts(Config):
+    columns: dict[str, Part] = Field(default_factory=dict)
+    fps: int = 1
+
+
+def test_a_key_of_a_table_of_any_name_is_hinted_at_by_itself() -> None:
+    for name in ("action", "unit"):
+        with pytest.raises(RecipeError, match=rf"columns\.{name}\.units: unknown key: did you mean 'unit'\?"):
+            validated({"columns": {name: {"units": "m"}}}, Parts, "it")

@@ -146,7 +146,8 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
     ("text", "expected"),
     [
         ("", "expected CSV with a header"),
-        ("x,cmd\n", "expected a header of different names, and rows of numbers below it"),
+        ("x,cmd\n", "expected two rows or more below its header, got 0: leave it out"),
+        ("x,cmd\n1,2\n", "expected two rows or more below its header, got 1: leave it out"),
         ("x,x,cmd\n1,2,3\n2,3,4\n", "expected a header of different names"),
         (
             "t,x\n0,1\n1,2\n2,3\n",
@@ -291,3 +292,50 @@ def test_a_number_of_the_row_makes_no_episodes(tmp_path: Path, time: dict[str, o
     log = write(tmp_path / "log.csv", {**time, "trial": RAMP, "x": RAMP, "cmd": RAMP})
     with pytest.raises(BadInputError, match=r"episodes of two rows .* trial changes in every row: leave it"):
         guess([log])
+
+
+def test_goals_are_told_from_states_and_commands(tmp_path: Path) -> None:
+    files = [
+        write(
+            tmp_path / f"{number}.csv",
+            {
+                "goal_x": 3.0 + number,
+                "goal_yaw_deg": 90.0 * number,
+                "target_x": 2.0 + number,
+                "target_y": RAMP,
+                "target_q1": 1.0 + number,
+                "dist_to_goal": RAMP[::-1],
+                "goal_reached": RAMP > 4,
+                "pose_x": RAMP,
+                "cmd_v": -RAMP,
+            },
+        )
+        for number in range(2)
+    ]
+    logs = guess(files)
+    found = {field.name: (field.role, field.unit, field.why) for field in logs.fields}
+    assert found == {
+        "goal_x": ("goal", "m", "its name"),
+        "goal_yaw_deg": ("goal", "rad", "its ending"),
+        "target_x": ("goal", "1", "one place in each log"),
+        "target_y": ("command", "1", "no unit in its name"),
+        "target_q1": ("command", "1", "no unit in its name"),
+        "dist_to_goal": ("state", "1", "no unit in its name"),
+        "goal_reached": ("success", "1", "its name"),
+        "pose_x": ("state", "m", "its name"),
+        "cmd_v": ("command", "1", "no unit in its name"),
+    }
+
+
+def test_a_hole_in_a_command_is_one_as_in_a_state(tmp_path: Path) -> None:
+    command = np.arange(30.0) % 3
+    command[[4, 17]] = np.nan
+    whole = write(tmp_path / "a.csv", {"t": np.arange(30) / 10, "x": np.arange(30), "cmd_x": 1.0}, rows=30)
+    holes = {"t": np.arange(30) / 10, "x": np.arange(30), "cmd_x": command}
+    logs = guess([whole, write(tmp_path / "b.csv", holes, rows=30)])
+    assert logs.left_out == {"cmd_x": 2}
+    assert [len(values) for values in logs.values(logs.of("state"))] == [30, 28]
+    times = np.where(np.arange(30) == 7, np.nan, np.arange(30) / 10)
+    write(tmp_path / "b.csv", holes | {"t": times}, rows=30)
+    with pytest.raises(BadInputError, match=r"b\.csv: t: expected a number in each row of a time"):
+        guess([whole, tmp_path / "b.csv"])

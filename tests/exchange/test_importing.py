@@ -221,3 +221,57 @@ def test_what_is_given_beside_a_mapping_overrides_it(tmp_path: Path) -> None:
     log = write_table(tmp_path / "log.npz", rows())
     dataset, _ = imported(tmp_path, log, name="strolls", fps=25, task="stroll")
     assert (dataset.description["name"], dataset.info["fps"], dataset.task) == ("strolls", 25, "stroll")
+
+
+def csv_logs(folder: Path, *texts: str) -> Path:
+    (folder / "logs").mkdir()
+    for number, text in enumerate(texts):
+        (folder / f"logs/{number}.csv").write_text(text)
+    mapping = folder / "logs.toml"
+    mapping.write_text(
+        'name = "logs"\ntask = "t"\nfps = 10\ntime = "t"\nnot_finite = "split"\n[split]\ngap_s = 0.5\n'
+        '[columns."observation.state"]\nfields = ["x"]\n[columns.action]\nfields = ["a"]\n'
+    )
+    return mapping
+
+
+def drive(rows: int, period: float = 0.1) -> str:
+    return "t,x,a\n" + "".join(f"{row * period},{row},{row}\n" for row in range(rows))
+
+
+def test_files_of_which_nothing_is_left_are_named(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, drive(9), drive(1), drive(5))
+    report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    assert (report.episodes, report.unused) == (2, ("1.csv",))
+    assert "\nfiles without an episode: 1.csv\n" in str(report)
+
+
+def test_a_time_in_another_unit_is_told_where_every_step_is_a_gap(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, drive(50, period=100.0))
+    with pytest.raises(
+        BadInputError, match=r"no episodes, 't' steps by over gap_s in 49 rows: correct time_sc"
+    ):
+        import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+
+
+def test_a_second_import_is_told_to_raise_the_version(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, drive(9))
+    import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    told = r"out exists already: raise `version` in the mapping \(now 1\.0\.0\)"
+    with pytest.raises(BadInputError, match=told):
+        import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+
+
+def test_rows_of_csv_are_named_by_their_lines(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, "t,x,a\n0,0,0\n0.1,1,1\n0.2,,2\n0.3,3,3\n0.4,4,4\n")
+    report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    assert report.tally.rejected_first == "0.csv line 4"
+
+
+def test_rows_that_are_missing_are_told_with_the_rate(tmp_path: Path) -> None:
+    lines = drive(200).splitlines(keepends=True)
+    mapping = csv_logs(
+        tmp_path, "".join(line for number, line in enumerate(lines) if number % 5 or not number)
+    )
+    report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    assert "gaps: 39 (25 % of the steps: rows are missing), jitter" in str(report)

@@ -226,3 +226,18 @@ def test_of_two_fields_that_end_episodes_one_is_left_out_aloud(tmp_path: Path) -
     assert "| left out | 1 | 1 | a second failure: make one field of both |" in page and not shown.exit_code
     assert '[columns."next.terminated"]\nfields = ["fell"]' in Path("slide/logs.toml").read_text()
     assert "| `\\|v\\|` | state v |" in page
+
+
+def test_goals_of_the_logs_are_kept_for_who_wants_them(tmp_path: Path) -> None:
+    log, rows = tmp_path / "log.csv", np.arange(20.0)
+    columns = {"goal_x": 0 * rows + 3, "goal_y_cm": 0 * rows + 400, "x": rows, "y": rows % 7, "yaw": rows % 3}
+    columns |= {"cmd_v": rows % 5, "cmd_w": rows % 2}
+    np.savetxt(log, np.column_stack([*columns.values()]), "%.3f", ",", header=",".join(columns), comments="")
+    write_robot("cart", tmp_path / "cart", [log])
+    mapping = (tmp_path / "cart/logs.toml").read_text()
+    assert "goal" not in "".join(line for line in mapping.splitlines() if not line.startswith("#"))
+    commented = mapping[mapping.index("# [columns.") :].replace("# ", "")
+    assert tomllib.loads(commented)["columns"]["observation.environment_state"] == {
+        "fields": ["goal_x", "goal_y_cm"],
+        "scale": [1.0, 0.01],
+    }

@@ -143,3 +143,24 @@ def test_commands_may_be_where_to_be(tmp_path: Path) -> None:
 def test_something_has_to_move(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="found no state that a command could move"):
         Direct.of(logs(tmp_path, vel_a=T % 4, cmd_1=T % 5))
+
+
+def test_a_place_to_go_is_no_place_of_the_robot(tmp_path: Path) -> None:
+    fixed = {"base_x": 3 + 0 * T, "base_y": 4 + 0 * T}
+    for drive in range(2):
+        columns = {name: values + drive for name, values in fixed.items()}
+        columns |= {"x": T, "y": T % 9, "yaw": T % 3, "cmd_v": T % 5, "cmd_w": T % 2}
+        table = np.column_stack([*columns.values()])
+        np.savetxt(tmp_path / f"{drive}.csv", table, "%.6f", ",", header=",".join(columns), comments="")
+    kind = Planar.of(guess([tmp_path]))
+    assert kind is not None
+    assert [field.short for field in kind.position] == ["x", "y"]
+
+
+def test_where_episodes_end_as_they_began_near_is_a_tenth_of_the_farthest_way(tmp_path: Path) -> None:
+    there_and_back = np.minimum(T, 49 - T)
+    kind = Planar.of(logs(tmp_path, x=there_and_back, y=0 * T + 1, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
+    assert kind is None  # y never changes, and is left out
+    kind = Planar.of(logs(tmp_path, x=there_and_back, y=there_and_back, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
+    assert kind is not None
+    assert float(kind.values()["close"]) == pytest.approx(np.hypot(24, 24) / 10, rel=0.05)

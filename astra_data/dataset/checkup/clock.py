@@ -90,10 +90,10 @@ class Clock:
             return f"{self._fps} Hz declared; {self._name} does not go on in most steps"
         if self._is_off:
             return f"{self._fps} Hz declared, and {self._off} by {self._name}"
-        return (
-            f"{self._fps} Hz declared, {1 / self.period_s:.4g} Hz by {self._name}; gaps: {self.gaps}, jitter "
-            f"{100 * self.jitter:.1f} % of a period"
-        )
+        share, rate = self.gaps / int(self._bins.sum()), f"{1 / self.period_s:.4g} Hz by {self._name}"
+        missing = f" ({100 * share:.0f} % of the steps: rows are missing)" if share >= MANY_GAPS else ""
+        jitter = f"jitter {100 * self.jitter:.1f} % of a period"
+        return f"{self._fps} Hz declared, {rate}; gaps: {self.gaps}{missing}, {jitter}"
 
     def findings(self, called: str) -> list[Finding]:
         """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""

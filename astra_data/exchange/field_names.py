@@ -1,0 +1,61 @@
+"""What the names of fields in logs say: roles and units."""
+
+import math
+import re
+from typing import Literal
+
+Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
+
+COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref"
+NAMES: tuple[tuple[Role, str], ...] = (
+    ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
+    ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
+    ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
+    (
+        "failure",
+        r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|colli(sion|ded)|bump(ed|er)?|e_?stop|fault|"
+        "terminated",
+    ),
+    ("success", r"success|succeeded|(goal_)?reached|at_goal|delivered|solved"),
+    ("reward", r"reward"),
+    ("goal", r"(?!.*dist)(.+_)?(goal|destination|waypoint)(_(x|y|z|yaw|heading|theta|psi|lat|lon))?"),
+    (
+        "command",
+        r"(.+_)?(cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref)(_.+|\d+)?|u(_.+|\d+)?",
+    ),
+)
+"""Roles by the whole of a field's name, without its unit; all other fields are states."""
+PLACE_TO_GO = re.compile(r"(target|ref|desired|des)_[xyz]")
+"""A goal where it stays the same in each log, and otherwise a command."""
+UNCLEAR = "done|truncated|timeout"
+"""Ends of which the name does not say whether they are successes, failures or neither."""
+FORCE = re.compile(r"(.+_)?(tau|torque|effort)(_.+|\d+)?")
+"""A command where there is no other."""
+UNITS: tuple[tuple[str, str, float], ...] = (
+    ("mm_s", "m/s", 1e-3),
+    ("cm_s", "m/s", 1e-2),
+    ("m_s", "m/s", 1.0),
+    ("deg_s", "rad/s", math.pi / 180),
+    ("rad_s", "rad/s", 1.0),
+    ("rpm", "rad/s", math.pi / 30),
+    ("mm", "m", 1e-3),
+    ("cm", "m", 1e-2),
+    ("m", "m", 1.0),
+    ("deg", "rad", math.pi / 180),
+    ("rad", "rad", 1.0),
+    ("nm", "N m", 1.0),
+    ("n", "N", 1.0),
+    ("v", "V", 1.0),
+    ("a", "A", 1.0),
+)
+"""Endings of names, the unit that values are stored in, and the factor to it."""
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
+ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
+LENGTH = re.compile(
+    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
+)
+FULL_TURNS = 4 * math.pi
+"""An angle beyond it is taken for degrees."""
+EPISODE = re.compile(dict(NAMES)["episode"])
+COMMAND = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")
