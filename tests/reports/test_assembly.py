@@ -204,3 +204,19 @@ def test_a_row_that_was_in_no_simulator_has_no_success_there(root: Path) -> None
     assert row.simulated_success is None and "simulated_success" not in row.summary
     assert np.isnan(row.learning[0].score).all()
     assert row.simulator_returns["raw"] == [0.0, 1.0, 4.0]
+
+
+def test_legs_of_the_target_are_those_of_the_evaluations(root: Path) -> None:
+    for seed in SEEDS:
+        edit_json(root / f"evaluate/astra/seed_{seed}/evaluation.json", leg_scale=1.25)
+    assert assembled(root, ("astra",)).leg_scale == 1.25
+
+
+def test_what_foretells_no_target_has_no_validity(root: Path) -> None:
+    for seed in SEEDS:
+        folder = root / f"evaluate/astra/seed_{seed}"
+        edit_json(folder / "evaluation.json", tested_in="grounded", target=None)
+        tensors = load_file(folder / "trajectories.safetensors")
+        tensors["grounded.position"] = tensors["target.position"]
+        save_file(tensors, folder / "trajectories.safetensors")
+    assert assembled(root, ("astra",)).predictive_validity == {}

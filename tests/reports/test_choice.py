@@ -126,3 +126,9 @@ def test_level_quartiles_are_told_apart_by_the_mean() -> None:
     found = choice_of(of, None, measured=measured, replicates=50)
     assert found is not None and found.rank_correlation is not None
     assert found.rank_correlation.value == pytest.approx(1.0)
+
+
+def test_a_row_with_enough_seeds_that_does_not_vary_is_not_said_to_have_too_few() -> None:
+    level: list[Line] = [("a", seed, 0.9, 0.1 * seed) for seed in range(3)]
+    found = choice(*level, ("b", 0, 0.5, 0.2))
+    assert found.withheld["rank_correlation"] == "in no row do both sides vary"

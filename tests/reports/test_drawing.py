@@ -4,17 +4,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_dataset import write_fake
-from fake_runs import ROWS, SEEDS, edit_json, write_runs
+from fake_runs import ROWS, SEEDS, edit_json, outcomes, write_runs
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import place
 from astra_data.reports.assembly import assemble
 from astra_data.reports.drawing import Camera, figure_of_sizes, figures_of
+from astra_data.reports.figures.style import DEPLOYED, SIMULATED
 from astra_data.reports.schema import Learning, Results
 from astra_data.reports.sizes import SizeResults, SizesResults
+from astra_data.reports.statistics import Summary
 from astra_data.worlds.plane.mazes import U_MAZE, Maze
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS
 
@@ -156,3 +158,58 @@ def test_sizes_are_mapped_where_all_datasets_of_a_seed_are_there(results: Result
     lines = figure.axes[-1].lines
     astra = results.methods["astra"].summary["success"].iqm
     assert np.asarray(lines[2].get_xydata()).tolist() == [[50, astra], [100, astra]]
+
+
+def test_crosses_stand_where_episodes_fail_in_either_world(results: Results, tmp_path: Path) -> None:
+    folder = write_runs(tmp_path) / "evaluate/astra/seed_0"
+    edit_json(
+        folder / "evaluation.json", target=outcomes([1, 0, 0, 0], 0), simulated=outcomes([0, 1, 1, 1], 0)
+    )
+    tensors = load_file(folder / "trajectories.safetensors")
+    tensors["target.position"][1, :, 1] = tensors["simulated.position"][1, :, 1] = 0.0
+    save_file(tensors, folder / "trajectories.safetensors")
+    (panel,) = drawn(results, folder.parents[2], U_MAZE, methods=("astra",))["trajectories"].axes
+    crosses = {
+        colour: [
+            np.asarray(line.get_xydata())[0].tolist()
+            for line in panel.lines
+            if line.get_marker() == "x" and line.get_color() == colour
+        ]
+        for colour in (DEPLOYED, SIMULATED)
+    }
+    assert crosses == {DEPLOYED: [[4, 0]], SIMULATED: [[4, 4]]}
+
+
+def test_bars_are_interquartile_means_and_diamonds_and_numbers_of_panels_are_means(
+    results: Results, root: Path
+) -> None:
+    """Of three seeds, as the toy rows have them, both are the same."""
+    apart = {
+        "success": Summary(0.4, 0.1, 0.6, 0.5, 0.7),
+        "simulated_success": Summary(0.8, 0.1, 0.9, 0.8, 1.0),
+    }
+    rows = {
+        name: row.model_copy(update={"summary": row.summary | apart}) for name, row in results.methods.items()
+    }
+    found = results.model_copy(update={"methods": rows})
+    figures = drawn(found, root, U_MAZE)
+    (bars,) = figures["success"].axes
+    assert {bar.get_width() for bar in bars.patches} == {0.6}  # type: ignore[attr-defined]
+    diamonds = [line for line in bars.lines if line.get_marker() == "D"]
+    assert {float(np.asarray(line.get_xdata())[0]) for line in diamonds} == {0.8}
+    assert {axes.get_title(loc="right") for axes in figures["trajectories"].axes} == {"0.40"}
+    sizes = [SizeResults(percent=100, results=found)]
+    lines = (
+        figure_of_sizes(SizesResults(recipe="toy", task="maze", command="", sizes=sizes), root).axes[0].lines
+    )
+    assert np.asarray(lines[0].get_xydata()).tolist() == [[100, 0.6]]
+
+
+def test_no_figure_is_of_the_target_where_nothing_was_tested_there(results: Results, root: Path) -> None:
+    found = results.model_copy(update={"tested_in": "simulators"})
+    figures = drawn(found, root, U_MAZE)
+    assert figures["success"].axes[0].get_xlabel() == "success rate in a simulator"
+    assert figures["trajectories"].legends[0].get_texts()[1].get_text() == "in a simulator"
+    sizes = [SizeResults(percent=100, results=found)]
+    figure = figure_of_sizes(SizesResults(recipe="toy", task="maze", command="", sizes=sizes), root)
+    assert figure.axes[0].get_ylabel() == "success rate in a simulator"

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.figures import reliability
-from astra_data.reports.held_out import write_held_out
+from astra_data.reports.held_out import enough, write_held_out
+from astra_data.reports.schema import BandMeans, GapMeans
 
 Rates = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
@@ -142,3 +143,13 @@ def test_the_figure_pools_the_steps_of_all_seeds_by_bin(
     np.testing.assert_allclose(predicted, [0.01, (60 * 0.2 + 120 * 0.3) / 180, 0.6])
     np.testing.assert_allclose(observed, [0.01, (60 * 0.1 + 120 * 0.7) / 180, 0.5])
     assert steps.tolist() == [900.0, 180.0, 20.0]
+
+
+def test_enough_is_judged_at_ten_steps_though_errors_are_known_further_ahead() -> None:
+    def gap(ten: float) -> GapMeans:
+        mean = [0.1, ten, 0.8]
+        band = BandMeans(mean=mean, low=[0.9 * one for one in mean], high=[1.1 * one for one in mean])
+        return GapMeans(seeds=[0], horizons=[1, 10, 50], grounded={"x": band}, raw={"x": band})
+
+    found = enough("NAS", "x", {50: gap(0.4), 100: gap(0.2)}, [1, 10, 50])
+    assert found == "NAS, `x`, 10 steps ahead: the error still falls up to 100 %: more data may help."

@@ -244,3 +244,52 @@ def test_failures_that_are_foreseen_have_a_table_and_a_figure(tmp_path: Path) ->
     assert page.table("On held-out episodes")[1] == line
     assert len(page.attributes("img")) == 1 and "Reliability of the failure model" in page.text
     assert "Reliability" not in read_page(render_html(results, {})).text
+
+
+def test_correlations_and_comparisons_stand_below_their_names(tmp_path: Path) -> None:
+    page = read_page(render_html(toy(tmp_path), {}))
+    # Returns are 0, 1 and 2 in the target and 0, 1 and 4 in the raw simulator: in order, not on a line.
+    head, raw, _ = page.table("Correlation")
+    assert head == ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"]
+    assert raw[2].startswith("0.96 [") and raw[3].startswith("1.00 [")
+    page, values = published("antmaze_long_fresh")
+    found = [of for others in values["probability_of_improvement"].values() for of in others.values()]
+    assert [line[2:] for line in page.table("Probability")[1:]] == [
+        [f"{of['probability']:.2f}", f"[{of['low']:.2f}, {of['high']:.2f}]"] for of in found
+    ]
+
+
+def test_sizes_have_a_table_of_interquartile_means_too() -> None:
+    page, values = published("cart_sizes")
+    head, nas, _ = page.table("Interquartile mean with its 95 % interval")
+    assert head == ["method", "10 %", "25 %", "50 %", "100 %"]
+    for size, cell in zip(values["sizes"], nas[1:], strict=True):
+        row = size["results"]["methods"]["nas"]
+        summary = row["summary"]["success"]
+        middle = np.mean(np.sort(row["success"])[1:-1])  # of five seeds
+        assert cell == f"{middle:.2f} [{summary['low']:.2f}, {summary['high']:.2f}]"
+
+
+@pytest.mark.parametrize(
+    ("special", "told"),
+    [
+        ({"leg_scale": 1.25}, "The target\N{RIGHT SINGLE QUOTATION MARK}s legs are 1.25 times as long."),
+        ({"unfinished": ["RMA", "NAS"]}, "Not finished yet: RMA, NAS."),
+        (
+            {"stand_in": "mujoco"},
+            "A simulated stand-in (mujoco) takes the physical robot",
+        ),
+    ],
+)
+def test_the_head_says_what_is_special(tmp_path: Path, special: dict[str, object], told: str) -> None:
+    results = toy(tmp_path)
+    assert told in read_page(render_html(results.model_copy(update=special), {})).text
+    assert told not in read_page(render_html(results, {})).text
+
+
+def test_what_is_foreseen_stands_below_its_window(tmp_path: Path) -> None:
+    page = read_page(render_html(toy(tmp_path), {}, [["x"] * 7]))
+    head = [cell.replace("\N{EN DASH}", " to ") for cell in page.table("On held-out episodes")[0]]
+    assert head == [
+        *("simulator", "failures", "AUC 1 to 20 steps", "11 to 30", "21 to 40", "Brier skill", "sure")
+    ]

@@ -84,3 +84,32 @@ def test_what_was_chosen_is_a_line_for_each_size() -> None:
     untested = small.model_copy(update={"choice": choice_of(judged, 50, measured={}, replicates=100)})
     page = render_sizes(FOUND.model_copy(update={"sizes": [SizeResults(percent=50, results=untested)]}), {})
     assert "| 50 % | ASTRA, seed 1 | 0.60 | - | - | - |" in page
+
+
+def test_regret_stands_before_the_one_at_random() -> None:
+    those = [Candidate(row="astra", seed=seed, percent=50, success={0: 0.6 - 0.1 * seed}) for seed in (0, 1)]
+    judged = Judged(judge="nas", episodes=5, candidates=those)
+    measured = {("astra", 0): 0.4, ("astra", 1): 0.7}
+    small = SMALL.model_copy(update={"choice": choice_of(judged, 50, measured=measured, replicates=100)})
+    page = render_sizes(FOUND.model_copy(update={"sizes": [SizeResults(percent=50, results=small)]}), {})
+    assert "| size | chosen | predicted [95 %] | in the target | regret | regret at random |" in page
+    assert "| 50 % | ASTRA, seed 0 | 0.60 | 0.40 | 0.30 | 0.15 |" in page
+
+
+def test_a_sweep_without_a_target_says_so_first() -> None:
+    sizes = [
+        SizeResults(percent=size.percent, results=size.results.model_copy(update={"tested_in": "simulators"}))
+        for size in FOUND.sizes
+    ]
+    page = render_sizes(FOUND.model_copy(update={"sizes": sizes}), {})
+    assert page.startswith("# toy\n\n**Nothing was tested on a robot")
+    assert "Mean ± standard deviation over seeds, in a simulator." in page
+
+
+def test_a_choice_is_made_once_for_all_sizes() -> None:
+    times = {"select": 60.0, "subset": 20.0, "total": 80.0}
+    size = SizeResults(percent=50, results=SMALL.model_copy(update={"wall_seconds": times}))
+    page = render_sizes(
+        FOUND.model_copy(update={"sizes": [size, size.model_copy(update={"percent": 100})]}), {}
+    )
+    assert "Wall time of the stages, summed: 2 min." in page  # 60 + 20 + 20 s

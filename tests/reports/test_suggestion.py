@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -52,3 +54,31 @@ def test_the_page_says_where_to_start_what_to_hold_and_how_to_record_it(suggesti
     assert "astra-data collect rail.py:TASK --plan plan.json" in page
     alone = suggestion_page(LOGS_ALONE, suggestion, maps, named="rail.py:LOGS_ALONE", origin=["a", "b"])
     assert "bring it to each start" in alone and "astra-data collect" not in alone
+
+
+def test_commands_follow_one_another(suggestion: Suggestion) -> None:
+    action = torch.tensor([[1.0], [1.0], [-1.0], [1.0], [1.0]])
+    plan = suggestion.plan.model_copy(update={"episodes": (planned(TASK, torch.zeros(1), action, 5.0),)})
+    of = replace(suggestion, plan=plan)
+    page = suggestion_page(TASK, of, maps_of(TASK, of), named="rail.py:TASK", origin=["ground/nas/seed_0"])
+    held = ["| 0 | 0.00 | 0.20 | 4.000 |", "|  | 0.20 | 0.10 | -1.000 |", "|  | 0.30 | 0.20 | 4.000 |"]
+    assert "\n".join(held) in page
+    # Of 1 + 1 + 1 + 4 and 2 + 2 + 2 / 2 + 0 nats the second is taken.
+    assert "6.0 on average, those suggested 5.0." in page
+
+
+def test_the_cells_that_teach_most_come_first_unless_hardly_a_step_is_in_them(suggestion: Suggestion) -> None:
+    cells = {
+        "axes": ["x"],
+        "edges": [[0.0, 1.0, 2.0, 3.0, 4.0, 5.0]],
+        "information": [1.0, 3.0, None, 2.0, 9.0],
+        "steps": [20.0, 30.0, 0.0, 25.0, 19.0],
+    }
+    maps = {"state": cells, "command": cells}
+    page = suggestion_page(TASK, suggestion, maps, named="rail.py:TASK", origin=["ground/nas/seed_0"])
+    lines = [
+        "| 1.00 to 2.00 | 3.000 | 30 |",
+        "| 3.00 to 4.00 | 2.000 | 25 |",
+        "| 0.00 to 1.00 | 1.000 | 20 |",
+    ]
+    assert "| --- | ---: | ---: |\n" + "\n".join(lines) + "\n\n" in page and "| 4.00 to 5.00" not in page

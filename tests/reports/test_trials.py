@@ -38,3 +38,13 @@ def test_the_page_says_who_was_tried_how_often_with_what_success() -> None:
     page = select_page("cart", JUDGED, done)
     assert "**NAS, seed 1**: success 0.62 by the prediction and its trials. 6 of 9 episodes" in page
     assert "| 2 | NAS | 1 | 2 | 2 | 0.62 |" in page  # (4 · 0.25 + 4) / (4 + 4)
+
+
+def test_the_prior_of_trials_is_the_lower_quartile() -> None:
+    one = Candidate(row="astra", seed=1, success={0: 0.0, 2: 1.0})
+    judged = Judged(judge="nas", episodes=5, candidates=[one])
+    tried = TrialRound(
+        trials=2, candidates=[("astra", 1)], tried=[Tried(row="astra", seed=1, success=[0, 1])]
+    )
+    page = select_page("cart", judged, BEGUN.model_copy(update={"rounds": [tried]}))
+    assert "| 1 | ASTRA | 1 | 1 | 2 | 0.33 |" in page  # (4 · 0.25 + 1) / (4 + 2)

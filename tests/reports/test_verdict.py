@@ -10,7 +10,7 @@ from astra_data.reports.assembly import assemble
 from astra_data.reports.comparing import summarised
 from astra_data.reports.files import read_published
 from astra_data.reports.schema import Choice, Ranked, Results
-from astra_data.reports.statistics import share_interval
+from astra_data.reports.statistics import Summary, share_interval
 from astra_data.reports.verdict import Verdict, _ends, verdict_of
 
 PUBLISHED = Path(__file__).parents[2] / "recipes/results"
@@ -241,3 +241,42 @@ def test_a_choice_below_the_floor_does_not_overlap_with_it(results: Results) -> 
     apart = with_success(results, astra=[0.25, 0.25, 0.25], direct_transfer=[1.0, 1.0, 1.0])
     found = verdict_of(apart.model_copy(update={"choice": choice}))
     assert not any("overlap" in remark for remark in found.remarks)
+
+
+def test_intervals_are_those_of_the_interquartile_mean(results: Results) -> None:
+    row = results.methods["astra_plus"]
+    summary = row.summary | {"success": Summary(0.9, 0.1, 0.95, 0.85, 0.98)}
+    rows = results.methods | {"astra_plus": row.model_copy(update={"summary": summary})}
+    verdict = verdict_of(results.model_copy(update={"methods": rows}))
+    assert "; interquartile mean 0.95, 95 % interval 0.85 to 0.98)" in sentence(verdict)
+    assert verdict.facts[0].note == "success, 3 seeds; IQM 0.95 [0.85, 0.98]"
+
+
+def test_the_facts_of_a_choice_have_intervals_of_their_own(tmp_path: Path) -> None:
+    predicted, measured, *_ = verdict_of(made(tmp_path, select=True)).facts
+    assert predicted.note.replace("\N{NO-BREAK SPACE}", " ") == "95 % [1.00, 1.00], by 3 judges"
+    # Wilson's interval of 3 of 4 episodes.
+    assert measured.note.replace("\N{NO-BREAK SPACE}", " ") == "95 % [0.30, 0.95], 4 episodes of this policy"
+
+
+@pytest.mark.parametrize(("ours", "its", "few"), [(3, 5, [3]), (5, 3, [3]), (4, 5, [])])
+def test_the_row_with_fewer_seeds_decides_whether_there_are_enough(
+    results: Results, ours: int, its: int, few: list[int]
+) -> None:
+    seeds = {"astra_plus": (ours, 1.0), "direct_transfer": (its, 0.0)}
+    rows = {
+        name: summarised(
+            results.methods[name].model_copy(update={"seeds": [*range(count)], "success": [share] * count}),
+            100,
+        )
+        for name, (count, share) in seeds.items()
+    }
+    remarks = verdict_of(results.model_copy(update={"methods": results.methods | rows})).remarks
+    chance = "by chance, equal rows may lie as far apart."
+    assert remarks == [f"ASTRA+ and Direct transfer have {count} seeds to compare: {chance}" for count in few]
+
+
+def test_a_reference_is_no_tie(results: Results) -> None:
+    # As many as the follower, which is the ceiling.
+    verdict = verdict_of(with_success(results, astra_plus=[1.0, 1.0, 1.0]))
+    assert verdict.row == "astra_plus" and not any("As good" in remark for remark in verdict.remarks)

@@ -85,3 +85,23 @@ def test_rows_of_mazes_are_four_wide_and_long_titles_small() -> None:
     assert grid is not None and grid.get_gridspec().get_geometry() == (2, 4)
     sizes = [axes._left_title.get_fontsize() for axes in figure.axes[:2]]  # type: ignore[attr-defined]
     assert sizes[0] < sizes[1] == 10.0
+
+
+def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
+    time_s = np.array([0.1, 0.2, 0.3])
+    simulated = np.tile([1.0, 2.0, 3.0, 4.0], (3, 1))
+    # 101 robots, a metre apart in x, two in y.
+    shift = np.arange(101.0)[:, None, None] * np.array([1.0, 2.0, 0.0, 0.0])
+    command = np.tile([0.8, -0.5], (3, 1))
+    x, y, _, sent = dynamics_mismatch(time_s, command, simulated, simulated + shift).axes
+    for axes, at, apart in ((x, 1.0, 1.0), (y, 2.0, 2.0)):
+        mean, one = (np.asarray(line.get_ydata()) for line in axes.lines)
+        assert one == pytest.approx(at) and mean == pytest.approx(at + 50 * apart)
+        for band, alpha, ends in zip(axes.collections, (0.18, 0.32), ((5, 95), (25, 75)), strict=True):
+            heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
+            assert band.get_alpha() == alpha
+            assert [heights.min(), heights.max()] == pytest.approx([at + apart * end for end in ends])
+    assert {line.get_linestyle(): np.asarray(line.get_ydata())[0] for line in sent.lines} == {
+        "-": 0.8,
+        ":": -0.5,
+    }
