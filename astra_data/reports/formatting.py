@@ -81,8 +81,11 @@ def measured(value: float, low: float | None, high: float | None) -> str:
 
 
 def short(rate: float) -> str:
-    """Return a rate with three significant digits, in thousands from 1000 on."""
-    return f"{rate / 1000:.3g} k" if rate >= 1000 else f"{rate:.3g}"
+    """Return a rate with three significant digits, in thousands from 1000 on, then in millions."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if rate >= 0.9995 * size:
+            return f"{rate / size:.3g} {unit}"
+    return f"{rate:.3g}"
 
 
 def duration(seconds: float | None) -> str:

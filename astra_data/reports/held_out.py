@@ -14,7 +14,7 @@ from astra_data.methods import method_title
 from astra_data.reports.artefacts import Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill, measured
-from astra_data.reports.schema import BandMeans, GapMeans
+from astra_data.reports.schema import GapMeans, shared_horizons
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def write_held_out(
     if not found:
         return None
     every = [gap for sizes in found.values() for gap in sizes.values()]
-    horizons = [h for h in every[0].horizons if all(h in gap.horizons for gap in every)]
+    horizons = shared_horizons(every)
     rates = failure_rates(root, groundings, seeds, max(percents, default=None))
     if rates:
         from astra_data.reports.figures import png, reliability
@@ -156,7 +156,7 @@ def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], hori
     interval of the largest.
     """
     horizon = max(h for h in horizons if h <= JUDGED_AT)
-    errors = {size: _at(gap.grounded[quantity], gap, horizon) for size, gap in sizes.items()}
+    errors = {size: gap.at(gap.grounded[quantity], horizon) for size, gap in sizes.items()}
     *smaller, largest = errors
     limit, least = errors[largest][2], largest
     where = f"{title}, `{quantity}`, {horizon} steps ahead: "
@@ -185,12 +185,6 @@ def _lines(
         bands = {"No grounding": (first.raw[quantity], first)}
         bands |= {title: (gap.grounded[quantity], gap) for title, gap in sized.items()}
         for title, (band, gap) in bands.items():
-            ends = [_at(band, gap, horizon) for horizon in horizons]
-            cells = [measured(*end) for end in ends]
+            cells = [measured(*gap.at(band, horizon)) for horizon in horizons]
             lines.append([*([f"{size} %"] if has_sizes else []), title, *cells])
     return lines
-
-
-def _at(band: BandMeans, gap: GapMeans, horizon: int) -> tuple[float, float | None, float | None]:
-    index = gap.horizons.index(horizon)
-    return band.mean[index], band.low[index], band.high[index]

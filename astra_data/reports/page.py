@@ -14,7 +14,7 @@ from astra_data.reports.cost_and_origin import (
     stage_costs,
 )
 from astra_data.reports.formatting import fill, interval, mean_std, measured, spread
-from astra_data.reports.schema import BandMeans, MethodResults, Results
+from astra_data.reports.schema import BandMeans, GapMeans, MethodResults, Results, shared_horizons
 from astra_data.reports.statistics import Correlation
 from astra_data.reports.tested import warning, where
 from astra_data.worlds.score import SUCCESS
@@ -149,8 +149,8 @@ def encoder_lines(results: Results) -> list[list[str]]:
 
 def horizon_titles(results: Results) -> list[str]:
     """Return the head of the tables of `gap_tables` behind their first column."""
-    first = next(iter(results.gaps().values()), None)
-    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in first.horizons] if first else []
+    gaps = list(results.gaps().values())
+    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in (shared_horizons(gaps) if gaps else ())]
 
 
 def gap_tables(results: Results) -> dict[str, list[list[str]]]:
@@ -158,22 +158,22 @@ def gap_tables(results: Results) -> dict[str, list[list[str]]]:
     gaps = {method_title(name): gap for name, gap in results.gaps().items()}
     if not gaps:
         return {}
-    first = next(iter(gaps.values()))
+    first, horizons = next(iter(gaps.values())), shared_horizons(list(gaps.values()))
+
+    def cells(gap: GapMeans, band: BandMeans) -> list[str]:
+        return [measured(*gap.at(band, horizon)) for horizon in horizons]
+
     tables = {}
     for quantity in first.grounded:
-        shared = all(gap.raw[quantity] == first.raw[quantity] for gap in gaps.values())
-        lines = [["No grounding", *_cells(first.raw[quantity])]] if shared else []
+        raw = {title: cells(gap, gap.raw[quantity]) for title, gap in gaps.items()}
+        shared = all(line == cells(first, first.raw[quantity]) for line in raw.values())
+        lines = [["No grounding", *cells(first, first.raw[quantity])]] if shared else []
         for title, gap in gaps.items():
             if not shared:
-                lines.append([f"{title}, no grounding", *_cells(gap.raw[quantity])])
-            lines.append([f"{title}, grounded", *_cells(gap.grounded[quantity])])
+                lines.append([f"{title}, no grounding", *raw[title]])
+            lines.append([f"{title}, grounded", *cells(gap, gap.grounded[quantity])])
         tables[quantity] = lines
     return tables
-
-
-def _cells(band: BandMeans) -> list[str]:
-    ends = zip(band.mean, band.low, band.high, strict=True)
-    return [measured(*end) for end in ends]
 
 
 def correlation_text(found: Correlation | None) -> str:

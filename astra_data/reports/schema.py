@@ -1,5 +1,6 @@
 """Results: the content of results.json. A row's lists are over its seeds, in the order of `seeds`."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
@@ -85,6 +86,16 @@ class GapMeans(Section):
     """Steps ahead."""
     grounded: dict[str, BandMeans]
     raw: dict[str, BandMeans]
+
+    def at(self, band: BandMeans, horizon: int) -> tuple[float, float | None, float | None]:
+        """Return mean, low and high of one of its bands at one of its horizons."""
+        index = self.horizons.index(horizon)
+        return band.mean[index], band.low[index], band.high[index]
+
+
+def shared_horizons(gaps: Sequence[GapMeans]) -> list[int]:
+    """Return the horizons that all gaps have; short held-out episodes have no long ones."""
+    return [horizon for horizon in gaps[0].horizons if all(horizon in gap.horizons for gap in gaps)]
 
 
 class Cost(Section):

@@ -58,27 +58,31 @@ class Verdict:
 def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     """Name the row to deploy: that of the chosen policy, or else the one with the best mean over seeds.
 
-    A row with a role, such as the floor, is a reference and never the one. Where nothing was tested in the
-    target, rows are compared by what judges predict, if a policy was chosen: they foresee failures.
+    A row with a role is a reference and not the one, unless a policy of the floor was chosen: then grounding
+    gained nothing. Where nothing was tested in the target, rows are compared by what judges predict, if a
+    policy was chosen: they foresee failures.
 
     Args:
         results: of all rows.
         percent: the size of the dataset, if there are several.
     """
-    references = [_of_row(results, row) for row in results.methods.values() if row.role]
+    references = {name: _of_row(results, row) for name, row in results.methods.items() if row.role}
     if len(references) == len(results.methods):
-        return Verdict(None, "No row to deploy: all rows are references.", "", "", [], references)
+        return Verdict(None, "No row to deploy: all rows are references.", "", "", [], [*references.values()])
     chosen = chosen_of(results)
     name = chosen.row if chosen else best_of(results)
     row = results.methods[name]
+    references.pop(name, None)
     worth = _worth(results)
     as_good = [floor.title for key, floor in _floors(results) if worth.get(key, -inf) >= worth[name]]
     opening = "Deploy"
-    if as_good:
+    if row.role:
+        opening = "No gain over the floor: of all policies, the one to deploy is"
+    elif as_good:
         opening = (
             f"No gain over the floor: {' and '.join(as_good)} does as well or better. Of the rest, deploy"
         )
-    facts = [_of_row(results, row), *references]
+    facts = [_of_row(results, row), *references.values()]
     remarks = [*_remarks(results, name, chosen)]
     if chosen:
         title, reason = named(chosen.row, chosen.seed), _why_chosen(results, chosen, percent)
@@ -93,7 +97,7 @@ def best_of(results: Results) -> str:
 
 
 def chosen_of(results: Results) -> Ranked | None:
-    """Return the best candidate of `select` whose row is tested and no reference; None without one."""
+    """Return the best candidate of `select` whose row is tested and no ceiling; None without one."""
     candidates = results.choice.candidates if results.choice else []
     return next((one for one in candidates if not _passed_over(results, one)), None)
 
@@ -103,7 +107,7 @@ def _passed_over(results: Results, one: Ranked) -> str:
     row = results.methods.get(one.row)
     if row is None:
         return "has not been tested yet"
-    return f"is of a reference row ({row.role})" if row.role else ""
+    return f"is of a reference row ({row.role})" if row.role not in (None, "floor") else ""
 
 
 def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
@@ -135,6 +139,8 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         if ties:
             yield f"As good by the mean: {', '.join(ties)}."
     for key, floor in _floors(results):
+        if floor is row:
+            continue
         if not is_predicted:
             yield from _against(results, row, floor)
         elif key in worth:

@@ -113,7 +113,7 @@ def report(
             scores=task.objective.scores,
             paper_success=config.paper_success,
             published=known.get(percent),
-        )
+        ).model_copy(update={"stand_in": task.facts.get("stand_in")})
         for percent in _made(recipe, root, known)
     }
     first, last = next(iter(sizes.values())), next(reversed(sizes.values()))
@@ -165,9 +165,8 @@ def _of_one(
     from astra_data.reports.drawing import figures_of
     from astra_data.reports.figures import dynamics_mismatch
 
-    found = results.model_copy(update={"stand_in": task.facts.get("stand_in")})
     figures = figures_of(
-        found,
+        results,
         root,
         maze=None if task.plane is None else task.maze,
         camera=_camera(task),
@@ -179,7 +178,7 @@ def _of_one(
         figures["mismatch"] = dynamics_mismatch(
             replay.time_s, replay.command, replay.simulated, replay.target
         )
-    return found, partial(render, found), figures
+    return results, partial(render, results), figures
 
 
 def _read(recipe: Reported, root: Path) -> dict[str, str]:

@@ -42,7 +42,11 @@ def test_a_measured_value_has_three_digits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "text"), [(0.01234, "0.0123"), (999.4, "999"), (1000, "1 k"), (123456, "123 k")]
+    ("rate", "text"),
+    [
+        *((0.01234, "0.0123"), (999.4, "999"), (999.7, "1 k"), (1000, "1 k"), (123456, "123 k")),
+        *((999_400, "999 k"), (999_600, "1 M"), (1_234_567, "1.23 M")),
+    ],
 )
 def test_rates_have_three_digits(rate: float, text: str) -> None:
     assert short(rate) == text

@@ -199,3 +199,32 @@ def test_every_figure_has_a_place_on_a_page_and_only_those_drawn_are_shown(resul
     assert places == sorted(places)
     alone = render(results, {"gap": "gap.png"})
     assert "## Open-loop error by horizon\n\n![Open-loop error by horizon](gap.png)\n\nThe simulator" in alone
+
+
+def test_errors_are_of_the_horizons_that_all_groundings_have(results: Results) -> None:
+    gap = results.methods["astra"].gap
+    assert gap is not None
+    short = {
+        name: band.model_copy(update={"mean": [3.0], "low": [2.0], "high": [4.0]})
+        for name, band in gap.raw.items()
+    }
+    other = gap.model_copy(update={"horizons": [1], "raw": short, "grounded": short})
+    for order in (("nas", "astra"), ("astra", "nas")):
+        gaps = {"nas": other, "astra": gap}
+        rows = rows_of(
+            results,
+            follower={"grounding": order[0], "gap": gaps[order[0]]},
+            astra={"grounding": order[1], "gap": gaps[order[1]]},
+        )
+        page = page_of(results, methods=rows)
+        assert "| `position_m` | 1 step |\n" in page
+        assert "| NAS, grounded | 3 [2, 4] |\n" in page
+        assert "| ASTRA, grounded | 0.2 [0.1, 0.4] |\n" in page
+
+
+def test_paths_are_said_to_be_of_where_the_policies_were_tested(results: Results) -> None:
+    drawn = {"trajectories": "paths.png"}
+    assert "Blue: the same policy in the target." in render(results, drawn)
+    untested = render(results.model_copy(update={"tested_in": "simulators"}), drawn)
+    assert "Blue: the same policy in a simulator." in untested
+    assert "The number is the success rate in a simulator over all" in untested

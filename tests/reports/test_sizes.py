@@ -113,3 +113,14 @@ def test_a_choice_is_made_once_for_all_sizes() -> None:
         FOUND.model_copy(update={"sizes": [size, size.model_copy(update={"percent": 100})]}), {}
     )
     assert "Wall time of the stages, summed: 2 min." in page  # 60 + 20 + 20 s
+
+
+def test_a_sweep_of_a_stand_in_or_of_other_legs_says_so() -> None:
+    first = SMALL.model_copy(update={"stand_in": "mujoco", "leg_scale": 1.25})
+    sizes = [SizeResults(percent=50, results=first), FOUND.sizes[1]]
+    page = render_sizes(FOUND.model_copy(update={"sizes": sizes}), {})
+    assert "size and seed. The target's legs are 1.25 times as long. Produced by" in page
+    assert "**A simulated stand-in (`mujoco`) takes the physical robot's place" in page
+    plain = render_sizes(FOUND, {})
+    assert "stand-in" not in plain
+    assert "legs" not in plain

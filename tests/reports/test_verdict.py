@@ -94,8 +94,8 @@ def candidate(row: str, seed: int, predicted: float) -> Ranked:
     )
 
 
-def test_a_choice_of_the_floor_or_of_what_is_untested_is_passed_over(results: Results) -> None:
-    candidates = [candidate("nas", 0, 0.9), candidate("direct_transfer", 1, 0.8), candidate("astra", 2, 0.7)]
+def test_a_choice_of_a_ceiling_or_of_what_is_untested_is_passed_over(results: Results) -> None:
+    candidates = [candidate("nas", 0, 0.9), candidate("follower", 1, 0.8), candidate("astra", 2, 0.7)]
     withheld = {"interval": "fewer than 3 judges"}
     choice = Choice(
         judge="nas", episodes=4, shares_episodes=True, candidates=candidates, regret=0.3, withheld=withheld
@@ -105,13 +105,26 @@ def test_a_choice_of_the_floor_or_of_what_is_untested_is_passed_over(results: Re
     assert "as 0.70 (interval withheld), and not measured in the target. " in verdict.reason
     assert verdict.remarks[:2] == [
         "select ranks NAS, seed 0 higher, but it has not been tested yet.",
-        "select ranks Direct transfer, seed 1 higher, but it is of a reference row (floor).",
+        "select ranks Careful follower, seed 1 higher, but it is of a reference row (ceiling).",
     ]
     assert "Withheld of the choice: interval, because fewer than 3 judges." in verdict.remarks
     assert any("All seeds have the same episodes" in remark for remark in verdict.remarks)
     # The regret is that of the first candidate.
     assert not any("regret" in remark for remark in verdict.remarks)
     assert verdict.facts[1].value == "-"
+
+
+def test_a_chosen_policy_of_the_floor_is_the_one_to_deploy(
+    results: Results,
+) -> None:
+    candidates = [candidate("direct_transfer", 1, 0.8), candidate("astra", 2, 0.7)]
+    choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
+    verdict = verdict_of(results.model_copy(update={"choice": choice}))
+    assert (verdict.row, verdict.title) == ("direct_transfer", "Direct transfer, seed 1")
+    assert verdict.opening == "No gain over the floor: of all policies, the one to deploy is"
+    assert [fact.label for fact in verdict.facts].count("Direct transfer (floor)") == 1
+    assert verdict.remarks[0].startswith("By the mean over seeds ASTRA+ is ahead: success 0.92 ± 0.14 in the")
+    assert not any("overlap" in remark or "seeds to compare" in remark for remark in verdict.remarks)
 
 
 def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Results) -> None:
