@@ -12,7 +12,7 @@ from astra_data.experiments.condition import Condition
 from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.paired_episodes import divided, recordings_of
 from astra_data.methods import METHODS
-from astra_data.stages.label import check_fits, is_address
+from astra_data.stages.label import check_fits, drawn_goals, is_address
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import task_named
 
@@ -44,7 +44,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
     check_fits(source, task)
     if any(METHODS[base_method(row)].grounds for row in recipe.methods):
         _check_division(recipe, source)
-    return Condition("finished", "; ".join(differing_bounds(task.limits, source)))
+    told = [*differing_bounds(task.limits, source), drawn_goals(source, task)]
+    return Condition("finished", "; ".join(filter(None, told)))
 
 
 def _check_division(recipe: Recipe, source: Dataset) -> None:

@@ -1,5 +1,6 @@
 """Label: what a log lacks of goals, rewards, successes and failures, as the task computes them from φ(s)."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,8 @@ from astra_data.worlds.expecting import judged, paid
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
+
+_log = logging.getLogger(__name__)
 
 
 def label(
@@ -79,6 +82,8 @@ def label(
         return out
     if not more:
         raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
+    if told := drawn_goals(source, world):
+        _log.warning(told)
     description, out = successor(
         source,
         "columns",
@@ -98,6 +103,18 @@ def label(
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
         writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
     return out
+
+
+def drawn_goals(source: Dataset, task: Task) -> str:
+    """Say that goals are drawn, where a task has some and the data have none; empty otherwise."""
+    if task.goal is None or GOAL in source.features:
+        return ""
+    alike = [name for name in source.features if "goal" in name.lower()]
+    mistaken = f" ({', '.join(alike)} is not read as one)" if alike else ""
+    return (
+        f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode; "
+        "import those that the robot had into that column"
+    )
 
 
 def labels(task: Task, episode: Episode, seed: int) -> Episode:

@@ -80,6 +80,18 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     assert labelled.reference == "logs@data-2.0.0"
 
 
+def test_goals_that_are_drawn_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    mistaken = Column("observation.goal")
+    goals = {"observation.goal": np.ones(10, np.float32)}
+    label(CART, data=write(tmp_path / "logs", [drive(0.5, 10) | goals], (mistaken,)), out=tmp_path / "out")
+    told = f"logs@data-1.0.0 has no {GOAL} (observation.goal is not read as one): goals are drawn by the"
+    assert told in caplog.text
+    caplog.clear()
+    known = {GOAL: np.ones(10, np.float32)}
+    label(CART, data=write(tmp_path / "more", [drive(0.5, 10) | known], (Column(GOAL),)), out=tmp_path / "in")
+    assert caplog.text == ""
+
+
 def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
     fell = np.array([False] * 9 + [True])
     goal = Column(GOAL, size=1)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from astra_data.dataset.checkup.angles import Angles
 from astra_data.dataset.checkup.clock import Clock, is_clock
 from astra_data.dataset.checkup.commands import GivenCommands
 from astra_data.dataset.checkup.continuity import Continuity
@@ -67,13 +68,15 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     outliers = Outliers(columns.get(STATE), successes)
     commands = GivenCommands(columns[ACTION], fps) if ACTION in columns else None
     jumps = Jumps(columns[STATE], int(dataset.lengths.sum())) if STATE in columns else None
+    angles = Angles(columns[STATE]) if STATE in columns else None
     names = [column.name for column in columns.values() if column.name in LOOKED_AT or is_clock(column)]
     parts: list[_Part] = [ends, duplicates, continuity, dead, outliers, *clocks]
-    parts += [part for part in (commands, jumps) if part is not None]
+    parts += [part for part in (commands, jumps, angles) if part is not None]
     for episode in dataset.episodes(names or list(columns)):
         for part in parts:
             part.add(episode)
     findings = [finding for clock in clocks for finding in clock.findings(called)]
+    findings += angles.findings() if angles else []
     findings += jumps.findings(dataset, called) if jumps else []
     findings += continuity.findings() + duplicates.findings(called)
     findings += dead.findings(called) + outliers.findings(called)
