@@ -28,6 +28,8 @@ def distances(task: Task, error: Tensor) -> Tensor:
 def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
     """Replay the actions of `episodes` open loop in both simulators and compare with the target.
 
+    Beside them, under "still", is the error of who expects the robot to stay where it is.
+
     Replays start every 25 steps, with a grounding's memory of the true history up to there. Errors are
     distances in the task's quantities after 1, 10, 50 and 200 steps: means and 95 % bootstrap intervals over
     episodes; None where a single episode is that long.
@@ -45,11 +47,12 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         simulators[name] = one.simulator(task, len(moments), device)
         before = one.hidden_before(windows)
         moments.start(simulators[name], None if before is None else before[episode, start])
-    errors: dict[str, dict[int, Tensor]] = {name: {} for name in simulators}
+    errors: dict[str, dict[int, Tensor]] = {name: {} for name in (*simulators, "still")}
     for step in range(horizons[-1]):
         now = moments.after(step)
         action = windows.action[episode, now]
         states = {name: simulator.step(action) for name, simulator in simulators.items()}
+        states["still"] = moments.state
         if step + 1 in horizons:
             for name, state in states.items():
                 apart = distances(task, state - windows.next_state[episode, now])

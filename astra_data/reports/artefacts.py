@@ -167,12 +167,14 @@ class Gap(Artefact):
     """Steps ahead."""
     grounded: dict[str, Band]
     raw: dict[str, Band]
+    still: dict[str, Band] | None = None
+    """Of who expects the robot to stay where it is; None where it was not measured."""
 
     @model_validator(mode="after")
     def _one_number_per_horizon(self) -> Self:
         if set(self.grounded) != set(self.raw):
             raise ValueError(f"grounded has {sorted(self.grounded)}, but raw has {sorted(self.raw)}")
-        for name, band in [*self.grounded.items(), *self.raw.items()]:
+        for name, band in [*self.grounded.items(), *self.raw.items(), *(self.still or {}).items()]:
             lengths = {len(band.mean), len(band.low), len(band.high)}
             if lengths != {len(self.horizons)}:
                 raise ValueError(f"expected {len(self.horizons)} numbers for {name}, got {sorted(lengths)}")

@@ -236,11 +236,18 @@ def mean_gap(of_seeds: Mapping[int, Gap]) -> GapMeans:
         low, high = ([None if np.isnan(end) else end for end in of.tolist()] for of in ends[1:])
         return BandMeans(mean=ends[0].tolist(), low=low, high=high)
 
+    def mean_still(of_each: Sequence[dict[str, Band] | None]) -> dict[str, BandMeans] | None:
+        known = [still for still in of_each if still is not None]
+        if len(known) < len(gaps):
+            return None
+        return {name: mean([still[name] for still in known]) for name in known[0]}
+
     return GapMeans(
         seeds=list(of_seeds),
         horizons=shared,
         grounded={name: mean([gap.grounded[name] for gap in gaps]) for name in gaps[0].grounded},
         raw={name: mean([gap.raw[name] for gap in gaps]) for name in gaps[0].raw},
+        still=mean_still([gap.still for gap in gaps]),
     )
 
 

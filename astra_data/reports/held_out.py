@@ -75,6 +75,7 @@ def write_held_out(
         head=[*(["size"] if percents else []), "simulator"],
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
+        astray=astray(every[0]),
         foresight=foresight_lines(root, groundings, seeds, percents),
         reliability=RELIABILITY if rates else None,
         enough=[
@@ -86,6 +87,16 @@ def write_held_out(
     )
     write_file(root / PAGE, page)
     return root / PAGE
+
+
+def astray(gap: GapMeans) -> list[str]:
+    """Return the quantities in which the raw simulator is no better than who expects the robot to stay."""
+    least = gap.horizons[0]
+    return [
+        name
+        for name, band in (gap.still or {}).items()
+        if gap.at(gap.raw[name], least)[0] >= gap.at(band, least)[0]
+    ]
 
 
 def foresight_lines(
@@ -182,7 +193,8 @@ def _lines(
     for size in sorted({size for sizes in found.values() for size in sizes}, key=lambda size: size or 0):
         sized = {method_title(method): sizes[size] for method, sizes in found.items() if size in sizes}
         first = next(iter(sized.values()))
-        bands = {"No grounding": (first.raw[quantity], first)}
+        bands = {"Standing still": (first.still[quantity], first)} if first.still else {}
+        bands |= {"No grounding": (first.raw[quantity], first)}
         bands |= {title: (gap.grounded[quantity], gap) for title, gap in sized.items()}
         for title, (band, gap) in bands.items():
             cells = [measured(*gap.at(band, horizon)) for horizon in horizons]

@@ -86,6 +86,8 @@ class GapMeans(Section):
     """Steps ahead."""
     grounded: dict[str, BandMeans]
     raw: dict[str, BandMeans]
+    still: dict[str, BandMeans] | None = Field(default=None, exclude_if=lambda still: still is None)
+    """Of who expects the robot to stay where it is; None where a seed has not measured it."""
 
     def at(self, band: BandMeans, horizon: int) -> tuple[float, float | None, float | None]:
         """Return mean, low and high of one of its bands at one of its horizons."""

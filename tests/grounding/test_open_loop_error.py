@@ -57,6 +57,15 @@ def test_a_perfect_simulator_has_no_gap() -> None:
                 assert report[kind][quantity][figure] == pytest.approx([0.0, 0.0, 0.0], abs=2e-4)
 
 
+def test_who_stands_still_is_left_behind_by_the_way_that_the_target_goes() -> None:
+    report = gap_report(TASK, untrained(), episodes(speed=1.0), seed=0)
+    # After one step all eight replays count, after 50 the two of the episodes that are so long.
+    speeds = {1: [3 * 0.5, 3 * 0.8, 2 * 1.0], 50: [0.5, 0.8]}
+    for index, (steps, count) in ((0, (1, 8)), (2, (50, 2))):
+        way = sum(speeds[steps]) / count * steps * TASK.timestep_s
+        assert report["still"]["position_m"]["mean"][index] == pytest.approx(way, rel=0.01)
+
+
 def test_a_slow_target_is_left_behind_in_proportion_to_the_horizon() -> None:
     report = gap_report(TASK, untrained(), episodes(speed=0.9), seed=0)
     # Of eight replays only two are still within the data after 50 steps.

@@ -222,6 +222,15 @@ def test_errors_are_of_the_horizons_that_all_groundings_have(results: Results) -
         assert "| ASTRA, grounded | 0.2 [0.1, 0.4] |\n" in page
 
 
+def test_who_stands_still_is_the_first_line_where_it_was_measured(results: Results, page: str) -> None:
+    gap = results.methods["astra"].gap
+    assert gap is not None
+    assert "Standing still" not in page
+    other = gap.model_copy(update={"still": gap.raw})
+    shown = page_of(results, methods=rows_of(results, astra={"gap": other}, astra_plus={"gap": other}))
+    assert "| Standing still | 1 [0.5, 2] | 2 |\n| No grounding | 1 [0.5, 2] | 2 |\n" in shown
+
+
 def test_paths_are_said_to_be_of_where_the_policies_were_tested(results: Results) -> None:
     drawn = {"trajectories": "paths.png"}
     assert "Blue: the same policy in the target." in render(results, drawn)
