@@ -189,3 +189,9 @@ def test_reading_needs_no_heavy_package(fake: Dataset) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     heavy = {"torch", "torchrl", "lerobot", "datasets", "matplotlib", "mujoco", "gymnasium", "pandas"}
     assert not heavy & set(done.stdout.split())
+
+
+def test_a_folder_of_logs_is_no_dataset_yet(tmp_path: Path) -> None:
+    (tmp_path / "Drive.CSV").write_text("x\n1\n")
+    with pytest.raises(BadInputError, match=r"holds logs, Drive\.CSV and so on: .*`astra-data import`"):
+        Dataset.open(tmp_path)

@@ -241,3 +241,12 @@ def test_goals_of_the_logs_are_kept_for_who_wants_them(tmp_path: Path) -> None:
         "fields": ["goal_x", "goal_y_cm"],
         "scale": [1.0, 0.01],
     }
+
+
+def test_logs_may_be_given_as_a_shell_writes_them_out(tmp_path: Path) -> None:
+    for name, rows in (("a.csv", 5), ("b.csv", 7), ("c.csv", 6)):
+        Path(name).write_text("x[m],cmd_x\n" + "".join(f"{row},{row % 3}\n" for row in range(rows)))
+    shown = CliRunner().invoke(app, ["new", "slide", "--from", "a.csv", "b.csv", "c.csv"])
+    assert shown.exit_code == 0
+    assert "x[m]" in shown.stdout  # brackets are no markup
+    assert "horizon=7" in Path("slide/slide.py").read_text()
