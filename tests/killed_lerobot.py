@@ -10,10 +10,12 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from forks import forked
 
 FEATURES: dict[str, Any] = {
     "observation.state": {"dtype": "float32", "shape": (3,), "names": ["x", "y", "yaw"]},
@@ -92,12 +94,12 @@ def main(folder: Path) -> None:
     cases: tuple[Callable[[], Any], ...] = (whole, saved, buffered, resumed)
     for case in cases:
         # One import of lerobot for all: each case is a fork that kills itself.
-        child = os.fork()
-        if child == 0:
-            _unfinished = case()  # kept: lerobot closes its files when the dataset is collected
-            os.kill(os.getpid(), signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        assert os.WIFSIGNALED(status)
+        assert forked(partial(kill_oneself, case)) == -signal.SIGKILL
+
+
+def kill_oneself(case: Callable[[], object]) -> None:
+    _unfinished = case()  # kept: lerobot closes its files when the dataset is collected
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,15 @@
 After each kill, OUT is either absent or bit-identical to TRUTH. Prints how often it was which.
 """
 
-import os
 import random
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import fsspec.implementations.local  # noqa: F401 - here, so that no child spends its life on it
+from forks import forked
 from shared_files import contents
 
 from astra_data.dataset import Dataset
@@ -20,18 +19,6 @@ from astra_data.exchange.sharing import store
 from astra_data.exchange.sharing.pull import pull
 
 store.BLOCK_BYTES = 1024
-
-
-def forked(job: Callable[[], object], seconds: float | None = None) -> int:
-    """Run `job` in a child that is killed after `seconds`; its exit status, negative if it was killed."""
-    child = os.fork()
-    if child == 0:
-        job()
-        os._exit(0)
-    if seconds is not None:
-        time.sleep(seconds)
-        os.kill(child, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def check(out: Path, truth: Path) -> None:
