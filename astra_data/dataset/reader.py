@@ -1,7 +1,7 @@
 """Read a dataset: whole columns as contiguous arrays, or one episode at a time."""
 
 import logging
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -236,6 +236,11 @@ class Dataset(Contents):
         """Return a `LeRobotDataset` of the same files, once all values are verified; it takes `options`."""
         self.require_whole()
         return to_lerobot(self.root, self.description["name"], **options)
+
+    def altered(self, columns: Mapping[str, Array]) -> list[str]:
+        """Return which of whole `columns`, (N,) or (N, size), have other values than were written."""
+        found = digests_of(columns, self.lengths)
+        return [name for name, digests in found.items() if (digests != self._digests[name]).any()]
 
     @cached_property
     def _digests(self) -> Digests:

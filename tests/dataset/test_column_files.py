@@ -57,6 +57,16 @@ def test_a_damaged_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
         Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
 
 
+def test_another_value_in_a_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
+    Frames.load(fake, NAMES, memory_share=0.0, cache=tmp_path)
+    path = tmp_path / fake.content_hash / STATE / "values.npy"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .other values.; delete"):
+        Frames.load(fake, NAMES, memory_share=0.0, cache=tmp_path)
+
+
 def test_a_full_disk_ends_with_an_error_and_no_raw_file(fake: Dataset, tmp_path: Path) -> None:
     with (
         small_files(200),
