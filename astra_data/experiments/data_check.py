@@ -44,8 +44,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
     check_fits(source, task)
     if any(METHODS[base_method(row)].grounds for row in recipe.methods):
         _check_division(recipe, source)
-    told = [*differing_bounds(task.limits, source), drawn_goals(source, task)]
-    return Condition("finished", "; ".join(filter(None, told)))
+    remarks = [*differing_bounds(task.limits, source), drawn_goals(source, task)]
+    return Condition("finished", "; ".join(filter(None, remarks)))
 
 
 def _check_division(recipe: Recipe, source: Dataset) -> None:

@@ -82,8 +82,8 @@ def label(
         return out
     if not more:
         raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
-    if told := drawn_goals(source, world):
-        _log.warning(told)
+    if warning := drawn_goals(source, world):
+        _log.warning(warning)
     description, out = successor(
         source,
         "columns",
