@@ -78,6 +78,10 @@ def test_blocks_of_wide_columns_have_fewer_rows(paths: list[Path], monkeypatch: 
     assert [len(block["x"]) for block in blocks] == [8, 2, 5]
     monkeypatch.setattr(parquet, "BLOCK_VALUES", 0)
     assert [len(block["x"]) for block in read_arrays(paths, [Column("x", "int64")])] == [4, 4, 2, 4, 1]
+    wide = to_arrow(np.zeros((6, 4), np.float32), pa.list_(pa.float32(), 4))
+    pq.write_table(pa.table({"y": wide}), paths[0].with_name("wide.parquet"), row_group_size=2)
+    monkeypatch.setattr(parquet, "BLOCK_VALUES", 8)
+    assert len(list(read_arrays([paths[0].with_name("wide.parquet")], [Column("y", size=4)]))) == 3
 
 
 @pytest.mark.parametrize("block_rows", [1, 5, 100])

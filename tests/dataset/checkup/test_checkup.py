@@ -91,6 +91,11 @@ def saturated(uid: int, columns: Columns) -> None:
     columns[ACTION][:, 1] = np.clip(2 * columns[ACTION][:, 1], -1, 1)
 
 
+def in_degrees(uid: int, columns: Columns) -> None:
+    for name in (STATE, NEXT_STATE):
+        columns[name][:, 2] *= np.float32(180 / np.pi)
+
+
 def failing(uid: int, columns: Columns) -> None:
     if uid < 9:
         columns["next.terminated"] = columns["next.done"]
@@ -117,6 +122,7 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (torn, "warning", (2,), "not the state of the row after: 1 of 2970", "rows are missing"),
     (rewarded, "note", (8,), "8 by return 59", "delete walks --episode 8"),
     (far, "note", (1,), "1 by y of observation.state, which reaches -4", "delete walks --episode 1"),
+    (in_degrees, "warning", (), "yaw of observation.state: up to", "degrees, set `scale` to 0.0174533"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
     (failing, "note", tuple(range(9)), "9 failures, little", "--behavior stress"),
 ]
