@@ -15,12 +15,12 @@ def refuse_others(root: Path) -> None:
     versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
     if versions:
         raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
-    if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
-        raise BadInputError(
-            f"{root} holds logs, {logs[0]} and so on: make a dataset of them by `astra-data import`, with a "
-            "mapping, which `astra-data new` writes"
-        )
     if not (root / "meta").is_dir():
+        if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
+            raise BadInputError(
+                f"{root} holds logs, {logs[0]} and so on: make a dataset of them by `astra-data import` with "
+                "a mapping, which `astra-data new` writes"
+            )
         raise BadInputError(
             f"{root}: no dataset there; check the path (`astra-data list` says where names are) "
             "or run the stage that writes it."

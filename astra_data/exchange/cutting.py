@@ -135,22 +135,23 @@ class Cutter:
                 self._pieces.append({name: values[first:last] for name, values in kept.items()})
 
     def _keep_ends(self, columns: dict[str, Array], counters: NDArray[np.int64], finite: Mask) -> None:
-        """Where a rejected row terminates an episode, let the last row that is kept of it do so.
+        """Where a rejected row ends an episode or succeeds, let the last row that is kept of it do so.
 
         `counters` are those of all reasons but rejected rows.
         """
-        if TERMINATED not in columns:
+        flags = [columns[name] for name in (TERMINATED, SUCCESS) if name in columns]
+        if not flags:
             return
         kept_before = np.maximum.accumulate(np.where(finite, np.arange(len(finite)), -1))
-        for row in np.flatnonzero(~finite & columns[TERMINATED]):
+        for row in np.flatnonzero(~finite & np.any(flags, axis=0)):
             last, at, then = columns, kept_before[row], counters[:, kept_before[row]]
             if at < 0:
-                if not self._pieces or self._kept_before is None:
+                if self._kept_before is None:
                     continue
                 last, then = self._pieces[-1], self._kept_before[0][:-1, 0]
             if (then == counters[:, row]).all():
                 for name in {TERMINATED, SUCCESS} & columns.keys():
-                    last[name][at] = columns[name][row]
+                    last[name][at] |= columns[name][row]
 
     def finish(self) -> Iterator[Cut]:
         """Yield the current episode, if there is one, and begin the next."""

@@ -13,20 +13,24 @@ NAMES: tuple[tuple[Role, str], ...] = (
     ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
     (
         "failure",
-        r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|colli(sion|ded)|bump(ed|er)?|e_?stop|fault|"
-        "terminated",
+        r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|colli(sion|ded)|fault|terminated|"
+        r"bump(ed|er)?|e_?stop",
     ),
     ("success", r"success|succeeded|(goal_)?reached|at_goal|delivered|solved"),
     ("reward", r"reward"),
-    ("goal", r"(?!.*dist)(.+_)?(goal|destination|waypoint)(_(x|y|z|yaw|heading|theta|psi|lat|lon))?"),
     (
         "command",
         r"(.+_)?(cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref)(_.+|\d+)?|u(_.+|\d+)?",
     ),
 )
 """Roles by the whole of a field's name, without its unit; all other fields are states."""
+GOAL = re.compile(
+    r"(?!.*(dist|bearing|_to_|_from_))(.+_)?(goal|destination|waypoint)(?P<axis>_(x|y|z|yaw|heading|theta|psi))?"
+)
 PLACE_TO_GO = re.compile(r"(target|ref|desired|des)_[xyz]")
-"""A goal where it stays the same in each log, and otherwise a command."""
+"""A goal where it stays the same in each episode and something else is commanded, and otherwise a command."""
+WEAK_FAILURE = re.compile(r"bump(ed|er)?|e_?stop")
+"""A failure where it ever comes, and where there is no other."""
 UNCLEAR = "done|truncated|timeout"
 """Ends of which the name does not say whether they are successes, failures or neither."""
 FORCE = re.compile(r"(.+_)?(tau|torque|effort)(_.+|\d+)?")
@@ -55,7 +59,5 @@ ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*
 LENGTH = re.compile(
     r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
 )
-FULL_TURNS = 4 * math.pi
-"""An angle beyond it is taken for degrees."""
 EPISODE = re.compile(dict(NAMES)["episode"])
 COMMAND = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")

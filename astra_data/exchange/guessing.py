@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.checkup.angles import LARGEST
 from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
 from astra_data.exchange.field_names import (
     ANGLE,
@@ -19,13 +20,14 @@ from astra_data.exchange.field_names import (
     COMMANDED,
     EPISODE,
     FORCE,
-    FULL_TURNS,
+    GOAL,
     LENGTH,
     NAMES,
     PLACE_TO_GO,
     TIMES,
     UNCLEAR,
     UNITS,
+    WEAK_FAILURE,
     Role,
 )
 from astra_data.exchange.importers.csv import csv_files
@@ -91,8 +93,9 @@ def guess(paths: Sequence[Path]) -> Logs:
         paths: files with the same fields; a folder stands for the CSV files in it.
 
     Raises:
-        BadInputError: there is no such file, it is no CSV, files differ, a time or command is not finite, two
-            fields come to the same name, or there are no commands, no states or no episodes of two rows.
+        BadInputError: there is no such file, it is no CSV, files differ, a time is not finite or a command
+            mostly not, two fields come to the same name, or there are no commands, no states or no episodes
+            of two rows.
     """
     files = [file for path in paths for file in csv_files(path)]
     tables = {file: read_numbers(file, EPISODE) for file in files}
@@ -104,15 +107,15 @@ def guess(paths: Sequence[Path]) -> Logs:
                 f"{file}: expected the fields of {files[0]}, {_filled(first)}: got {_filled(table)}"
             )
     joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
-    guessed = []
+    guessed, every = [], list(tables.values())
     for name, values in joined.items():
         try:
-            guessed.append(_field(name, values))
+            guessed.append(_goal(name, values, every) or _field(name, values))
         except BadInputError as error:
             lacking = next(file for file, table in tables.items() if not np.isfinite(table[name]).all())
             raise BadInputError(f"{lacking}: {error}") from None
     try:
-        fields = _goals_apart(_distinct(guessed), list(tables.values()))
+        fields = _distinct(_places_apart(guessed, every))
     except BadInputError as error:
         raise BadInputError(f"{files[0]}: {error}") from None
     needed = [field.name for field in fields if field.role in ("state", "command")]
@@ -145,13 +148,13 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     """
     if not any(field.role == "command" for field in fields):
         fields = [
-            replace(field, role="command", why="a force, and no other command")
-            if field.role == "state" and FORCE.fullmatch(field.short)
-            else field
+            replace(field, role="command", why="a force, and no other command") if _is_force(field) else field
             for field in fields
         ]
     ends = set[Role]()
-    for number, field in enumerate(fields):
+    # What is a failure for want of another one comes last.
+    weak = [bool(WEAK_FAILURE.fullmatch(plain_name(field.name))) for field in fields]
+    for number, field in sorted(enumerate(fields), key=lambda numbered: weak[numbered[0]]):
         if field.role in ("failure", "success", "reward"):
             if field.role in ends:
                 why = f"a second {field.role}: make one field of both"
@@ -168,17 +171,45 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _goals_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> tuple[Field, ...]:
-    """Return the fields, with places to go as goals where each log has but one."""
+def _goal(name: str, values: Floats, tables: Sequence[dict[str, Floats]]) -> Field | None:
+    """Return a field that its name calls a goal, and that has one value in each episode; None for others."""
+    body, ending = _without_unit(plain_name(name), [end for end, _, _ in UNITS])
+    found = GOAL.fullmatch(body)
+    is_flag = bool(np.isin(values, (0, 1)).all())
+    if found is None or (is_flag and not found["axis"]) or not _stays(name, tables):
+        return None
+    return _with_unit(name, "goal", body, ending, values)
 
-    def is_goal(field: Field) -> bool:
-        body, _ = _without_unit(plain_name(field.name), [end for end, _, _ in UNITS])
-        return bool(PLACE_TO_GO.fullmatch(body)) and all(np.ptp(table[field.name]) == 0 for table in tables)
 
-    return tuple(
-        replace(field, role="goal", why="one place in each log") if is_goal(field) else field
+def _places_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> list[Field]:
+    """Return the fields, with commanded places as goals where these stay and something else is commanded."""
+    bodies = [_without_unit(plain_name(field.name), [end for end, _, _ in UNITS])[0] for field in fields]
+    stay = {
+        field.name
+        for field, body in zip(fields, bodies, strict=True)
+        if field.role == "command" and PLACE_TO_GO.fullmatch(body) and _stays(field.name, tables)
+    }
+    others = [field for field in fields if field.name not in stay]
+    if not any(field.role == "command" or _is_force(field) for field in others):
+        return list(fields)
+    return [
+        replace(field, role="goal", why="one place in each episode") if field.name in stay else field
         for field in fields
-    )
+    ]
+
+
+def _is_force(field: Field) -> bool:
+    return field.role == "state" and FORCE.fullmatch(field.short) is not None
+
+
+def _stays(name: str, tables: Sequence[dict[str, Floats]]) -> bool:
+    """Return whether a field has one value in each episode."""
+    for table in tables:
+        numbered = (values for other, values in table.items() if EPISODE.fullmatch(plain_name(other)))
+        begins = {int(row) for values in numbered for row in np.flatnonzero(np.diff(values))}
+        if not np.isfinite(table[name]).all() or {*np.flatnonzero(np.diff(table[name])).tolist()} - begins:
+            return False
+    return True
 
 
 def _field(name: str, values: Floats) -> Field:
@@ -205,10 +236,10 @@ def _field(name: str, values: Floats) -> Field:
     is_flag = bool(np.isin(values, (0, 1)).all())
     for role, pattern in NAMES[1:]:
         if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
-            if is_flag != (role in ("failure", "success")) and role in ("failure", "success", "goal"):
+            if role in ("failure", "success") and not is_flag:
                 continue
-            if role == "goal":
-                return _with_unit(name, role, body, ending, values)
+            if WEAK_FAILURE.fullmatch(body) and not values.any():
+                return left_out("never changes")
             if role != "command":
                 return Field(name, role, role, "1", 1.0, "its name")
             if np.isfinite(values).mean() <= MOSTLY:
@@ -243,7 +274,7 @@ def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Fl
         if ending == known:
             return Field(name, role, short, unit, scale, "its ending")
     if role in ("state", "goal") and ANGLE.fullmatch(short):
-        if (largest := np.nanmax(np.abs(values))) > FULL_TURNS:
+        if (largest := np.nanmax(np.abs(values))) > LARGEST:
             return Field(name, role, short, "rad", math.pi / 180, f"an angle up to {largest:.0f}: degrees")
         return Field(name, role, short, "rad", 1.0, "its name")
     if role in ("state", "goal") and LENGTH.fullmatch(short):

@@ -127,7 +127,8 @@ def import_dataset(
     root = place(description) if out is None else out
     if root.exists():
         raised = f"raise `version` in the mapping (now {settings.version}), " if mapping else ""
-        raise BadInputError(f"{root} exists already: {raised}give another --name or --out, or delete it")
+        another = f"{raised}give another --name or an --out" if out is None else "give another --out"
+        raise BadInputError(f"{root} exists already: {another}, or delete it")
     frames = count = 0
     origins: set[str] = set()
     with DatasetWriter(

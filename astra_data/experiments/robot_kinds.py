@@ -205,12 +205,14 @@ def _length(filled: list[Field | None]) -> int:
 def _typical(episodes: list[Floats]) -> tuple[Floats, float]:
     """Return the end (D,) of the episode whose way from its start is the median, and a tenth of the way.
 
-    Where that ends as it began, it is a tenth of the farthest way that an episode went.
+    Where that ends as it began, it is a tenth of the farthest way that an episode went, or else of how far
+    episodes lie apart.
     """
     ways = [float(np.linalg.norm(values[-1] - values[0])) for values in episodes]
     typical = int(np.argsort(ways)[len(ways) // 2])
     farthest = max(float(np.linalg.norm(values - values[0], axis=1).max()) for values in episodes)
-    return episodes[typical][-1], (ways[typical] or farthest) / 10
+    apart = float(np.linalg.norm(np.ptp(np.concatenate(episodes), axis=0)))
+    return episodes[typical][-1], (ways[typical] or farthest or apart) / 10
 
 
 def _numbers(values: Iterable[float] | Floats, brackets: str = "[]") -> str:

@@ -28,7 +28,15 @@ from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, 
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
-from astra_data.reports.schema import BandMeans, DatasetOrigin, GapMeans, Learning, Origin, Results
+from astra_data.reports.schema import (
+    BandMeans,
+    DatasetOrigin,
+    GapMeans,
+    Learning,
+    Origin,
+    Results,
+    shared_horizons,
+)
 from astra_data.reports.seed_table import Line, row_of
 from astra_data.worlds.score import SUCCESS, Score
 
@@ -221,8 +229,7 @@ def mean_gap(of_seeds: Mapping[int, Gap]) -> GapMeans:
     """
     gaps = list(of_seeds.values())
     _require_alike([sorted(gap.grounded) for gap in gaps], "quantities")
-    # A seed whose episodes are short has no long horizons.
-    shared = [horizon for horizon in gaps[0].horizons if all(horizon in gap.horizons for gap in gaps)]
+    shared = shared_horizons([gap.horizons for gap in gaps])
     places = [[gap.horizons.index(horizon) for horizon in shared] for gap in gaps]
 
     def mean(bands: Sequence[Band]) -> BandMeans:

@@ -149,8 +149,8 @@ def encoder_lines(results: Results) -> list[list[str]]:
 
 def horizon_titles(results: Results) -> list[str]:
     """Return the head of the tables of `gap_tables` behind their first column."""
-    gaps = list(results.gaps().values())
-    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in (shared_horizons(gaps) if gaps else ())]
+    every = [gap.horizons for gap in results.gaps().values()]
+    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in (shared_horizons(every) if every else ())]
 
 
 def gap_tables(results: Results) -> dict[str, list[list[str]]]:
@@ -158,7 +158,8 @@ def gap_tables(results: Results) -> dict[str, list[list[str]]]:
     gaps = {method_title(name): gap for name, gap in results.gaps().items()}
     if not gaps:
         return {}
-    first, horizons = next(iter(gaps.values())), shared_horizons(list(gaps.values()))
+    first = next(iter(gaps.values()))
+    horizons = shared_horizons([gap.horizons for gap in gaps.values()])
 
     def cells(gap: GapMeans, band: BandMeans) -> list[str]:
         return [measured(*gap.at(band, horizon)) for horizon in horizons]

@@ -95,9 +95,9 @@ class GapMeans(Section):
         return band.mean[index], band.low[index], band.high[index]
 
 
-def shared_horizons(gaps: Sequence[GapMeans]) -> list[int]:
-    """Return the horizons that all gaps have; short held-out episodes have no long ones."""
-    return [horizon for horizon in gaps[0].horizons if all(horizon in gap.horizons for gap in gaps)]
+def shared_horizons(of_each: Sequence[Sequence[int]]) -> list[int]:
+    """Return the horizons that are among those of each gap; short held-out episodes have no long ones."""
+    return [horizon for horizon in of_each[0] if all(horizon in others for others in of_each)]
 
 
 class Cost(Section):

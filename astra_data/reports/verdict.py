@@ -111,9 +111,10 @@ def _passed_over(results: Results, one: Ranked) -> str:
 
 
 def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
-    ahead = best_of(results)
-    row, best = results.methods[name], results.methods[ahead]
     worth, is_predicted = _worth(results), _is_predicted(results)
+    rivals = [other for other in worth if not results.methods[other].role]
+    ahead = max(rivals, key=lambda other: worth[other]) if rivals else name
+    row, best = results.methods[name], results.methods[ahead]
     if chosen and results.choice:
         candidates = results.choice.candidates
         for one in candidates[: candidates.index(chosen)]:

@@ -81,7 +81,7 @@ def code_digest(name: str) -> str | None:
 
 
 def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
-    """Yield a file and those beside it that it imports, of packages all, each once, and what is in it.
+    """Yield a file and those beside it that it imports, all of a package, each once, and what is in it.
 
     Raises:
         BadInputError: one of them is no Python.
@@ -93,14 +93,28 @@ def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
         try:
             tree = ast.parse(path.read_bytes())
         except SyntaxError as error:
-            raise BadInputError(f"{path}, line {error.lineno}: expected Python, got {error.msg}") from None
+            if path.parent == place.parent:
+                raise BadInputError(
+                    f"{path}, line {error.lineno}: expected Python, got {error.msg}"
+                ) from None
+            # A package may hold what is never imported, such as a template.
+            tree = ast.Module([ast.Expr(ast.Constant(path.read_bytes()))], [])
         yield path, tree
-        beside = {
-            file
-            for module in _imported(tree)
-            for file in (place.with_name(f"{module}.py"), *place.with_name(module).rglob("*.py"))
-        }
-        todo += sorted(file for file in beside - seen - set(todo) if file.is_file())
+        beside = {file for module in _imported(tree) for file in _files_of(module, place.parent)}
+        todo += sorted(beside - seen - set(todo))
+
+
+def _files_of(module: str, folder: Path) -> list[Path]:
+    """Return the file of a top module in `folder`, or all of its package there that is not installed."""
+    file, package = folder / f"{module}.py", folder / module
+    if file.is_file() or not package.is_dir():
+        return [file] if file.is_file() else []
+    spec = None
+    with suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(module)
+    if spec is not None and spec.origin and not Path(spec.origin).is_relative_to(folder.resolve()):
+        return []
+    return sorted(package.rglob("*.py"))
 
 
 def _imported(tree: ast.Module) -> set[str]:

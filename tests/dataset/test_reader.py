@@ -193,5 +193,8 @@ def test_reading_needs_no_heavy_package(fake: Dataset) -> None:
 
 def test_a_folder_of_logs_is_no_dataset_yet(tmp_path: Path) -> None:
     (tmp_path / "Drive.CSV").write_text("x\n1\n")
+    written = write_fake(tmp_path / "set").root
+    (written / "notes.csv").write_text("")
+    assert len(Dataset.open(written)) > 0
     with pytest.raises(BadInputError, match=r"holds logs, Drive\.CSV and so on: .*`astra-data import`"):
         Dataset.open(tmp_path)

@@ -382,3 +382,11 @@ def test_a_rejected_failure_right_after_an_end_is_of_no_episode(block_rows: int)
     episodes = cut(cutting, block_rows, x=[0, 1, nan, 3], fell=[0, 0, 1, 0], end=[0, 1, 0, 0])
     assert rows(episodes) == [[0, 1], [3]]
     assert not any(episode[TERMINATED].any() for episode in episodes)
+
+
+@BLOCKS
+def test_a_success_without_an_end_is_kept_where_its_row_is_rejected(block_rows: int) -> None:
+    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | {SUCCESS: {"fields": ("won",)}}, not_finite="drop")
+    (episode,) = cut(cutting, block_rows, x=[0, 1, float("nan")], won=[0, 0, 1])
+    assert episode[SUCCESS].tolist() == [False, True]

@@ -317,7 +317,7 @@ def test_goals_are_told_from_states_and_commands(tmp_path: Path) -> None:
     assert found == {
         "goal_x": ("goal", "m", "its name"),
         "goal_yaw_deg": ("goal", "rad", "its ending"),
-        "target_x": ("goal", "1", "one place in each log"),
+        "target_x": ("goal", "1", "one place in each episode"),
         "target_y": ("command", "1", "no unit in its name"),
         "target_q1": ("command", "1", "no unit in its name"),
         "dist_to_goal": ("state", "1", "no unit in its name"),
@@ -339,3 +339,42 @@ def test_a_hole_in_a_command_is_one_as_in_a_state(tmp_path: Path) -> None:
     write(tmp_path / "b.csv", holes | {"t": times}, rows=30)
     with pytest.raises(BadInputError, match=r"b\.csv: t: expected a number in each row of a time"):
         guess([whole, tmp_path / "b.csv"])
+
+
+def roles(folder: Path, *files: Mapping[str, object]) -> dict[str, str]:
+    folder.mkdir(exist_ok=True)
+    logs = [write(folder / f"{number}.csv", columns) for number, columns in enumerate(files)]
+    return {field.name: field.role for field in guess(logs).fields}
+
+
+def test_what_changes_within_an_episode_is_no_goal(tmp_path: Path) -> None:
+    state = {"x": RAMP, "cmd_v": -RAMP}
+    found = roles(tmp_path / "a", state | {"heading_to_goal": RAMP, "waypoint": RAMP, "goal_x": RAMP // 2})
+    assert {found[name] for name in ("heading_to_goal", "waypoint", "goal_x")} == {"state"}
+    found = roles(tmp_path / "b", state | {"goal_x": RAMP // 2, "drive": RAMP // 2})
+    assert found["goal_x"] == "goal"
+    found = roles(tmp_path / "c", state | {"goal_x": 3.0, "goal_y": 0.0, "goal": RAMP > 4})
+    assert (found["goal_x"], found["goal_y"], found["goal"]) == ("goal", "goal", "left out")
+
+
+def test_a_place_that_is_all_that_is_commanded_is_a_command(tmp_path: Path) -> None:
+    steps: list[dict[str, object]] = [{"x": RAMP, "ref_x": 1.0 + number} for number in range(2)]
+    assert roles(tmp_path / "a", *steps)["ref_x"] == "command"
+    pushed = [one | {"tau_1": -RAMP} for one in steps]
+    assert roles(tmp_path / "b", *pushed) == {"x": "state", "ref_x": "goal", "tau_1": "command"}
+    driven: list[dict[str, object]] = [
+        {"x": RAMP, "target_x": 1.0 + number, "cmd_x": -RAMP} for number in range(2)
+    ]
+    assert roles(tmp_path / "c", *driven)["target_x"] == "goal"
+    other: dict[str, object] = {"x": RAMP, "cmd_v": -RAMP}
+    one_moves = roles(tmp_path / "d", other | {"target_x": 1.0}, other | {"target_x": RAMP})
+    assert one_moves["target_x"] == "command"
+
+
+def test_a_bumper_is_a_failure_where_it_ever_comes_and_nothing_else_is(tmp_path: Path) -> None:
+    state = {"x": RAMP, "cmd_v": -RAMP}
+    assert roles(tmp_path / "a", state | {"bumper": RAMP > 4})["bumper"] == "failure"
+    assert roles(tmp_path / "b", state | {"e_stop": 0.0})["e_stop"] == "left out"
+    both = roles(tmp_path / "c", {"estop": RAMP > 3} | state | {"fell": RAMP > 4})
+    assert (both["estop"], both["fell"]) == ("left out", "failure")
+    assert roles(tmp_path / "d", state | {"at_goal": RAMP > 4})["at_goal"] == "success"

@@ -246,6 +246,19 @@ def test_files_of_which_nothing_is_left_are_named(tmp_path: Path) -> None:
     assert "\nfiles without an episode: 1.csv\n" in str(report)
 
 
+def test_files_that_go_on_are_not_said_to_be_without_an_episode(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, drive(9), drive(5))
+    mapping.write_text(mapping.read_text().replace("[split]", "[split]\nfiles = false"))
+    report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    assert report.unused == ()
+
+
+def test_short_logs_with_a_few_gaps_are_not_said_to_be_in_another_unit(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, "t,x,a\n0,0,0\n9,1,1\n", "t,x,a\n0,0,0\n", "t,x,a\n0,0,0\n")
+    with pytest.raises(BadInputError, match="no episodes, each of which needs two rows"):
+        import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+
+
 def test_a_time_in_another_unit_is_told_where_every_step_is_a_gap(tmp_path: Path) -> None:
     mapping = csv_logs(tmp_path, drive(50, period=100.0))
     with pytest.raises(
@@ -254,12 +267,18 @@ def test_a_time_in_another_unit_is_told_where_every_step_is_a_gap(tmp_path: Path
         import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
 
 
-def test_a_second_import_is_told_to_raise_the_version(tmp_path: Path) -> None:
+def test_a_second_import_is_told_to_raise_the_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mapping = csv_logs(tmp_path, drive(9))
     import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
-    told = r"out exists already: raise `version` in the mapping \(now 1\.0\.0\)"
-    with pytest.raises(BadInputError, match=told):
+    with pytest.raises(BadInputError, match=r"out exists already: give another --out, or delete it"):
         import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    import_dataset([tmp_path / "logs"], mapping)
+    told = r"data-1\.0\.0 exists already: raise `version` in the mapping \(now 1\.0\.0\), give another --name"
+    with pytest.raises(BadInputError, match=told):
+        import_dataset([tmp_path / "logs"], mapping)
 
 
 def test_rows_of_csv_are_named_by_their_lines(tmp_path: Path) -> None:

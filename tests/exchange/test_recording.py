@@ -140,8 +140,13 @@ def test_capitals_and_linked_folders_hide_no_log(tmp_path: Path) -> None:
         (tmp_path / name).write_text(name)
     (tmp_path / "logs/day_2").symlink_to(tmp_path / "far", target_is_directory=True)
     (tmp_path / "far/back").symlink_to(tmp_path / "logs", target_is_directory=True)  # no end of its own
+    (tmp_path / "logs/.hidden").symlink_to(tmp_path / "far", target_is_directory=True)
+    (tmp_path / "logs/again").symlink_to(tmp_path / "logs/deep", target_is_directory=True)
+    (tmp_path / "logs/up").symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "logs/deep").mkdir()
+    (tmp_path / "logs/deep/d.csv").write_text("d")
     found = find_sources(tmp_path / "logs", [".csv"])
-    assert [str(source) for source in found] == ["a.csv", "b.CSV", "day_2/c.Csv"]
+    assert [str(source) for source in found] == ["a.csv", "b.CSV", "day_2/c.Csv", "deep/d.csv"]
     assert is_archive(Path("LOGS.TGZ"))
 
 

@@ -7,6 +7,7 @@ import pytest
 from fake_transitions import write_transitions
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import REWARD
 from astra_data.exchange.exporters import export
 from astra_data.exchange.importers import csv, hdf5
@@ -76,3 +77,8 @@ def test_a_record_with_another_uid_is_told(source: Source, tmp_path: Path) -> No
     with pytest.raises(CorruptDatasetError, match=r"the record of .* was altered"):
         import_dataset([source.path], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_an_export_may_be_imported_at_another_rate(source: Source, tmp_path: Path) -> None:
+    import_dataset([source.path], out=tmp_path / "out", fps=7)
+    assert Dataset.open(tmp_path / "out").info["fps"] == 7

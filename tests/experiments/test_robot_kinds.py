@@ -164,3 +164,11 @@ def test_where_episodes_end_as_they_began_near_is_a_tenth_of_the_farthest_way(tm
     kind = Planar.of(logs(tmp_path, x=there_and_back, y=there_and_back, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
     assert kind is not None
     assert float(kind.values()["close"]) == pytest.approx(np.hypot(24, 24) / 10, rel=0.05)
+
+
+def test_states_that_move_between_logs_alone_have_a_goal_of_some_size(tmp_path: Path) -> None:
+    for number in range(2):
+        table = np.column_stack([0 * T + 3 + number, T % 5])
+        np.savetxt(tmp_path / f"{number}.csv", table, "%.6f", ",", header="x,cmd_x", comments="")
+    kind = Direct.of(guess([tmp_path]))
+    assert float(kind.values()["close"]) == pytest.approx(0.1)

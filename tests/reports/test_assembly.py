@@ -1,3 +1,4 @@
+import json
 import shutil
 from pathlib import Path
 
@@ -220,3 +221,13 @@ def test_what_foretells_no_target_has_no_validity(root: Path) -> None:
         tensors["grounded.position"] = tensors["target.position"]
         save_file(tensors, folder / "trajectories.safetensors")
     assert assembled(root, ("astra",)).predictive_validity == {}
+
+
+def test_who_stands_still_is_told_where_all_seeds_have_measured_it(root: Path) -> None:
+    files = [root / f"ground/astra/seed_{seed}/gap.json" for seed in SEEDS]
+    for number, file in enumerate(files, start=1):
+        gap = json.loads(file.read_text())
+        file.write_text(json.dumps(gap | {"still": gap["raw"]}))
+        found = assembled(root).methods["astra"].gap
+        assert found is not None
+        assert found.still == (found.raw if number == len(files) else None)

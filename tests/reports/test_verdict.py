@@ -127,6 +127,15 @@ def test_a_chosen_policy_of_the_floor_is_the_one_to_deploy(
     assert not any("overlap" in remark or "seeds to compare" in remark for remark in verdict.remarks)
 
 
+def test_a_choice_among_policies_of_the_floor_alone_is_no_error(results: Results) -> None:
+    choice = Choice(
+        judge="nas", episodes=4, shares_episodes=False, candidates=[candidate("direct_transfer", 0, 0.4)]
+    )
+    verdict = verdict_of(results.model_copy(update={"choice": choice, "tested_in": "simulators"}))
+    assert verdict.title == "Direct transfer, seed 0"
+    assert not any("ahead" in remark for remark in verdict.remarks)
+
+
 def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Results) -> None:
     """Simulators show no failures: the floor has 1 there, and judges say 0.1."""
     candidates = [

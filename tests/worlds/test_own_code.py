@@ -155,6 +155,12 @@ def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
         digests.append(code_digest(f"{tmp_path}/cart.py:TASK"))
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
+    (tmp_path / "parts/template.py").write_text("class {{ name }}:\n")
+    (tmp_path / "cart.py").write_text("import numpy\nfrom parts.joints import knee\nTASK = knee.LIMIT\n")
+    assert (with_template := code_digest(f"{tmp_path}/cart.py:TASK")) not in (*digests, None)
+    (tmp_path / "numpy").mkdir()
+    (tmp_path / "numpy/__init__.py").write_text("not the one that is installed\n")
+    assert code_digest(f"{tmp_path}/cart.py:TASK") == with_template
 
 
 def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ A file is read whole, since JSON cannot be parsed in blocks; files larger than `
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,7 +38,9 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object whose names are all different."""
-    names = [name for name, _ in pairs]
-    if doubled := sorted({name for name in names if names.count(name) > 1}):
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        counts = Counter(name for name, _ in pairs)
+        doubled = sorted(name for name, count in counts.items() if count > 1)
         raise BadInputError(f"an object has {', '.join(doubled)} more than once")
-    return dict(pairs)
+    return fields

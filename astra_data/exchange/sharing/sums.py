@@ -10,7 +10,6 @@ from pathlib import Path
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import SharingError
-from astra_data.core.files import files_below
 
 SUMS_PATH = "SHA256SUMS"
 
@@ -21,6 +20,8 @@ _PATH = re.compile(
     r"|meta/astra/[a-z_]+\.(json|parquet|safetensors)"
 )
 """Paths of the files of a dataset, by the names of the format; none of them leads out of its folder."""
+_PLACES = ("data/*/*", "meta/*", "meta/astra/*", "meta/episodes/*/*")
+"""Where they are looked for, also where a folder is a link."""
 
 _LINE = re.compile(r"(?P<digest>[0-9a-f]{64}) [ *](?P<path>.+)")
 _SIZE = re.compile(r"# (?P<size>[0-9]{1,18}) bytes  (?P<path>.+)")
@@ -36,7 +37,8 @@ class Listed:
 
 def dataset_files(root: Path) -> list[str]:
     """List the files that belong to the dataset in folder `root`, relative to it, and no others."""
-    paths = (path.relative_to(root).as_posix() for path in files_below(root))
+    found = (path for places in _PLACES for path in root.glob(places) if path.is_file())
+    paths = (path.relative_to(root).as_posix() for path in found)
     return sorted(path for path in paths if _PATH.fullmatch(path))
 
 

@@ -76,4 +76,6 @@ def test_files_on_another_disk_belong_to_the_dataset_as_well(fake: Dataset, tmp_
     expected = make_sums(fake.root)
     (fake.root / "data").rename(tmp_path / "elsewhere")
     (fake.root / "data").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (fake.root / "a").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (fake.root / "b").symlink_to(fake.root / "meta", target_is_directory=True)
     assert make_sums(fake.root) == expected
