@@ -1,3 +1,4 @@
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -73,9 +74,10 @@ def test_every_fault_is_told() -> None:
 
 
 def test_files_on_another_disk_belong_to_the_dataset_as_well(fake: Dataset, tmp_path: Path) -> None:
-    expected = make_sums(fake.root)
-    (fake.root / "data").rename(tmp_path / "elsewhere")
-    (fake.root / "data").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
-    (fake.root / "a").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
-    (fake.root / "b").symlink_to(fake.root / "meta", target_is_directory=True)
-    assert make_sums(fake.root) == expected
+    root = Path(shutil.copytree(fake.root, tmp_path / "set"))
+    expected = make_sums(root)
+    (root / "data").rename(tmp_path / "elsewhere")
+    (root / "data").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (root / "a").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (root / "b").symlink_to(root / "meta", target_is_directory=True)
+    assert make_sums(root) == expected
