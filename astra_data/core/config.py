@@ -222,15 +222,13 @@ def _section(model: type[BaseModel], location: Iterable[int | str]) -> type[Base
     """Follow `location` through the nested models; None where it leaves them."""
     section: type[BaseModel] | None = model
     choices: dict[str, type[BaseModel]] = {}
-    names_freely = False
-    for part in location:
-        if names_freely:  # the key of a dictionary, whose values are of the section
-            names_freely = False
-            continue
+    parts = iter(location)
+    for part in parts:
         if part not in choices:
             field = section.model_fields.get(str(part)) if section else None
             choices = _nested_models(field.annotation) if field else {}
-            names_freely = field is not None and get_origin(field.annotation) is dict
+            if field is not None and get_origin(field.annotation) is dict:
+                next(parts, None)  # a key of any name, whose values are of the section
             part = _UNNAMED
         section = choices.get(str(part))
     return section

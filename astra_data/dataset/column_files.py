@@ -53,8 +53,8 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
             columns[name] = np.load(folder / "values.npy", mmap_mode="c")
         except (OSError, ValueError) as error:
             raise CorruptDatasetError(f"{folder} was altered ({error}); delete it and try again.") from error
-        if dataset.altered({name: columns[name]}):
-            raise CorruptDatasetError(f"{folder} was altered (other values); delete it and try again.")
+    for name in dataset.altered(columns):
+        raise CorruptDatasetError(f"{parent / name} was altered (other values); delete it and try again.")
     return columns
 
 

@@ -7,6 +7,8 @@ from typing import Literal
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
 
 COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|desired|des|target|ref"
+WEAK_FAILURE = re.compile(r"bump(ed|er)?|e_?stop")
+"""A failure where it ever comes, and where there is no other."""
 NAMES: tuple[tuple[Role, str], ...] = (
     ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
     ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
@@ -14,7 +16,7 @@ NAMES: tuple[tuple[Role, str], ...] = (
     (
         "failure",
         r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|crash(ed)?|colli(sion|ded)|fault|terminated|"
-        r"bump(ed|er)?|e_?stop",
+        + WEAK_FAILURE.pattern,
     ),
     ("success", r"success|succeeded|(goal_)?reached|at_goal|delivered|solved"),
     ("reward", r"reward"),
@@ -29,8 +31,6 @@ GOAL = re.compile(
 )
 PLACE_TO_GO = re.compile(r"(target|ref|desired|des)_[xyz]")
 """A goal where it stays the same in each episode and something else is commanded, and otherwise a command."""
-WEAK_FAILURE = re.compile(r"bump(ed|er)?|e_?stop")
-"""A failure where it ever comes, and where there is no other."""
 UNCLEAR = "done|truncated|timeout"
 """Ends of which the name does not say whether they are successes, failures or neither."""
 FORCE = re.compile(r"(.+_)?(tau|torque|effort)(_.+|\d+)?")
@@ -53,6 +53,7 @@ UNITS: tuple[tuple[str, str, float], ...] = (
     ("a", "A", 1.0),
 )
 """Endings of names, the unit that values are stored in, and the factor to it."""
+ENDINGS = [ending for ending, _, _ in UNITS]
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
 ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")

@@ -18,6 +18,7 @@ from astra_data.exchange.field_names import (
     ANGLE,
     COMMAND,
     COMMANDED,
+    ENDINGS,
     EPISODE,
     FORCE,
     GOAL,
@@ -173,7 +174,7 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
 
 def _goal(name: str, values: Floats, tables: Sequence[dict[str, Floats]]) -> Field | None:
     """Return a field that its name calls a goal, and that has one value in each episode; None for others."""
-    body, ending = _without_unit(plain_name(name), [end for end, _, _ in UNITS])
+    body, ending = _without_unit(plain_name(name), ENDINGS)
     found = GOAL.fullmatch(body)
     is_flag = bool(np.isin(values, (0, 1)).all())
     if found is None or (is_flag and not found["axis"]) or not _stays(name, tables):
@@ -183,14 +184,13 @@ def _goal(name: str, values: Floats, tables: Sequence[dict[str, Floats]]) -> Fie
 
 def _places_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields, with commanded places as goals where these stay and something else is commanded."""
-    bodies = [_without_unit(plain_name(field.name), [end for end, _, _ in UNITS])[0] for field in fields]
+    bodies = [_without_unit(plain_name(field.name), ENDINGS)[0] for field in fields]
     stay = {
         field.name
         for field, body in zip(fields, bodies, strict=True)
         if field.role == "command" and PLACE_TO_GO.fullmatch(body) and _stays(field.name, tables)
     }
-    others = [field for field in fields if field.name not in stay]
-    if not any(field.role == "command" or _is_force(field) for field in others):
+    if not any(field.role == "command" or _is_force(field) for field in fields if field.name not in stay):
         return list(fields)
     return [
         replace(field, role="goal", why="one place in each episode") if field.name in stay else field
@@ -230,7 +230,7 @@ def _field(name: str, values: Floats) -> Field:
         return Field(name, "time", "time", unit, TIMES[unit], why)
     if re.fullmatch(UNCLEAR, plain):
         return left_out("an end, but which? name it success or failed")
-    body, ending = _without_unit(plain, [end for end, _, _ in UNITS])
+    body, ending = _without_unit(plain, ENDINGS)
     if ending in ("n", "v", "a") and re.fullmatch(f"{COMMANDED}|u", body):
         body, ending = plain, None  # an axis, as in cmd_v
     is_flag = bool(np.isin(values, (0, 1)).all())

@@ -94,12 +94,17 @@ def astray(gap: GapMeans) -> list[str]:
 
     Not after the first step: a robot that lags behind its commands hardly leaves its state in one.
     """
-    horizon = max(h for h in gap.horizons if h <= JUDGED_AT)
+    horizon = _judged(gap.horizons)
     return [
         name
         for name, band in (gap.still or {}).items()
         if gap.at(gap.raw[name], horizon)[0] >= gap.at(band, horizon)[0]
     ]
+
+
+def _judged(horizons: Sequence[int]) -> int:
+    """Return the horizon at which simulators are judged."""
+    return max(horizon for horizon in horizons if horizon <= JUDGED_AT)
 
 
 def foresight_lines(
@@ -169,7 +174,7 @@ def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], hori
     That is the smallest one whose error, and those of all larger ones, are at most the upper end of the
     interval of the largest.
     """
-    horizon = max(h for h in horizons if h <= JUDGED_AT)
+    horizon = _judged(horizons)
     errors = {size: gap.at(gap.grounded[quantity], horizon) for size, gap in sizes.items()}
     *smaller, largest = errors
     limit, least = errors[largest][2], largest

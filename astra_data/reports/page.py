@@ -167,9 +167,9 @@ def gap_tables(results: Results) -> dict[str, list[list[str]]]:
     tables = {}
     for quantity in first.grounded:
         raw = {title: cells(gap, gap.raw[quantity]) for title, gap in gaps.items()}
-        shared = all(line == cells(first, first.raw[quantity]) for line in raw.values())
+        shared = len(set(map(tuple, raw.values()))) == 1
         lines = [["Standing still", *cells(first, first.still[quantity])]] if first.still else []
-        lines += [["No grounding", *cells(first, first.raw[quantity])]] if shared else []
+        lines += [["No grounding", *next(iter(raw.values()))]] if shared else []
         for title, gap in gaps.items():
             if not shared:
                 lines.append([f"{title}, no grounding", *raw[title]])

@@ -90,10 +90,11 @@ def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     return Verdict(name, opening, row.title, _why_best(results, row, percent), remarks, facts)
 
 
-def best_of(results: Results) -> str:
-    """Return the row with the best mean over seeds that is no reference."""
+def best_of(results: Results, otherwise: str = "") -> str:
+    """Return the row with the best mean over seeds that is no reference; else `otherwise`."""
     worth = _worth(results)
-    return max((name for name in worth if not results.methods[name].role), key=lambda name: worth[name])
+    rivals = [name for name in worth if not results.methods[name].role]
+    return max(rivals, key=lambda name: worth[name], default=otherwise)
 
 
 def chosen_of(results: Results) -> Ranked | None:
@@ -112,8 +113,7 @@ def _passed_over(results: Results, one: Ranked) -> str:
 
 def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
     worth, is_predicted = _worth(results), _is_predicted(results)
-    rivals = [other for other in worth if not results.methods[other].role]
-    ahead = max(rivals, key=lambda other: worth[other]) if rivals else name
+    ahead = best_of(results, name)
     row, best = results.methods[name], results.methods[ahead]
     if chosen and results.choice:
         candidates = results.choice.candidates

@@ -180,6 +180,16 @@ def test_seeds_tell_their_tries_and_commands_beyond_the_data_and_curves_what_is_
     ]
 
 
+def leave_out_the_target(root: Path) -> None:
+    """Let ASTRA have been tested in the grounded simulator alone."""
+    for seed in SEEDS:
+        folder = root / f"evaluate/astra/seed_{seed}"
+        edit_json(folder / "evaluation.json", tested_in="grounded", target=None)
+        tensors = load_file(folder / "trajectories.safetensors")
+        tensors["grounded.position"] = tensors["target.position"]
+        save_file(tensors, folder / "trajectories.safetensors")
+
+
 def test_a_choice_is_of_the_seeds_that_are_asked_for_and_measured_in_the_target_alone(root: Path) -> None:
     write_choice(root)
     choice = assembled(root, ("astra",), (0, 1)).choice
@@ -187,12 +197,7 @@ def test_a_choice_is_of_the_seeds_that_are_asked_for_and_measured_in_the_target_
         (0, 0.5),
         (1, 0.25),
     ]
-    for seed in SEEDS:
-        folder = root / f"evaluate/astra/seed_{seed}"
-        edit_json(folder / "evaluation.json", tested_in="grounded", target=None)
-        tensors = load_file(folder / "trajectories.safetensors")
-        tensors["grounded.position"] = tensors["target.position"]
-        save_file(tensors, folder / "trajectories.safetensors")
+    leave_out_the_target(root)
     for rows in (("astra",), ("astra", "astra_plus")):
         found = assembled(root, rows)
         assert found.tested_in == "simulators" and found.choice is not None
@@ -214,12 +219,7 @@ def test_legs_of_the_target_are_those_of_the_evaluations(root: Path) -> None:
 
 
 def test_what_foretells_no_target_has_no_validity(root: Path) -> None:
-    for seed in SEEDS:
-        folder = root / f"evaluate/astra/seed_{seed}"
-        edit_json(folder / "evaluation.json", tested_in="grounded", target=None)
-        tensors = load_file(folder / "trajectories.safetensors")
-        tensors["grounded.position"] = tensors["target.position"]
-        save_file(tensors, folder / "trajectories.safetensors")
+    leave_out_the_target(root)
     assert assembled(root, ("astra",)).predictive_validity == {}
 
 
