@@ -7,6 +7,7 @@ import typer
 
 from astra_data.cli.arguments import DatasetName, NewName, Out
 from astra_data.cli.showing import show_table
+from astra_data.core.wording import first_few
 
 if TYPE_CHECKING:
     from astra_data.worlds.task import Task
@@ -46,8 +47,8 @@ def tasks(
     for name, known in known_tasks().items():
         table.add_row(
             name if name in TASKS else f"{name} (installed)",
-            _in_short(list(known.limits)),
-            _in_short(_names(known)),
+            first_few(list(known.limits), _SHOWN),
+            first_few(_names(known), _SHOWN),
             "yes" if known.has_target else "no",
             str(known.fps),
         )
@@ -61,12 +62,6 @@ def tasks(
 def _names(task: "Task") -> Sequence[str]:
     """Return the names of a task's abstract states."""
     return task.abstract_state.names or (f"{task.abstract_state.size} values",)
-
-
-def _in_short(names: Sequence[str]) -> str:
-    """List the first of `names`, and count the others."""
-    more = len(names) - _SHOWN
-    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def label(

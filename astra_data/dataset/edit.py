@@ -11,6 +11,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
+from astra_data.core.wording import first_few
 from astra_data.dataset.columns import Scalar
 from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.description import permutation
@@ -90,8 +91,9 @@ def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out
     unknown = sorted(set(uids) - known)
     if unknown or not uids:
         raise BadInputError(
-            f"{source.reference} has no episode {_listed(unknown) or '(none was named)'}; its {len(source)} "
-            f"uids lie between {min(known)} and {max(known)}: {_listed(sorted(known))}"
+            f"{source.reference} has no episode {first_few(unknown, MOST_UIDS) or '(none was named)'}; "
+            f"its {len(source)} uids lie between {min(known)} and {max(known)}: "
+            f"{first_few(sorted(known), MOST_UIDS)}"
         )
     config = {"episodes": sorted(set(uids))}
     return _write(source, known - set(uids), stage="delete", config=config, name=name, out=out)
@@ -277,12 +279,8 @@ def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, i
             named[uid] = name
     if repeated and not new_uids:
         raise BadInputError(
-            f"{len(repeated)} episodes have the uid of an earlier one ({_listed(sorted(repeated))}): leave "
-            "them out, or give them new ones with --new-uids"
+            f"{len(repeated)} episodes have the uid of an earlier one "
+            f"({first_few(sorted(repeated), MOST_UIDS)}): "
+            "leave them out, or give them new ones with --new-uids"
         )
     return names
-
-
-def _listed(uids: Sequence[int]) -> str:
-    more = f" and {len(uids) - MOST_UIDS} more" if len(uids) > MOST_UIDS else ""
-    return ", ".join(map(str, uids[:MOST_UIDS])) + more

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from astra_data.core.wording import first_few
 from astra_data.dataset.columns import TERMINATED
 from astra_data.dataset.endings import Endings
 from astra_data.exchange.cutting import Tally
@@ -38,8 +39,7 @@ class ImportReport:
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
-        more = f" and {len(self.unused) - _SHOWN} more" if len(self.unused) > _SHOWN else ""
-        unused = f"files without an episode: {', '.join(self.unused[:_SHOWN])}{more}\n" if self.unused else ""
+        unused = f"files without an episode: {first_few(self.unused, _SHOWN)}\n" if self.unused else ""
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from astra_data.core.wording import first_few
 from astra_data.dataset.columns import Column
 
 SHOWN = 5
@@ -40,8 +41,7 @@ class Finding:
 def listed(uids: Sequence[int]) -> str:
     """Name the first `SHOWN` of the episodes `uids` and count the others."""
     words = "episode " if len(uids) == 1 else "episodes "
-    more = f" and {len(uids) - SHOWN} more" if len(uids) > SHOWN else ""
-    return words + ", ".join(str(uid) for uid in uids[:SHOWN]) + more
+    return words + first_few(uids, SHOWN)
 
 
 def deletion(called: str, uids: Sequence[int]) -> str:

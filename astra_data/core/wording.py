@@ -1,0 +1,9 @@
+"""Lists in sentences."""
+
+from collections.abc import Sequence
+
+
+def first_few(words: Sequence[object], most: int) -> str:
+    """Name the first `most` of `words` and count the others: `a, b and 3 more`."""
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return ", ".join(map(str, words[:most])) + more
