@@ -74,7 +74,7 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     stages, model = _fake_stages()
     monkeypatch.setattr(plan, "STAGES", stages)
     methods = importlib.import_module("astra_data.methods")
-    for module in (plan, recipe, experiment, methods):
+    for module in (recipe, experiment, methods):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
     monkeypatch.setattr(experiment, "Recipe", model)

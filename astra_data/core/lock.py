@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from astra_data.core.errors import BadInputError
+
 
 @contextmanager
 def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
@@ -24,3 +26,16 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
         yield True
     finally:
         os.close(handle)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run's folder.
+
+    Raises:
+        BadInputError: another process holds it.
+    """
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        yield

@@ -10,6 +10,9 @@ from typing import Any
 
 from astra_data.core.cores import cores
 
+MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""Memory limit of a container in bytes, or "max"; absent outside of one."""
+
 ROOT = Path(__file__).parents[2]
 CODE = ("astra_data", "pyproject.toml", "uv.lock")
 """Changes of these make a checkout dirty; changes of notes and recipes do not."""
@@ -65,9 +68,16 @@ def machine(device: str = "cpu") -> dict[str, Any]:
     return {
         "cpu": _cpu_name(),
         "cores": cores(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "memory_gib": round(memory_bytes() / 2**30, 1),
         "gpu": _gpu_name(device) if device.startswith("cuda") else None,
     }
+
+
+def memory_bytes() -> int:
+    """Return this machine's memory in bytes, or the container's limit where that is less."""
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    limit = MEMORY_LIMIT.read_text().strip() if MEMORY_LIMIT.exists() else "max"
+    return machine if limit == "max" else min(machine, int(limit))
 
 
 def _cpu_name() -> str:

@@ -12,20 +12,10 @@ from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.reader import Dataset
 
-MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Memory limit of a container in bytes, or "max"; absent outside of one."""
-
 
 def cache_folder() -> Path:
     """Return the folder of the raw files: $ASTRA_DATA_CACHE, by default ~/.cache/astra-data."""
     return Path(os.environ.get("ASTRA_DATA_CACHE", Path.home() / ".cache" / "astra-data"))
-
-
-def memory_bytes() -> int:
-    """Return this machine's memory in bytes, or the container's limit where that is less."""
-    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    limit = MEMORY_LIMIT.read_text().strip() if MEMORY_LIMIT.exists() else "max"
-    return machine if limit == "max" else min(machine, int(limit))
 
 
 def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[str, Array]:

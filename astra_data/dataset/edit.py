@@ -81,22 +81,32 @@ def share(percent: int, episodes: int) -> int:
     return (percent * episodes + 50) // 100
 
 
+def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
+    """Check that `dataset` has the episodes `uids`.
+
+    Raises:
+        BadInputError: it lacks some.
+    """
+    known = _uids(dataset)
+    if unknown := sorted(set(uids) - set(known)):
+        raise BadInputError(
+            f"{dataset.reference} has no episode {first_few(unknown, MOST_UIDS)}; "
+            f"its {len(dataset)} uids lie between {min(known)} and {max(known)}: "
+            f"{first_few(sorted(known), MOST_UIDS)}"
+        )
+
+
 def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out: Path | None = None) -> Path:
     """Write `source` without the episodes `uids`.
 
     Raises:
         BadInputError: one of them is not in `source`, or none would be left.
     """
-    known = set(_uids(source))
-    unknown = sorted(set(uids) - known)
-    if unknown or not uids:
-        raise BadInputError(
-            f"{source.reference} has no episode {first_few(unknown, MOST_UIDS) or '(none was named)'}; "
-            f"its {len(source)} uids lie between {min(known)} and {max(known)}: "
-            f"{first_few(sorted(known), MOST_UIDS)}"
-        )
+    check_uids(source, uids)
+    if not uids:
+        raise BadInputError("expected the uids of episodes to leave out, got none")
     config = {"episodes": sorted(set(uids))}
-    return _write(source, known - set(uids), stage="delete", config=config, name=name, out=out)
+    return _write(source, set(_uids(source)) - set(uids), stage="delete", config=config, name=name, out=out)
 
 
 def filter_episodes(

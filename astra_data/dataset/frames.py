@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.column_files import cache_folder, mapped_columns, memory_bytes
+from astra_data.core.provenance import memory_bytes
+from astra_data.dataset.column_files import cache_folder, mapped_columns
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.samples import Samples, take
 from astra_data.dataset.step_windows import every, inside, padded, rolled

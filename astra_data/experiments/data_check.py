@@ -3,7 +3,6 @@
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import base_method
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
 from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
@@ -11,7 +10,7 @@ from astra_data.dataset.versions import open_dataset
 from astra_data.experiments.condition import Condition
 from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.paired_episodes import divided, recordings_of
-from astra_data.methods import METHODS
+from astra_data.methods import method_named
 from astra_data.stages.label import check_fits, drawn_goals, is_address
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import task_named
@@ -42,7 +41,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
         )
     task = task_named(recipe.task)
     check_fits(source, task)
-    if any(METHODS[base_method(row)].grounds for row in recipe.methods):
+    if any(method_named(row).grounds for row in recipe.methods):
         _check_division(recipe, source)
     remarks = [*differing_bounds(task.limits, source), drawn_goals(source, task)]
     return Condition("finished", "; ".join(filter(None, remarks)))

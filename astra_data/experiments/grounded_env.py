@@ -12,6 +12,7 @@ from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import is_plus, place
 from astra_data.core.progress import Progress, silent
+from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
@@ -126,6 +127,8 @@ def _world(
     **options: Any,  # noqa: ANN401 - checked as a recipe's are
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
+    settings, table = settings_of(run), "plus" if is_plus(row) else "train"
+    add_all(settings.get("own_methods", {}))
     learn = method_named(row).learn
     if not isinstance(learn, InSimulator):
         raise BadInputError(
@@ -134,7 +137,6 @@ def _world(
         )
     if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
-    settings, table = settings_of(run), "plus" if is_plus(row) else "train"
     changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | options}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))

@@ -23,7 +23,7 @@ from astra_data.core.naming import base_method, place, reference_of
 from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
-from astra_data.methods import METHODS, grounded_as
+from astra_data.methods import grounded_as, method_named
 from astra_data.methods.method import Method
 from astra_data.reports.runs import Reported
 from astra_data.stages.registry import STAGES, Stage
@@ -58,13 +58,13 @@ def plan(
     items = list(_Plan(recipe, folder, selection, device).items())
     report, keys = STAGES["report"], tuple(point.key for point in selection.points())
     reported = Reported(
-        path.stem,
-        recipe.task,
-        selection.methods,
-        selection.seeds,
-        {row: grounded_as(row) for row in selection.methods},
-        recipe.settings,
-        selection.percents,
+        name=path.stem,
+        task=recipe.task,
+        methods=selection.methods,
+        seeds=selection.seeds,
+        groundings={row: grounded_as(row) for row in selection.methods},
+        settings=recipe.settings,
+        percents=selection.percents,
     )
     choice = _choice(recipe, reported, folder)
     if choice is not None:
@@ -139,13 +139,13 @@ class _Plan:
         reference = reference_of(self.recipe.methods)
         judge = [judge_of(self.recipe.select.judge, self.recipe.methods)] if self.recipe.select else []
         candidates = (*bases, *([reference] if reference else []), *judge)
-        groundings = dict.fromkeys(grounded_as(base) for base in candidates if METHODS[base].grounds)
-        initial = [first for base in bases if (first := METHODS[base].initial)]
-        trained = [row for row in rows if METHODS[base_method(row)].trains]
+        groundings = dict.fromkeys(grounded_as(base) for base in candidates if method_named(base).grounds)
+        initial = [first for base in bases if (first := method_named(base).initial)]
+        trained = [row for row in rows if method_named(row).trains]
         return {
             "grounding": tuple(groundings),
             "policy": tuple(dict.fromkeys(initial + trained)),
-            "alignment": tuple(base for base in groundings if METHODS[base].aligns),
+            "alignment": tuple(base for base in groundings if method_named(base).aligns),
             "row": rows,
         }
 
@@ -170,7 +170,7 @@ class _Plan:
 
     def _item(self, stage: Stage, seed: int, percent: int | None, name: str = "") -> Item:
         """Return the artefact that a stage makes of a dataset, for a method or row if `name` is one."""
-        recipe, method = self.recipe, METHODS[base_method(name)] if name else None
+        recipe, method = self.recipe, method_named(name) if name else None
         key = "/".join(filter(None, (stage.name, name, place(seed, percent))))
         parameters = inspect.signature(stage.run).parameters
         artefacts = self._artefacts(stage, seed, percent, name)
@@ -218,7 +218,7 @@ class _Plan:
         if not name:
             return artefacts
         base = base_method(name)
-        method, reference = METHODS[base], reference_of(self.recipe.methods) or base
+        method, reference = method_named(base), reference_of(self.recipe.methods) or base
 
         def made(by: str, of: str | None) -> str | None:
             return f"{by}/{of}/{place(seed, percent)}" if of else None
@@ -233,7 +233,7 @@ class _Plan:
 
 
 def _grounding(base: str) -> str | None:
-    return grounded_as(base) if METHODS[base].grounds else None
+    return grounded_as(base) if method_named(base).grounds else None
 
 
 def _command(recipe: Recipe, path: Path, selection: Selection) -> str:

@@ -134,7 +134,7 @@ class Recipe(Config):
             except BadInputError:
                 unknown = f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}"
                 raise ValueError(unknown) from None
-            if is_plus(row) and not METHODS[base_method(row)].in_simulator:
+            if is_plus(row) and not method_named(row).in_simulator:
                 raise ValueError(
                     f"'{row}' trains nothing in a simulator, so the [plus] settings are without effect: "
                     f"leave out {PLUS}"
@@ -167,10 +167,10 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_rewards_to_learn_from(self) -> Self:
-        initial = [METHODS[base_method(row)].initial for row in self.methods]
+        initial = [method_named(row).initial for row in self.methods]
         for row in (*self.methods, *filter(None, initial)):
             table = "plus" if is_plus(row) else "train"
-            if not METHODS[base_method(row)].accepts(getattr(self, table).reward):
+            if not method_named(row).accepts(getattr(self, table).reward):
                 raise ValueError(
                     f"{table}.reward: {row} predicts none: expected 'abstract' or 'blend', got 'predicted'"
                 )
@@ -186,14 +186,14 @@ class Recipe(Config):
             raise ValueError(f"select.judge: {error}") from None
         if len(self.seeds) < 2:
             raise ValueError("select: expected two seeds or more, got 1: judges are of other seeds")
-        methods = [METHODS[base_method(row)] for row in self.methods]
+        methods = [method_named(row) for row in self.methods]
         if not any(method.trains and not method.steps_target for method in methods):
             raise ValueError("select: expected a row with policies of abstract states, got none")
         return self
 
     @model_validator(mode="after")
     def _limits_all_commands(self) -> Self:
-        rows = {row: METHODS[base_method(row)] for row in self.methods}
+        rows = {row: method_named(row) for row in self.methods}
         elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]
         if self.train.limits_commands and elsewhere:
             raise ValueError(
@@ -204,7 +204,7 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _has_the_target_that_it_needs(self) -> Self:
-        needing = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].steps_target]
+        needing = [f"methods: {row}" for row in self.methods if method_named(row).steps_target]
         needing += ['[collect] (give `data = "…"` in its place)'] if self.data is None else []
         if needing and not task_named(self.task).has_target:
             raise ValueError(f"{self.task} has no target, which these need: {', '.join(needing)}")
@@ -214,7 +214,7 @@ class Recipe(Config):
     def _fits_the_task(self) -> Self:
         if task_named(self.task).plane is not None:
             return self
-        faults = [f"methods: {row}" for row in self.methods if METHODS[base_method(row)].planar]
+        faults = [f"methods: {row}" for row in self.methods if method_named(row).planar]
         asked = {
             "augment": self.augment is not None,
             'collect.start = "anywhere" (the default: write start = "task")': self.collect

@@ -12,7 +12,7 @@ from rich.console import Console
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.lock import held
+from astra_data.core.lock import alone_in
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -198,9 +198,7 @@ def make(
     """
     check_device(device, cluster)
     recipe, folder = experiment.recipe, experiment.folder
-    with folder_for(folder / RECORD), held(folder) as ours:
-        if not ours:
-            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+    with folder_for(folder / RECORD), alone_in(folder):
         experiment.check_unchanged()
         if is_own_code(recipe.task):
             _check_task(experiment)

@@ -9,6 +9,7 @@ import torch
 from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_SIMULATED_NEXT_STATE
+from astra_data.dataset.edit import check_uids
 from astra_data.dataset.reader import Dataset
 from astra_data.experiments.execution import Item
 from astra_data.experiments.plan import plan, stage_of
@@ -21,7 +22,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.reports.figures import method_colour
-from astra_data.reports.rerun_view import ReplayedEpisode, check_episodes, view
+from astra_data.reports.rerun_view import ReplayedEpisode, view
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import task_named
 
@@ -63,7 +64,7 @@ def view_run(
             f"{run} has no dataset of seed {selection.seeds[0]} yet: run the recipe until pair first"
         )
     dataset = Dataset.open(Path(run) / datasets[-1].key)
-    check_episodes(dataset, uids)
+    check_uids(dataset, uids)
     if ABSTRACT_SIMULATED_NEXT_STATE not in dataset.features:
         view(dataset, uids or dataset.uids[:SHOWN].tolist(), save=save)
         return "all simulators (the dataset is not paired yet)"

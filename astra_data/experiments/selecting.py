@@ -7,7 +7,7 @@ from typing import Any
 
 from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
+from astra_data.core.lock import alone_in
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.experiments.own_methods import add_all
@@ -17,7 +17,7 @@ from astra_data.methods import grounded_as
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
 from astra_data.reports.trials import TRIALS
-from astra_data.stages.select import FOLDER, SelectConfig, benches, digests, judge_of
+from astra_data.stages.select import FOLDER, SelectConfig, benches, digests, judge_in
 from astra_data.stages.select import select as judge_all
 
 _log = logging.getLogger(__name__)
@@ -54,17 +54,15 @@ def select(
     config = validated(asked, SelectConfig, f"{folder}: select")
     methods = tuple(rows) or tuple(settings["methods"])
     recipe = Reported(
-        folder.name,
-        settings["task"],
-        methods,
-        tuple(settings["seeds"]),
-        {row: grounded_as(row) for row in methods},
-        settings,
-        tuple(settings.get("sweep", {}).get("percent", ())),
+        name=folder.name,
+        task=settings["task"],
+        methods=methods,
+        seeds=tuple(settings["seeds"]),
+        groundings={row: grounded_as(row) for row in methods},
+        settings=settings,
+        percents=tuple(settings.get("sweep", {}).get("percent", ())),
     )
-    with held(folder) as ours:
-        if not ours:
-            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+    with alone_in(folder):
         kept = read_judged(folder) if _is_current(folder, recipe, config) else None
         if kept is None:
             judge_all(recipe, config, root=folder, progress=progress)
@@ -82,7 +80,7 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
         )
     if not out.is_dir():
         return False
-    judge = judge_of(config.judge, tuple(recipe.settings["methods"]))  # type: ignore[arg-type]
+    judge = judge_in(recipe, config)
     read = digests([bench.finished(folder) for bench in benches(recipe, judge)], folder)
     manifest, settings = read_manifest(out), out / "config.json"
     same = manifest is not None and manifest.made_from == read and not manifest.faults(out, verify=False)

@@ -8,7 +8,7 @@ from shutil import copy2
 
 from astra_data.core.artefact import finished_folder
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
+from astra_data.core.lock import alone_in
 from astra_data.core.manifest import read_manifest, write_manifest
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
@@ -66,9 +66,7 @@ def choose_by_trials(
             f"{field or len(candidates)}: give another --field, or more rows"
         )
     begun = _begun(folder, trials, field or widest_field(len(candidates), trials), percent)
-    with held(folder) as ours:
-        if not ours:
-            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+    with alone_in(folder):
         return _halve(folder, judged, candidates, begun, part(progress, 0.5, 1.0))
 
 

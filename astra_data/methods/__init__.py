@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from astra_data.core.errors import BadInputError
@@ -21,7 +20,7 @@ from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.policy_file import add_policy_kind
-from astra_data.worlds.own_code import own_object
+from astra_data.worlds.own_code import offered, own_object
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -119,7 +118,7 @@ def method_named(row: str) -> Method:
         BadInputError: there is no such method.
     """
     name = base_method(row)
-    if name not in METHODS and (point := _installed().get(name)):
+    if name not in METHODS and (point := offered(ENTRY_POINTS).get(name)):
         add_method(name, point)
     if name not in METHODS:
         raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with {PLUS}")
@@ -133,8 +132,3 @@ def grounded_as(row: str) -> str:
         BadInputError: as `method_named`.
     """
     return method_named(row).grounded_as or base_method(row)
-
-
-def _installed() -> dict[str, str]:
-    """Return where the methods are that installed packages offer, by name."""
-    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}

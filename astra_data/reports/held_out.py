@@ -14,14 +14,12 @@ from astra_data.methods import method_title
 from astra_data.reports.artefacts import Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill, measured
-from astra_data.reports.schema import GapMeans, shared_horizons
+from astra_data.reports.schema import GapMeans, judged_horizon, shared_horizons
 
 Floats = NDArray[np.float64]
 
 PAGE = "gap.md"
 RELIABILITY = "gap_reliability.png"
-JUDGED_AT = 10
-"""Steps ahead, if the episodes are as long: the horizon at which sizes are compared."""
 _SURE = 0.1
 """Probability of a failure soon above which predictions are compared with what happened."""
 
@@ -94,17 +92,12 @@ def astray(gap: GapMeans) -> list[str]:
 
     Not after the first step: a robot that lags behind its commands hardly leaves its state in one.
     """
-    horizon = _judged(gap.horizons)
+    horizon = judged_horizon(gap.horizons)
     return [
         name
         for name, band in (gap.still or {}).items()
         if gap.at(gap.raw[name], horizon)[0] >= gap.at(band, horizon)[0]
     ]
-
-
-def _judged(horizons: Sequence[int]) -> int:
-    """Return the horizon at which simulators are judged."""
-    return max(horizon for horizon in horizons if horizon <= JUDGED_AT)
 
 
 def foresight_lines(
@@ -174,7 +167,7 @@ def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], hori
     That is the smallest one whose error, and those of all larger ones, are at most the upper end of the
     interval of the largest.
     """
-    horizon = _judged(horizons)
+    horizon = judged_horizon(horizons)
     errors = {size: gap.at(gap.grounded[quantity], horizon) for size, gap in sizes.items()}
     *smaller, largest = errors
     limit, least = errors[largest][2], largest

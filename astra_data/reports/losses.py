@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from astra_data.reports.formatting import interval, mean_std, spread
-from astra_data.reports.schema import MethodResults, Results
+from astra_data.reports.schema import MethodResults, Results, judged_horizon
 from astra_data.reports.tested import where
 from astra_data.worlds.score import SUCCESS
 
@@ -98,28 +98,23 @@ def seed_lines(results: Results) -> tuple[list[str], list[list[str]]]:
     return ["row", "seed", *(name.replace("_", " ") for name in measures)], lines
 
 
-def remaining_errors(results: Results, *, steps: int = 10) -> tuple[int, list[str], list[list[str]]]:
-    """Return how much of each open-loop error is left where it is corrected.
-
-    Args:
-        results: with a gap.
-        steps: the horizon, or the longest that is shorter.
+def remaining_errors(results: Results) -> tuple[int, list[str], list[list[str]]]:
+    """Return how much of each open-loop error is left where it is corrected, of `results` with a gap.
 
     Returns:
         The horizon; the names of the groundings; and a line for each quantity.
     """
     gaps = results.gaps()
     first = next(iter(gaps.values()))
-    horizon = max(one for one in first.horizons if one <= max(steps, min(first.horizons)))
+    horizon = judged_horizon(first.horizons)
     lines = []
     for quantity in first.raw:
         cells = []
         for gap in gaps.values():
-            place = gap.horizons.index(horizon) if horizon in gap.horizons else None
-            if place is None or quantity not in gap.raw:
+            if horizon not in gap.horizons or quantity not in gap.raw:
                 cells.append("-")
                 continue
-            raw, left = gap.raw[quantity].mean[place], gap.grounded[quantity].mean[place]
+            raw, left = (gap.at(of[quantity], horizon)[0] for of in (gap.raw, gap.grounded))
             share = f" ({100 * left / raw:.0f} %)" if raw > 0 else ""
             cells.append(f"{left:.3g} of {raw:.3g}{share}")
         lines.append([quantity, *cells])

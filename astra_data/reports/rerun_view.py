@@ -23,6 +23,7 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.edit import check_uids
 from astra_data.dataset.reader import Dataset
 
 _TARGET, _SIMULATOR = (31, 119, 180), (255, 127, 14)
@@ -73,7 +74,7 @@ def view(
     """
     rerun = optional("rerun", "view")
     known = {int(uid): index for index, uid in enumerate(dataset.uids)}
-    check_episodes(dataset, uids)
+    check_uids(dataset, uids)
     chosen = sorted({known[uid] for uid in uids}) if uids else None
     stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
     if save is None:
@@ -85,20 +86,6 @@ def view(
     recorded = stream.binary_stream()
     _send(rerun, stream, dataset, chosen, replays or {})
     write_file(save, recorded.read())
-
-
-def check_episodes(dataset: Dataset, uids: Sequence[int]) -> None:
-    """Check that `dataset` has the episodes `uids`.
-
-    Raises:
-        BadInputError: it lacks some.
-    """
-    known = set(dataset.uids.tolist())
-    if unknown := [str(uid) for uid in uids if uid not in known]:
-        raise BadInputError(
-            f"{dataset.reference} has no episode {', '.join(unknown)}; its {len(known)} uids lie between "
-            f"{min(known)} and {max(known)}"
-        )
 
 
 def _open_viewer(stream: Any) -> None:  # noqa: ANN401

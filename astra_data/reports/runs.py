@@ -15,7 +15,7 @@ SHARED_BY_ROWS = ("ground", "align")
 """Stages whose artefacts a "_plus" row takes from its base row."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Reported:
     """What stages of a whole recipe need of it, small enough to be sent to another process.
 

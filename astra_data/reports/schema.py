@@ -95,6 +95,11 @@ class GapMeans(Section):
         return band.mean[index], band.low[index], band.high[index]
 
 
+def judged_horizon(horizons: Sequence[int]) -> int:
+    """Return the steps ahead at which simulators are judged: the most of ten or less, if any are."""
+    return max(horizon for horizon in horizons if horizon <= max(10, min(horizons)))
+
+
 def shared_horizons(of_each: Sequence[Sequence[int]]) -> list[int]:
     """Return the horizons that are among those of each gap; short held-out episodes have no long ones."""
     return [horizon for horizon in of_each[0] if all(horizon in others for others in of_each)]

@@ -1,7 +1,6 @@
 """Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import machine
 from astra_data.core.stopwatch import Stopwatch
+from astra_data.dataset.blocks import in_blocks
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -101,7 +101,7 @@ def pair(
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, simulating, reset_error = 0, 0.0, 0.0
     with DatasetWriter.like(source, out, description, more=added) as writer:
-        for episodes in _blocks(source):
+        for episodes in in_blocks(source.episodes(), _BLOCK):
             before = time.perf_counter()
             state, action, next_state = (
                 as_rows(np.concatenate([episode.columns[name] for episode in episodes]))
@@ -221,16 +221,3 @@ def _check(source: Dataset, pairing: Pairing) -> None:
         faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")
     if faults:
         raise BadInputError(f"{source.root} has {' and '.join(faults)}; expected a dataset to be paired")
-
-
-def _blocks(source: Dataset) -> Iterator[list[Episode]]:
-    block: list[Episode] = []
-    steps = 0
-    for episode in source.episodes():
-        block.append(episode)
-        steps += len(episode)
-        if steps >= _BLOCK:
-            yield block
-            block, steps = [], 0
-    if block:
-        yield block

@@ -116,6 +116,15 @@ def judge_of(judge: str | None, rows: tuple[str, ...]) -> str:
     return grounded_as(asked)
 
 
+def judge_in(recipe: Reported, config: SelectConfig) -> str:
+    """Return the judge of all policies of a recipe, of which only some rows may be reported.
+
+    Raises:
+        BadInputError: as `judge_of`.
+    """
+    return judge_of(config.judge, tuple(recipe.settings["methods"]))  # type: ignore[arg-type]
+
+
 def benches(recipe: Reported, judge: str) -> list[Bench]:
     """Return who is judged by whom, at each size; policies that do not act on abstract states are not."""
     able = [row for row in recipe.methods if method_named(row).trains and not method_named(row).steps_target]
@@ -149,7 +158,7 @@ def select(
     Raises:
         BadInputError: there is no policy, no judge, or there are groundings of fewer than two seeds.
     """
-    judge = judge_of(config.judge, tuple(recipe.settings["methods"]))  # type: ignore[arg-type]
+    judge = judge_in(recipe, config)
     contests = [bench.finished(root) for bench in benches(recipe, judge)]
     for bench in contests:
         _check(bench, recipe, root, judge)

@@ -12,7 +12,7 @@ import numpy as np
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
+from astra_data.core.lock import alone_in
 from astra_data.core.progress import Progress, part
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import generator
@@ -123,9 +123,7 @@ def run_study(
         "train": [recording.content_hash for recording in train],
     }
     folder.mkdir(parents=True, exist_ok=True)
-    with held(folder) as ours:
-        if not ours:
-            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+    with alone_in(folder):
         _check_same(folder / "config.json", settings)
         made, stopwatch, found = origin(), Stopwatch(), []
         chosen = list(cases(recipe, data, train))

@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -54,6 +55,11 @@ def own_object(name: str) -> Any:  # noqa: ANN401 - any object
             f"{place} has no '{attribute}'; it has {', '.join(_own_names(module)) or 'nothing'}"
         )
     return getattr(module, attribute)
+
+
+def offered(group: str) -> dict[str, str]:
+    """Return what installed packages offer under a group of entry points: the place of each, by name."""
+    return {point.name: point.value for point in entry_points(group=group)}
 
 
 def file_of(name: str) -> dict[str, str]:

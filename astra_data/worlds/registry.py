@@ -3,14 +3,12 @@
 A task of a file or of a package is code, which is run when the task is named.
 """
 
-from importlib.metadata import entry_points
-
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.ant.tasks import ANTMAZE_TASKS
 from astra_data.worlds.humanoid.tasks import HUMANOID_TASKS
 from astra_data.worlds.nao.tasks import NAO_TASKS
-from astra_data.worlds.own_code import is_own_code, own_object
+from astra_data.worlds.own_code import is_own_code, offered, own_object
 from astra_data.worlds.task import Task
 
 TASKS: dict[str, Task] = {task.name: task for task in (*ANTMAZE_TASKS, *NAO_TASKS, *HUMANOID_TASKS)}
@@ -22,7 +20,7 @@ ENTRY_POINTS = "astra_data.tasks"
 
 def known_names() -> tuple[str, ...]:
     """Return the names of the tasks of this package and of installed ones, without running these."""
-    return (*TASKS, *(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in TASKS))
+    return (*TASKS, *(name for name in offered(ENTRY_POINTS) if name not in TASKS))
 
 
 def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
@@ -37,9 +35,9 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
         return TASKS[name]
     if is_own_code(name):
         return _a_task(name, own_object(name))
-    installed = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    installed = offered(ENTRY_POINTS)
     if name in installed:
-        return _a_task(name, own_object(installed[name].value))
+        return _a_task(name, own_object(installed[name]))
     known = (*known_names(), *besides)
     raise BadInputError(
         f"unknown task '{name}'{did_you_mean(name, known)}; a task of your own is named as cart.py:TASK"

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, Array, Column
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.own_code import explained, file_of, is_own_code, own_object
+from astra_data.worlds.own_code import explained, file_of, is_own_code, offered, own_object
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.registry import TASKS, known_names, task_named
@@ -82,22 +81,17 @@ def pairing_named(name: str) -> Pairing:
         raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
     kind = name.rpartition(":")[2]
     column = replace(column, name=ABSTRACT_STATE)
-    origin = file_of(name) if is_own_code(name) else {"package": _installed()[name]}
+    origin = file_of(name) if is_own_code(name) else {"package": offered(ENTRY_POINTS)[name]}
     return Pairing(kind, origin, None, column, made.abstraction, made)
 
 
 def _made_by(name: str) -> Any:  # noqa: ANN401 - a task or a class of the user's
     if is_own_code(name):
         return own_object(name)
-    installed = _installed()
+    installed = offered(ENTRY_POINTS)
     if name in installed and name not in known_names():
         return own_object(installed[name])
     return task_named(name, besides=tuple(installed))
-
-
-def _installed() -> dict[str, str]:
-    """Return the places of the simulators that installed packages offer, by name."""
-    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
 
 
 def built(pairing: Pairing, count: int) -> AbstractSimulator:

@@ -11,14 +11,14 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.worlds import registry
+from astra_data.worlds import own_code, registry
 
 CART = Path(__file__).parents[1] / "small_cart.py"
 
 
 def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = EntryPoint("rail-cart", "small_cart:LOGS_ALONE", registry.ENTRY_POINTS)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [offered])
+    monkeypatch.setattr(own_code, "entry_points", lambda group: [offered])
     result = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
     lines = {line.split()[1]: line for line in result.output.splitlines() if line.startswith("│")}

@@ -1,7 +1,10 @@
 import threading
 from pathlib import Path
 
-from astra_data.core.lock import held
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.lock import alone_in, held
 
 
 def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
@@ -25,3 +28,14 @@ def test_who_waits_gets_the_lock_when_it_is_free(tmp_path: Path) -> None:
         assert not got.wait(0.1)
     waiting.join()
     assert got.is_set()
+
+
+def test_a_run_is_alone_in_its_folder_or_told_what_to_do(tmp_path: Path) -> None:
+    with (
+        alone_in(tmp_path),
+        pytest.raises(BadInputError, match=f"^{tmp_path} is in use by another run: wait"),
+        alone_in(tmp_path),
+    ):
+        pytest.fail("two are in the folder")
+    with alone_in(tmp_path):
+        pass

@@ -63,3 +63,13 @@ def test_a_gpu_is_named_where_the_networks_are_on_it(monkeypatch: pytest.MonkeyP
     assert origin("cuda:1")["machine"]["gpu"] == "GPU cuda:1"
     assert origin()["machine"]["gpu"] is None
     assert origin()["machine"]["cores"] >= 1
+
+
+def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(provenance, "MEMORY_LIMIT", limit)
+    machine = provenance.memory_bytes()
+    for text, expected in (("max\n", machine), (f"{2**60}\n", machine), (f"{2**20}\n", 2**20)):
+        limit.write_text(text)
+        assert provenance.memory_bytes() == expected
+        assert provenance.machine()["memory_gib"] == round(expected / 2**30, 1)

@@ -10,7 +10,7 @@ from failing_disk import small_files
 from fake_frames import NAMES, assert_equal, everything
 
 from astra_data.core.errors import CorruptDatasetError, DiskError
-from astra_data.dataset import Dataset, column_files
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.frames import Frames
 
@@ -28,15 +28,6 @@ def test_mapped_columns_equal_loaded_ones(
     mapped.columns[STATE].zero_()
     again = Frames.load(fake, NAMES, memory_share=0.0)
     assert torch.equal(again.columns[STATE], frames.columns[STATE])
-
-
-def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limit = tmp_path / "memory.max"
-    monkeypatch.setattr(column_files, "MEMORY_LIMIT", limit)
-    machine = column_files.memory_bytes()
-    for text, expected in (("max\n", machine), (f"{2**60}\n", machine), (f"{2**20}\n", 2**20)):
-        limit.write_text(text)
-        assert column_files.memory_bytes() == expected
 
 
 def test_processes_map_the_same_columns_at_once(fake: Dataset, tmp_path: Path) -> None:

@@ -158,6 +158,21 @@ def test_a_recipe_that_chooses_has_the_same_environments(run: Path, monkeypatch:
         assert world_of(run, row, seed=0).num_envs == 1
 
 
+@pytest.mark.usefixtures("forgotten_methods")
+def test_methods_of_the_run_s_own_are_added_when_it_is_opened(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fresh process knows none of them."""
+    (tmp_path / "mine.py").write_text(
+        "from astra_data.methods import METHODS\nMETHOD = METHODS['direct_transfer']\n"
+    )
+    own = {"mine": f"{tmp_path}/mine.py:METHOD"}
+    settings = settings_of(run) | {"own_methods": own, "methods": ["direct_transfer", "mine"]}
+    monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)
+    mine, raw = (gymnasium.make(ID, run=run, row=row) for row in ("mine", "direct_transfer"))
+    np.testing.assert_array_equal(mine.reset(seed=3)[0], raw.reset(seed=3)[0])
+
+
 def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
     def steps(**options: Any) -> int:  # noqa: ANN401
         env = gymnasium.make(ID, run=run, row="nas", **options)

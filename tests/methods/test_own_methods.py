@@ -262,7 +262,7 @@ def test_another_methods_kind_is_not_replaced(tmp_path: Path) -> None:
 
 def test_installed_packages_offer_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = {"theirs": f"{EXAMPLES / 'delta_action.py'}:METHOD"}
-    monkeypatch.setattr(registry, "_installed", lambda: offered)
+    monkeypatch.setattr(registry, "offered", lambda _: offered)
     assert method_named("theirs_plus").title == "Delta action"
     with pytest.raises(BadInputError, match="unknown method 'thiers'"):
         method_named("thiers")

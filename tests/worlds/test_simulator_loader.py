@@ -13,7 +13,7 @@ from small_cart import GIVEN
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
-from astra_data.worlds import simulator_loader
+from astra_data.worlds import own_code
 from astra_data.worlds.mujoco_model import MujocoModel
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -123,7 +123,7 @@ def test_errors_of_the_users_code_keep_their_cause() -> None:
 
 def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = [EntryPoint(name, "my_simulator:Glider", ENTRY_POINTS) for name in ("glider", "antmaze-umaze")]
-    monkeypatch.setattr(simulator_loader, "entry_points", lambda group: {ENTRY_POINTS: offered}[group])
+    monkeypatch.setattr(own_code, "entry_points", lambda group: {ENTRY_POINTS: offered}.get(group, []))
     pairing = pairing_named("glider")
     assert (pairing.id, pairing.origin) == ("glider", {"package": "my_simulator:Glider"})
     assert pairing.simulator(2).step(torch.ones(2, 2)).tolist() == pytest.approx(np.full((2, 2), 0.05))

@@ -1,10 +1,10 @@
 """D4RL: one HDF5 file with all transitions one after another."""
 
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from astra_data.dataset.blocks import in_blocks
 from astra_data.dataset.columns import REWARD, TERMINATED, TRUNCATED, Array, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
@@ -32,7 +32,7 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         if REWARD not in fields:
             file[D4RL[REWARD]] = np.zeros(rows, np.float32)
         first = 0
-        for block in disk.until_it_fails(_blocks(exported.episodes())):
+        for block in disk.until_it_fails(in_blocks(exported.episodes(), BLOCK_ROWS)):
             part = slice(first, first + sum(map(len, block)))
             for name in block[0].columns:
                 values = np.concatenate([episode.columns[name] for episode in block])
@@ -40,20 +40,6 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
             file[D4RL[TRUNCATED]][part] = np.concatenate([_timeouts(episode) for episode in block])
             first = part.stop
         file[RECORD] = exported.text()
-
-
-def _blocks(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
-    """Yield successive episodes in lists of about `BLOCK_ROWS` rows: each write to HDF5 has its price."""
-    block: list[Episode] = []
-    rows = 0
-    for episode in episodes:
-        block.append(episode)
-        rows += len(episode)
-        if rows >= BLOCK_ROWS:
-            yield block
-            block, rows = [], 0
-    if block:
-        yield block
 
 
 def _timeouts(episode: Episode) -> Array:
