@@ -1,7 +1,6 @@
 """Cut a recording into episodes."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -22,10 +21,11 @@ from astra_data.dataset.columns import (
     Column,
     Scalar,
 )
-from astra_data.dataset.endings import Endings, is_terminated
+from astra_data.dataset.endings import is_terminated
 from astra_data.exchange.conversion import Converter, Mask
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block, row_name
+from astra_data.exchange.tally import Tally
 
 REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
 """Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
@@ -36,42 +36,6 @@ RATE_TOLERANCE = 0.1
 """Largest relative difference between fps and the rate measured from the times."""
 
 Cut = tuple[dict[str, Array], dict[str, Scalar]]
-
-
-@dataclass
-class Tally:
-    """How many rows were read and dropped, and why.
-
-    Attributes:
-        rows: how many were read.
-        rejected_rows: those with a value that is not finite.
-        rejected_first: where the first of them is.
-        split_points: number of boundaries between episodes, by reason.
-        last_rows: last rows of episodes, dropped because their next state was not recorded.
-        last_terminated: those of them that were terminated.
-        last_successes: those of them that succeeded without being terminated.
-        last_reward: the sum of their rewards.
-        back_rows: those at which time goes back, within a file. back_first: where the first of them is.
-        short_rows: rows of episodes that were too short.
-        rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
-        endings: how the episodes end.
-        clock: the recorded rate, gaps and jitter, where the mapping names the times.
-    """
-
-    rows: int = 0
-    rejected_rows: int = 0
-    rejected_first: str = ""
-    split_points: dict[str, int] = field(default_factory=dict)
-    last_rows: int = 0
-    last_terminated: int = 0
-    last_successes: int = 0
-    last_reward: float = 0.0
-    back_rows: int = 0
-    back_first: str = ""
-    short_rows: int = 0
-    rows_after_end: int = 0
-    endings: Endings = field(default_factory=Endings)
-    clock: str = ""
 
 
 class Cutter:
@@ -237,10 +201,10 @@ class Cutter:
                 times = _held(series)
                 steps_s = np.diff(times[:, 0])
                 masks["back"], masks[key] = steps_s < 0, self._gaps(steps_s)
-                if masks["back"].any():
-                    first = row_name(block.origin, row + int(np.argmax(masks["back"])))
-                    self.tally.back_first = self.tally.back_first or first
-                    self.tally.back_rows += int(masks["back"].sum())
+                known = np.isfinite(series[:, 0])
+                stands = (steps_s == 0) & known[:-1] & known[1:]
+                stands[0] &= continues
+                self.tally.count_times(masks["back"], stands, lambda at: row_name(block.origin, row + at))
                 now[key] = times[1:]
             else:
                 masks["end"] |= (np.nan_to_num(series[:-1]) != 0).any(axis=1)

@@ -6,7 +6,7 @@ from pathlib import Path
 from astra_data.core.wording import first_few
 from astra_data.dataset.columns import TERMINATED
 from astra_data.dataset.endings import Endings
-from astra_data.exchange.cutting import Tally
+from astra_data.exchange.tally import Tally
 
 _SHOWN = 8
 """Files that are listed."""
@@ -39,12 +39,18 @@ class ImportReport:
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
+        still = (
+            f"time stands still in {tally.still_rows} rows, first in {tally.still_first}: expected one row "
+            "at a time; they are of several robots, or written twice\n"
+            if tally.still_rows
+            else ""
+        )
         unused = f"files without an episode: {first_few(self.unused, _SHOWN)}\n" if self.unused else ""
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
             f"split points: {points}\n"
-            f"{ends}{rate}{unused}"
+            f"{ends}{rate}{still}{unused}"
             f"rejected rows: {tally.rejected_rows}{first}\n"
             f"last rows without a next state: {_last_rows(tally)}; "
             f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}"

@@ -16,7 +16,7 @@ from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
 from astra_data.dataset.versions import place
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.exchange.cutting import Cut, Cutter, Tally
+from astra_data.exchange.cutting import Cut, Cutter
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.import_report import ImportReport, losses
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
@@ -31,6 +31,7 @@ from astra_data.exchange.recording import (
     is_archive,
 )
 from astra_data.exchange.restoring import read_record, restored, write_restored
+from astra_data.exchange.tally import Tally
 
 FORMATS: Mapping[str, ModuleType] = {
     "csv": csv,
@@ -113,10 +114,7 @@ def import_dataset(
     first = next(cuts, None)
     if first is None:
         _refuse_rejected(cutter.tally, settings)
-        leaps = cutter.tally.split_points.get("gap", 0)
-        why = "each of which needs two rows where logs have no next states"
-        if 2 * leaps > cutter.tally.rows:
-            why = f"'{settings.time}' steps by over gap_s in {leaps} rows: correct time_scale or gap_s"
+        why = _why_none(cutter.tally, settings)
         raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes, {why} ({losses(cutter.tally)})")
     description = {
         "name": settings.name,
@@ -272,3 +270,16 @@ def _refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
             f'{tally.rejected_first}; set not_finite in the mapping to leave them out: "split" ends '
             'the episode there, "drop" goes on with the next row as if one step had passed'
         )
+
+
+def _why_none(tally: Tally, settings: ImportMapping) -> str:
+    """Return why recordings hold no episode: what cuts most of their rows, if anything does."""
+    reasons = {
+        "gap": f"'{settings.time}' steps by over gap_s in {{}} rows: correct time_scale or gap_s",
+        "back": f"'{settings.time}' goes back in {{}} rows, first in {tally.back_first}: sort the rows by it",
+        "field": f"'{settings.split.field}' changes in {{}} rows: sort by it, or write a file of each",
+    }
+    for reason, why in reasons.items():
+        if 2 * (times := tally.split_points.get(reason, 0)) > tally.rows:
+            return why.format(times)
+    return "each of which needs two rows where logs have no next states"

@@ -3,7 +3,7 @@
 from difflib import get_close_matches
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from astra_data.core.config import Config, Count, Positive
 from astra_data.dataset.columns import (
@@ -21,6 +21,15 @@ from astra_data.dataset.columns import (
 )
 
 Index = Annotated[int, Field(ge=0)]
+
+
+def _other_than_zero(factor: float) -> float:
+    if factor == 0:
+        raise ValueError("expected a factor other than 0, which would make all values equal")
+    return factor
+
+
+Factor = Annotated[float, AfterValidator(_other_than_zero)]
 FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
 FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
 
@@ -37,8 +46,8 @@ class ColumnMapping(Config):
     """Fields of the source; of MCAP, "/topic:path.in.message"."""
     take: tuple[Index, ...] = ()
     """Which of their values, from 0; by default all."""
-    scale: tuple[float, ...] = ()
-    """Factors, such as 0.001 for mm."""
+    scale: tuple[Factor, ...] = ()
+    """Factors other than 0, such as 0.001 for mm."""
     offset: tuple[float, ...] = ()
     """Added after scaling."""
     clip: tuple[float, float] | None = None

@@ -100,3 +100,7 @@ class Learner(ABC):
             self.acting.load_state_dict(state["acting"], observation)
         else:
             self.acting.observation = observation
+            self._cut()
+
+    def _cut(self) -> None:  # noqa: B027 - most keep nothing
+        """Let what comes next follow no step that was kept."""

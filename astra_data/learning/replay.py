@@ -39,6 +39,12 @@ class Replay:
             column[row] = step[name]
         self._added += 1
 
+    def cut(self) -> None:
+        """End all episodes with the last step, as where time runs out: the next one does not follow it."""
+        if self._added:
+            last = (self._added - 1) % self._rows
+            self._columns["expired"][last] |= ~self._columns["terminated"][last]
+
     def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
         """Draw windows of `length` consecutive steps, plus one, by torch's global generator.
 

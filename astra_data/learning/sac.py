@@ -142,6 +142,10 @@ class Sac(Learner):
                     self._learn()
         return {"temperature": float(self._log_temperature.detach().exp())}
 
+    def _cut(self) -> None:
+        """End the episodes in the replay buffer."""
+        self._replay.cut()
+
     @torch.no_grad()
     def _act(self) -> None:
         """Take one step and add it to the buffer."""

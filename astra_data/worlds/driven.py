@@ -29,8 +29,8 @@ class DrivenSimulator:
 
     @property
     def state(self) -> Tensor:
-        """The present states, (B, X) float32."""
-        return self.simulator.state.to(self._device)
+        """A copy of the present states, (B, X) float32."""
+        return self.simulator.state.to(self._device, copy=True)
 
     @property
     def parameters(self) -> Mapping[str, float]:
@@ -48,7 +48,8 @@ class DrivenSimulator:
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A) of ±1; return the new states (B, X)."""
-        return self.simulator.step(self._commands.in_units(action).to(self._there)).to(self._device)
+        landed = self.simulator.step(self._commands.in_units(action).to(self._there))
+        return landed.to(self._device, copy=True)
 
     def keep_clear(self, distance_m: float) -> None:
         """Let corrections end no closer to walls than `distance_m`, where there are walls."""
@@ -59,7 +60,7 @@ class DrivenSimulator:
         """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
         if hasattr(self.simulator, "settle"):
             there: Tensor = self.simulator.settle(before.to(self._there), landed.to(self._there))
-            return there.to(self._device)
+            return there.to(self._device, copy=True)
         self.reset_to(landed)
         return self.state
 

@@ -71,7 +71,8 @@ def file_of(name: str) -> dict[str, str]:
 def code_digest(name: str) -> str | None:
     """Return a digest of the code that `name` begins with; None where it is no file.
 
-    The files and packages beside it that it imports count too; comments and layout do not.
+    The files and packages beside it that it imports count too, and other files beside these that they name,
+    such as a robot.xml; comments and layout do not.
 
     Raises:
         BadInputError: one of these files is no Python.
@@ -83,6 +84,8 @@ def code_digest(name: str) -> str | None:
     for path, tree in _with_neighbours(place):
         name = path.relative_to(place.parent).as_posix()
         digest.update(f"{name}\n{ast.dump(tree)}\n".encode())
+        for file in _named_beside(path, tree):
+            digest.update(f"{file.name}\n{file_digest(file)}\n".encode())
     return digest.hexdigest()
 
 
@@ -108,6 +111,14 @@ def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
         yield path, tree
         beside = {file for module in _imported(tree) for file in _files_of(module, place.parent)}
         todo += sorted(beside - seen - set(todo))
+
+
+def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
+    """Return the files in the folder of `place` whose paths within it are texts in it, but no Python."""
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    paths = {text for text in texts if isinstance(text, str) and text.isprintable() and len(text) < 256}
+    beside = {place.parent / path for path in paths if path and not Path(path).is_absolute()}
+    return sorted(file for file in beside if file.suffix != ".py" and file.is_file())
 
 
 def _files_of(module: str, folder: Path) -> list[Path]:

@@ -1,7 +1,7 @@
 from pathlib import Path
 
-from astra_data.exchange.cutting import Tally
 from astra_data.exchange.import_report import ImportReport, losses
+from astra_data.exchange.tally import Tally
 
 
 def test_what_was_dropped_is_counted_aloud() -> None:
@@ -32,3 +32,10 @@ def test_rows_after_the_end_are_told_where_there_are_any() -> None:
     assert losses(tally).endswith(told)
     assert str(ImportReport(Path("out"), 2, 7, tally, 0.25)).endswith(told)
     assert "after the end" not in losses(Tally(rows=9))
+
+
+def test_time_that_stands_still_is_told_with_its_place() -> None:
+    tally = Tally(rows=9, still_rows=4, still_first="a.csv line 3")
+    told = str(ImportReport(Path("out"), 2, 7, tally, 0.25))
+    assert "\ntime stands still in 4 rows, first in a.csv line 3: expected one row at a time" in told
+    assert "still" not in str(ImportReport(Path("out"), 2, 7, Tally(rows=9), 0.25))

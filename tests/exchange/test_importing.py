@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
-from astra_data.exchange.cutting import Cutter, Tally
+from astra_data.exchange.cutting import Cutter
 from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.tally import Tally
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -100,6 +101,20 @@ def test_time_that_goes_back_begins_an_episode_and_is_told(tmp_path: Path) -> No
     tally = with_times(tmp_path, np.arange(20) % 8 / 10)
     assert tally.split_points == {"back": 2}
     assert (tally.back_rows, tally.back_first) == (2, "log.npz row 8")
+
+
+def test_rows_at_the_same_time_are_told_with_their_place(tmp_path: Path) -> None:
+    """Once, wherever blocks end; a time that is not known stands still nowhere."""
+    seconds = np.arange(20) / 10
+    seconds[[5, 6, 12]] = seconds[[4, 4, 11]]
+    tally = with_times(tmp_path, seconds)
+    assert (tally.still_rows, tally.still_first, tally.back_rows) == (3, "log.npz row 5", 0)
+    seconds[:] = np.arange(20) / 10
+    seconds[7] = np.nan
+    path = write_table(tmp_path / "unknown.npz", rows() | {"unused": seconds, "fell": np.zeros(20, bool)})
+    extra = 'time = "unused"\nnot_finite = "drop"\n' + PER_FILE
+    (tmp_path / "unknown").mkdir()
+    assert imported(tmp_path / "unknown", path, extra)[1].tally.still_rows == 0
 
 
 def test_times_in_no_order_are_told_with_their_place(tmp_path: Path) -> None:
@@ -294,3 +309,32 @@ def test_rows_that_are_missing_are_told_with_the_rate(tmp_path: Path) -> None:
     )
     report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
     assert "gaps: 39 (25 % of the steps: rows are missing), jitter" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("split", "log", "why"),
+    [
+        (
+            "[split]",
+            "t,x,a\n" + "".join(f"{row / 10},{row},{row}\n" for row in range(20, 0, -1)),
+            "'t' goes back in 19 rows, first in 0.csv line 3: sort the rows by it",
+        ),
+        (
+            '[split]\nfield = "x"',
+            drive(20),
+            "'x' changes in 19 rows: sort by it, or write a file of each",
+        ),
+    ],
+)
+def test_what_cuts_every_row_is_named(tmp_path: Path, split: str, log: str, why: str) -> None:
+    mapping = csv_logs(tmp_path, log)
+    mapping.write_text(mapping.read_text().replace("[split]", split))
+    with pytest.raises(BadInputError, match=f"no episodes, {why}"):
+        import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+
+
+def test_a_scale_of_zero_is_refused(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, drive(9))
+    mapping.write_text(mapping.read_text() + "scale = [0.0]\n")
+    with pytest.raises(RecipeError, match=r"columns\.action\.scale\.0: expected a factor other than 0"):
+        import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")

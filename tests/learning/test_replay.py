@@ -57,3 +57,16 @@ def test_the_first_steps_of_episodes_are_learned_from_as_often_as_others() -> No
     counts = torch.stack([(step[learned] == place).sum() for place in range(4)]).double()
     assert counts.min() > 0.9 * counts.max()
     assert learned.double().mean() > 0.8
+
+
+def test_nothing_is_learned_across_a_cut() -> None:
+    """Where an episode had ended there, it stays as it was."""
+    kept = replay(ROWS * 12, 40)
+    before = kept.state_dict()
+    expired = torch.as_tensor(before["expired"]).clone()
+    kept.cut()
+    last = 39 % 12
+    expired[last] = ~torch.as_tensor(before["terminated"])[last]
+    assert expired[last].any() and not expired[last].all()
+    assert torch.equal(torch.as_tensor(kept.state_dict()["expired"]), expired)
+    replay(ROWS * 12, 0).cut()

@@ -71,3 +71,31 @@ def test_commands_vary_from_episode_to_episode() -> None:
     landed = noisy.step(torch.zeros(500, 1))
     assert abs(float(landed.std()) / (0.05 * 2.5 * 0.1) - 1.0) < 0.1
     assert abs(float(landed.mean()) - 0.15) < 0.002
+
+
+class InPlace:
+    """A simulator that has one tensor of states, and writes into it."""
+
+    def __init__(self) -> None:
+        self.state = torch.zeros(2, 1)
+
+    def reset_to(self, state: torch.Tensor, rows: torch.Tensor | None = None) -> None:
+        self.state[slice(None) if rows is None else rows] = state
+
+    def step(self, command: torch.Tensor) -> torch.Tensor:
+        self.state += command
+        return self.state
+
+    def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
+        self.state[:] = landed
+        return self.state
+
+
+def test_states_that_were_handed_out_stay_as_they_were() -> None:
+    simulator = DrivenSimulator(InPlace(), DRIVE, "cpu")
+    state, landed = simulator.state, simulator.step(torch.ones(2, 1))
+    kept = landed.clone()
+    settled = simulator.settle(state, torch.full((2, 1), 7.0))
+    simulator.reset_to(torch.full((1, 1), 9.0), torch.tensor([0]))
+    assert state.tolist() == [[0.0], [0.0]] and torch.equal(landed, kept)
+    assert settled.tolist() == [[7.0], [7.0]] and simulator.state.tolist() == [[9.0], [7.0]]

@@ -191,3 +191,18 @@ def test_a_place_is_named_once_and_only_where_it_is_the_users(tmp_path: Path) ->
 def test_a_file_of_another_kind_is_no_module(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"cart.csv: expected a Python file"):
         own_object(f"{tmp_path / 'cart.csv'}:TASK")
+
+
+def test_the_digest_covers_data_that_the_files_name(tmp_path: Path) -> None:
+    """A model in MuJoCo's XML, say; what is beside it and not named does not count."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "cart.py").write_text(
+        '"""A cart."""\nXML = "parts/cart.xml"\nNO = ("", "/", "\\0", "cart.py")\n'
+    )
+    (tmp_path / "parts/cart.xml").write_text("<mujoco/>")
+    (tmp_path / "other.xml").write_text("<mujoco/>")
+    first = code_digest(f"{tmp_path}/cart.py:TASK")
+    (tmp_path / "other.xml").write_text("<mujoco></mujoco>")
+    assert code_digest(f"{tmp_path}/cart.py:TASK") == first
+    (tmp_path / "parts/cart.xml").write_text("<mujoco></mujoco>")
+    assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)

@@ -2,11 +2,13 @@
 
 From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
 topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s` ends the
-episode, and the next begins when all have sent a message again. Times are the messages' log times. Files
+episode, and the next begins when all have sent a message again; where all are silent for as long, it ends
+with the last message. Times are the messages' log times. Files
 are read message by message.
 """
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -21,6 +23,8 @@ from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
 
 SUFFIXES = (".mcap",)
 
+_log = logging.getLogger(__name__)
+
 MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
 
@@ -31,6 +35,7 @@ class Resampler:
     Attributes:
         topics: topic to its fields.
         times: topic to the time of its last message, in ns.
+        silences: topic to how often it ended an episode: it was silent for too long, and others were not.
     """
 
     def __init__(self, mapping: ImportMapping, origin: str) -> None:
@@ -38,6 +43,7 @@ class Resampler:
         self._origin = origin
         self.topics: dict[str, list[str]] = {}
         self.times: dict[str, int] = {}
+        self.silences: dict[str, int] = {}
         for field in mapping.all_fields:
             self.topics.setdefault(field.partition(":")[0], []).append(field)
         expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
@@ -47,11 +53,20 @@ class Resampler:
         self._values: dict[str, Array] = {}
         self._start: int | None = None
         self._row = 0
+        self._resumed = 0
+        self._silent: set[str] = set()
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
         self._values |= values
+        if self._is_pause(time):
+            self._resumed = time
         self.times[topic] = time
+        self._silent.discard(topic)
+        for other in self._expiring & self.times.keys() - self._silent:
+            if time - max(self.times[other], self._resumed) > self._gap_ns:
+                self._silent.add(other)
+                self.silences[other] = self.silences.get(other, 0) + 1
         if self._start is None and self._is_complete(time):
             self._start, self._row = time, 0
 
@@ -61,6 +76,9 @@ class Resampler:
         Raises:
             BadInputError: these are more than `MOST_HELD_ROWS`.
         """
+        if self._is_pause(time):
+            yield from self.rows_before(max(self._heard()) + 1)
+            self._start = None
         self._refuse_gap(time)
         while self._start is not None:
             moment = self._start + self._row * 10**9 // self._fps
@@ -82,6 +100,13 @@ class Resampler:
                 f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
                 f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
             )
+
+    def _is_pause(self, time: int) -> bool:
+        """Return whether all topics that are not latched were silent for too long before `time`."""
+        return bool(heard := self._heard()) and time - max(heard) > self._gap_ns
+
+    def _heard(self) -> list[int]:
+        return [self.times[topic] for topic in self._expiring & self.times.keys()]
 
     def _is_complete(self, time: int) -> bool:
         return self.times.keys() == self.topics.keys() and all(
@@ -134,6 +159,14 @@ def _rows(source: Source, mapping: ImportMapping) -> Iterator[tuple[bool, dict[s
     silent = sorted(resampler.topics.keys() - resampler.times.keys())
     if silent:
         raise BadInputError(f"{source}: no messages on {', '.join(silent)}")
+    for topic, times in resampler.silences.items():
+        _log.warning(
+            "%s: %s is silent for over split.gap_s %d times while others are not, and episodes end there: "
+            "set latched = true where it is sent on change, or a longer gap_s",
+            source,
+            topic,
+            times,
+        )
 
 
 def _block(source: Source, rows: list[dict[str, Array]], starts: bool) -> Block:

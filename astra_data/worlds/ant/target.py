@@ -128,10 +128,11 @@ class AntMazeEnv:
         torques = self.controller(self.physics.qpos, self.physics.qvel, command)
         self.physics.step(torques, None if active is None else active.numpy())
         after = self.position
-        self.failed = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
         success = self.objective.reached(after, self.goal)
+        self.failed = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
         if self.objective.ends_at_walls:
-            self.failed |= self.wall_contact & ~success
+            self.failed |= self.wall_contact
+        self.failed &= ~success
         return Step(
             observation=self._observe(),
             reward=self.objective.reward(before, after, self.goal, self.failed),

@@ -50,13 +50,13 @@ def test_time_far_apart_costs_nothing(tmp_path: Path) -> None:
         m for t in (0.0, 1e9) for k in range(3) for m in (pose(t + k / 10, 1), command(t + k / 10, 1))
     ]
     dataset, _ = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
-    assert dataset.lengths.tolist() == [5, 2]
+    assert dataset.lengths.tolist() == [2, 2]
 
 
 def test_a_message_in_the_far_future_is_not_waited_for(tmp_path: Path) -> None:
     messages = [pose(0.0, 1), command(0.0, 1), pose(1.8e10, 2), command(1.8e10, 2)]
-    mapping = MAPPING.replace("gap_s = 0.35", "gap_s = 1e10")
-    with pytest.raises(BadInputError, match=r"log\.mcap: .* 100000000000 equal rows, .*split\.gap_s"):
+    mapping = MAPPING.replace("gap_s = 0.35", "gap_s = 1.9e10")
+    with pytest.raises(BadInputError, match=r"log\.mcap: .* 180000000000 equal rows, .*split\.gap_s"):
         imported(tmp_path, write_json(tmp_path / "log.mcap", messages), mapping)
 
 
@@ -146,3 +146,36 @@ def test_the_bag_of_a_wheeled_base_is_read_by_the_mapping_that_comes_with_the_pa
     np.testing.assert_allclose(yaw, 0.05 * np.arange(49), atol=0.011)
     np.testing.assert_allclose(state[:, 0], np.sin(yaw), atol=1e-6)
     assert episode.columns[ACTION].tolist() == [[0.5, 0.5]] * 49
+
+
+def test_a_pause_of_all_topics_ends_the_episode_with_its_last_message(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No row is made up, and nobody is blamed for being silent."""
+    drives = [m for t in (0.0, 60.0) for k in range(5) for m in (pose(t + k / 10, k), command(t + k / 10, k))]
+    dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drives), MAPPING)
+    assert dataset.lengths.tolist() == [4, 4] and report.tally.rows == 10
+    turns = dataset.columns([ACTION])[ACTION].tolist()
+    assert turns == [0.0, 1.0, 2.0, 3.0] * 2
+    assert not caplog.messages
+
+
+def test_a_latched_topic_keeps_no_pause_awake(tmp_path: Path) -> None:
+    messages = [pose(t + k / 10, k) for t in (1.0, 60.0) for k in range(5)]
+    messages += [command(t, t) for t in (0.9, 20.0, 40.0, 59.9)]
+    latched = MAPPING.replace('fields = ["/command:turn"]', 'fields = ["/command:turn"]\nlatched = true')
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    dataset, _ = imported(tmp_path, path, latched)
+    assert dataset.lengths.tolist() == [4, 4]
+    assert dataset.columns([ACTION])[ACTION].tolist() == [np.float32(0.9)] * 4 + [np.float32(59.9)] * 4
+
+
+def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages = [pose(k / 10, k) for k in range(40)] + [command(t, 1.0) for t in (0.0, 1.0, 1.2, 2.5)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    imported(tmp_path, path, MAPPING)
+    [warning] = caplog.messages
+    assert "log.mcap: /command is silent for over split.gap_s 3 times while others are not" in warning
+    assert "latched = true" in warning

@@ -196,3 +196,13 @@ def test_the_reach_covers_every_leg() -> None:
 
     assert farthest(1.0) < 1.6
     assert farthest(1.25) < 1.6 * 1.25
+
+
+def test_who_topples_at_the_goal_has_reached_it() -> None:
+    env = placed([[-4, 4], [-4, 4]])
+    rolled(env, [0, 1], np.pi)
+    env.goal = env.position + torch.tensor([[0.0, 0.0], [3.0, 0.0]])
+    step = env.step(torch.zeros(2, 2))
+    assert step.success.tolist() == [True, False] and env.failed.tolist() == [False, True]
+    assert step.terminated.tolist() == [True, True]
+    assert step.reward.tolist() == pytest.approx([10.0, -10.0], abs=0.2)
