@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,3 +30,14 @@ def test_what_needs_a_target_is_refused_in_one_line(tmp_path: Path) -> None:
     needing = 'methods: target, methods: full_obs, [collect] (give `data = "…"` in its place)'
     assert str(caught.value).endswith(f"has no target, which these need: {needing}")
     assert "\n" not in str(caught.value)
+
+
+def test_rows_that_share_a_grounding_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = '"direct_transfer", "astra_plus", "nas", "nas_plus"'
+    path, given = written(tmp_path, f'data = "logs"\nmethods = [{rows}]\n[plus]\nramp = 0.1\n'), list[Any]()
+    monkeypatch.setattr(
+        "astra_data.experiments.held_out.write_held_out", lambda *of, **more: given.append(of[2])
+    )
+    experiment = load_experiment(path, tmp_path / "runs")
+    write_errors(experiment, Selection.of(experiment.recipe))
+    assert given == [("astra", "nas")]

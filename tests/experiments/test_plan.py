@@ -305,3 +305,23 @@ def test_the_last_stage_is_one_of_those_made() -> None:
     assert stages_until(None) - stages_until("select") == {"evaluate", "report"}
     with pytest.raises(BadInputError, match=r"unknown stage 'grond'.*ground"):
         stages_until("grond")
+
+
+def test_a_policy_to_go_on_from_comes_first_wherever_its_row_is(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = 'task = "maze"\nmethods = ["fine_tuned", "direct_transfer"]\nseeds = [0]\n'
+    keys = [item.key for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)]
+    first, then = (keys.index(f"train/{row}/seed_0") for row in ("direct_transfer", "fine_tuned"))
+    assert first < then and len(set(keys)) == len(keys)
+
+
+def test_who_was_trained_in_the_target_goes_beyond_no_recorded_commands(
+    tmp_path: Path, fake_recipe: type[Recipe]
+) -> None:
+    text = HEAD.replace('"astra_plus"', '"target"')
+    items = plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
+    calls = {item.key: item.call for item in items if item.key.startswith("evaluate")}
+    known = {key: call.keywords["recorded"] for key, call in calls.items() if isinstance(call, partial)}
+    assert known["evaluate/target/seed_0"] is None
+    assert known["evaluate/astra/seed_0"] == tmp_path / "pair/seed_0"

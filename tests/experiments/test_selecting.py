@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rail_run import make_rail_run
@@ -104,3 +105,17 @@ def test_what_is_not_there_is_asked_for(folder: Path) -> None:
     (folder / "select").symlink_to(folder.parent / "base")
     with pytest.raises(BadInputError, match="which this run is based on: select there"):
         select(folder)
+
+
+def test_policies_of_every_size_are_judged(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, sizes = folder / "recipe.json", list[Any]()
+    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"sweep": {"percent": [50, 100]}}))
+
+    def noted(asked: Any, *_: object, **more: object) -> None:  # noqa: ANN401
+        sizes.append(asked.percents)
+        raise StopIteration
+
+    monkeypatch.setattr("astra_data.experiments.selecting.judge_all", noted)
+    with pytest.raises(StopIteration):
+        select(folder)
+    assert sizes == [(50, 100)]

@@ -14,8 +14,9 @@ from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.suggesting import suggest
+from astra_data.experiments.suggesting import _usual, suggest
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.worlds.registry import TASKS
 
 FEW: dict[str, Any] = {"episodes": 3, "proposals": 20}
 
@@ -115,3 +116,9 @@ def test_what_cannot_disagree_is_refused_and_nothing_is_written(folder: Path) ->
     with pytest.raises(BadInputError, match="expected a row that grounds its simulator"):
         suggest(folder)
     assert not list(folder.glob(".suggest*"))
+
+
+def test_without_a_collection_starts_are_anywhere_in_a_maze() -> None:
+    for name, start in (("antmaze-umaze", "anywhere"), ("humanoid-walker2d", "task")):
+        task = TASKS[name]
+        assert _usual(task, {}) == {"max_steps": task.objective.horizon, "start": start}

@@ -15,6 +15,7 @@ from astra_data.core.manifest import read_manifest
 from astra_data.core.seeding import derive
 from astra_data.experiments import trials as module
 from astra_data.experiments.selecting import select
+from astra_data.experiments.trained_policy import load_policy
 from astra_data.experiments.trials import choose_by_trials
 from astra_data.reports.halving import halve
 from astra_data.reports.trials import TrialsFile
@@ -181,3 +182,23 @@ def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
     recipe.write_text(json.dumps(json.loads(recipe.read_text()) | task))
     with pytest.raises(BadInputError, match=r"expected a task with a target, got .*LOGS_ALONE: leave out"):
         choose_by_trials(folder, 12)
+
+
+def test_trials_are_of_the_size_that_is_asked_for(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged, made, loaded = select(folder), load_policy, list[int | None]()
+    sized = [one.model_copy(update={"percent": size}) for size in (50, 100) for one in judged.candidates]
+    both = judged.model_copy(update={"candidates": sized})
+
+    def noted(run: Path, row: str, *, seed: int, percent: int | None = None) -> RunningPolicy:
+        loaded.append(percent)
+        return made(run, row, seed=seed)
+
+    monkeypatch.setattr(module, "load_policy", noted)
+    monkeypatch.setattr(module, "select", lambda *_, **__: both)
+    with pytest.raises(BadInputError, match=r"a size of the run \(50, 100\), got none"):
+        choose_by_trials(folder, 20, field=4)
+    found = choose_by_trials(folder, 20, field=4, percent=50)
+    assert found.percent == 50 and loaded == [50] * 6
+    assert found.rounds[0].candidates == [(one.row, one.seed) for one in both.ranked(50)[:4]]

@@ -144,3 +144,9 @@ def test_the_failure_model_is_fitted_to_replays_that_keep_clear(
     fitting = Fitting(TASK, config, None, training, training, 0, "cpu", tmp_path, silent)
     HistoryFit(latent=False, reward=False)(fitting)
     assert given == [pytest.approx(1.0, abs=0.11)]
+
+
+def test_two_of_100_steps_are_what_a_robot_can_rely_on() -> None:
+    assert recorded_clearance_m(TASK, recorded(*[1.5] * 197, 0.25, 0.25, 0.25)) == pytest.approx(
+        0.25, abs=0.11
+    )

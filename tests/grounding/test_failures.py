@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
+from astra_data.grounding import failures as module
 from astra_data.grounding.failures import (
     averages_before,
     compared_foresight,
@@ -386,3 +387,23 @@ def test_inputs_are_seen_in_their_own_scale_and_weights_decay(monkeypatch: pytes
     monkeypatch.setattr("astra_data.grounding.failures._WEIGHT_DECAY", 300.0)
     decayed = fit_failures(TASK, grounding, training, 1, seed=0)
     assert float(decayed.log_odds(seen).std()) < 0.1 * float(model.log_odds(seen).std())
+
+
+def test_who_cross_fits_has_not_seen_the_fold(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, fitted = module._descended, list[tuple[FailureModel, FailureModel, Tensor]]()
+
+    def noted(untrained: FailureModel, inputs: Tensor, fails: Tensor) -> FailureModel:
+        model = made(untrained, inputs, fails)
+        fitted.append((untrained, model, fails))
+        return model
+
+    monkeypatch.setattr(module, "_descended", noted)
+    monkeypatch.setattr(module, "_DESCENT", DescentConfig(updates=4))
+    episodes = hurried(10, 0)
+    fit_failures(TASK, HistoryGrounding(grounding_model()), episodes, 1, 0, 7)
+    begins, models, fails = zip(*fitted, strict=True)
+    assert len(fitted) == 1 + 5
+    assert all(begin is begins[0] and begin not in models for begin in begins)
+    steps = int(episodes.windows.mask.sum())
+    assert len(fails[0]) == steps
+    assert sum(steps - len(one) for one in fails[1:]) == steps  # each step is left out once

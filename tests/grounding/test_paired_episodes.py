@@ -279,3 +279,32 @@ def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> N
     moved = replace(PairedEpisodes.load(tmp_path / "ant"), commands=Commands(bounded))
     with pytest.raises(BadInputError, match=r"was paired for commands within \{'vx': \(-1.0, 2.0\)"):
         moved.check(ant)
+
+
+def test_an_episode_of_nothing_but_a_made_up_step_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "LENGTHS", (7, 3, 1, 30, 5))  # the third is terminated
+    sizes = SIZES | {NEXT_STATE: 3}
+    folder = write(tmp_path / "made_up", sizes, held_out=(3,), made_up=True, sources={3: 0})
+    left = PairedEpisodes.load(folder)
+    assert left.lengths.tolist() == [7, 3, 29, 5]
+    assert left.uids is not None and left.uids.tolist() == [0, 1, 3, 4]
+    assert left.held_out is not None and left.held_out.tolist() == [False, False, True, False]
+    assert left.recordings is not None and left.recordings.tolist() == [0, 1, 0, 3]
+    # The episode before it is as it was.
+    assert left.reward[1, :3].tolist() == [-label(1, step) for step in range(3)]
+    assert left.terminated.nonzero().tolist() == [[2, 28]]
+
+
+def test_chosen_episodes_keep_their_names(tmp_path: Path) -> None:
+    episodes = PairedEpisodes.load(write(tmp_path / "copies", SIZES, sources={1: 4, 3: 4}))
+    chosen = episodes.select(torch.tensor([3, 0]))
+    assert chosen.uids is not None and chosen.uids.tolist() == [3, 0]
+    assert chosen.recordings is not None and episodes.recordings is not None
+    assert chosen.recordings.tolist() == [int(episodes.recordings[one]) for one in (3, 0)]
+
+
+def test_copies_of_the_first_episode_are_of_its_recording(tmp_path: Path) -> None:
+    episodes = PairedEpisodes.load(write(tmp_path / "copies", SIZES, sources={1: 0, 3: 0}))
+    assert episodes.recordings is not None and episodes.recordings.tolist() == [0, 0, 1, 0, 2]

@@ -217,3 +217,33 @@ def test_a_recorded_start_is_one_of_the_recorded_moments(
     moments = few.steps(few.windows.state)
     assert len(moments) == 6
     assert torch.equal(world.simulator.state.unique(dim=0), moments.unique(dim=0))
+
+
+def test_plenty_of_data_is_no_bonus(episodes: PairedEpisodes) -> None:
+    thinness = env_parts(TASK, EnvConfig(), episodes, NO_GROUNDING).thinness
+    assert thinness is not None
+    assert (float(thinness.min()), float(thinness.max())) == (0.0, 1.0)
+
+
+def test_data_counts_for_what_is_near_it(episodes: PairedEpisodes) -> None:
+    """A kernel of 0.25 m ends at four of its deviations, 1 m."""
+    here = torch.cat([HERE, torch.zeros(2)]).expand(2, 400, 4)
+    alone = replace(episodes, windows=replace(episodes.windows, state=here))
+    thinness = env_parts(TASK, EnvConfig(), alone, NO_GROUNDING).thinness
+    assert thinness is not None
+    cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
+    near, far = (HERE + torch.tensor([[apart, 0.0], [-apart, 0.0], [0.0, -apart]]) for apart in (0.8, 1.2))
+    assert not thinness[cells(near)].any()
+    assert (thinness[cells(far)] == 1.0).all()
+
+
+def test_the_usual_density_is_that_of_the_free_space() -> None:
+    """With data in every free cell the middle of a corridor is as dense as is usual."""
+    free = torch.from_numpy(~TASK.maze.fine_walls).nonzero().flip(1)  # columns are x
+    places = (free + 0.5) * TASK.maze.fine_m - torch.as_tensor(TASK.maze.half_extent)
+    state = torch.cat([places, torch.zeros(len(places), 2)], dim=-1).float()[None]
+    everywhere = toy_episodes(state, torch.zeros(1, len(places), 2), next_state=state)
+    thinness = env_parts(TASK, EnvConfig(support_density=2.0), everywhere, NO_GROUNDING).thinness
+    assert thinness is not None
+    cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
+    assert float(thinness[cells(HERE[None])]) == pytest.approx(0.5, abs=0.02)

@@ -115,3 +115,20 @@ def test_a_suggestion_is_what_was_taken_of_the_proposals() -> None:
     assert (np.diff(made.information) <= 0).all()
     with pytest.raises(BadInputError, match="expected at most 16, the proposals, got 17"):
         suggested(TASK, committee, CONFIG.model_copy(update={"episodes": 17}), seed=1)
+
+
+def test_what_teaches_nothing_is_taken_once_all_the_same() -> None:
+    taken, gained = chosen(torch.zeros(3, 1), torch.zeros(3, 1, 1), 3, reach=0.5)
+    assert sorted(taken.tolist()) == [0, 1, 2] and gained.tolist() == [0.0] * 3
+
+
+def test_a_step_teaches_as_much_as_the_nearest_leaves_of_it() -> None:
+    """The third lies between the others, as far from either as their reach."""
+    information, places = torch.tensor([[10.0], [9.0], [1.0]]), torch.tensor([[-0.5], [0.5], [0.0]])
+    taken, gained = chosen(information, places[..., None], 3, reach=0.5)
+    assert taken.tolist() == [0, 1, 2] and gained[2] == pytest.approx(1 - np.exp(-0.5))
+
+
+def test_a_copy_of_a_long_way_teaches_nothing() -> None:
+    places = torch.tensor([[0.0, 5.0]]).expand(2, 2)[..., None]
+    assert chosen(torch.ones(2, 2), places, 2, reach=0.5)[1] == pytest.approx([2.0, 0.0])

@@ -138,3 +138,12 @@ def test_all_tries_meet_the_same_starts_and_goals(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("astra_data.training.restarts.trial", tested)
     restarted(tmp_path, [-1.0, -0.9], tries=2)
     assert seeds == [7, 7]
+
+
+def test_what_is_just_enough_masters_it() -> None:
+    config = PpoTrainConfig(tries=2, least_success=0.9, most_of_horizon=0.5)
+    training: Any = SimpleNamespace(task=TASK, config=config)
+    just = 0.5 * TASK.objective.horizon
+    assert _masters(Reached(0.9, just), training)
+    assert not _masters(Reached(0.89, just), training)
+    assert not _masters(Reached(0.9, just + 0.1), training)

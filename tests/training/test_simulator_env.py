@@ -357,3 +357,47 @@ def test_recorded_starts_hand_over_their_history() -> None:
     expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)
     torch.testing.assert_close(grounded.hidden, expected.expand(3, 8))
     assert torch.equal(one.goal, goal.expand(3, 2)) and torch.equal(grounded.goal, one.goal)
+
+
+def test_whoever_reaches_the_goal_at_a_wall_has_not_failed() -> None:
+    task = TASKS["nao-navigation"]
+    one = SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, 2))
+    # Both touch the wall at x = -2; the goal of the first is there.
+    state = torch.tensor([[-1.999, 2.0, 0.0, 0.0]]).expand(2, 4)
+    goal = torch.tensor([[-1.9, 2.0], [1.9, 2.0]])
+    one.load_state_dict(one.state_dict() | {"state": state, "goal": goal})
+    step = one.step(torch.tensor([[-1.0, 0.0]]).expand(2, 2))
+    assert one.simulator.blocked.all() and step.terminated.all()
+    assert step.success.tolist() == [True, False] and one.failed.tolist() == [False, True]
+
+
+def test_thin_data_costs_where_a_step_ends() -> None:
+    thinness = torch.zeros(U_MAZE.fine_walls.shape)
+    thinness[:, thinness.shape[1] // 2 :] = 0.25  # x > 0
+    rewards = []
+    for one in (world(2), world(2, thinness=thinness)):
+        state = torch.tensor([[-0.02, 4.0, 0.0, 0.0], [0.02, 4.0, 0.0, 0.0]])
+        one.load_state_dict({"state": state, "goal": torch.tensor([[-4.0, -4.0]]).expand(2, 2)})
+        rewards.append(one.step(torch.tensor([[1.0, 0.0], [-1.0, 0.0]])).reward)
+    assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-0.25, 0.0])
+
+
+def test_going_on_the_last_command_is_known() -> None:
+    first, second = (world(2, change_penalty=1.0) for _ in range(2))
+    same = torch.full((2, 2), 0.5)
+    first.reset()
+    first.step(same)
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(first.step(same).reward, second.step(same).reward)
+
+
+def test_a_saved_state_stays_as_it_was() -> None:
+    one = world(2, change_penalty=1.0)
+    one.reset()
+    one.step(torch.full((2, 2), 0.5))
+    saved = {name: values.clone() for name, values in one.state_dict().items()}
+    kept = {name: values.clone() for name, values in saved.items()}
+    one.load_state_dict(saved)
+    one.reset(torch.tensor([True, False]))
+    one.step(torch.full((2, 2), -0.5))
+    assert all(torch.equal(saved[name], values) for name, values in kept.items())

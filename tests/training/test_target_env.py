@@ -116,3 +116,21 @@ def test_a_share_of_the_episodes_starts_from_the_data() -> None:
     start, goal = (torch.tensor(TASK.maze.cell_centre(*cell)) for cell in (TASK.maze.start, TASK.maze.goal))
     assert ((saved["physics"][~from_data, 1:3] - start).abs() < 0.7).all()
     assert ((saved["goal"][~from_data] - goal).abs() < 0.7).all()
+
+
+def test_only_those_that_start_anew_are_put_into_the_data() -> None:
+    torch.manual_seed(0)
+    env = world(share=1.0)
+    before = env.reset()
+    after = env.reset(torch.tensor([True, False, True, False]))
+    assert torch.equal(after[1::2], before[1::2])
+    assert not torch.equal(after[::2], before[::2])
+
+
+def test_each_episode_begins_somewhere_else() -> None:
+    torch.manual_seed(0)
+    env = world()
+    first, second = env.reset(), env.reset()
+    assert (first != second).any(dim=1).all()
+    torch.manual_seed(0)
+    assert torch.equal(world().reset(), first)

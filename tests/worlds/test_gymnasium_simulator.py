@@ -51,3 +51,27 @@ def test_options_are_those_of_the_environment() -> None:
 def test_an_environment_that_is_not_there_is_told() -> None:
     with pytest.raises(BadInputError, match=r"gymnasium\.make\('Nowhere-v0'\)"):
         make(1, env_id="Nowhere-v0")
+
+
+def test_what_is_written_has_to_be_what_is_read() -> None:
+    """Entries in another order, say; once the first batch is known to be right, nothing is read again."""
+
+    def swapped(env: Env, state: State) -> None:
+        write(env, state[::-1])
+
+    simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=read, write=swapped)
+    simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
+    with pytest.raises(
+        BadInputError, match=r"^Pendulum-v1: after write\(env, \[1.0, 0.25\]\) .* \[0.25, 1.0\]"
+    ):
+        simulator.step(torch.zeros(2, 1))
+    reads = []
+
+    def noted(env: Env) -> State:
+        reads.append(0)
+        return read(env)
+
+    simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=noted, write=write)
+    for expected in (4, 6):
+        simulator.step(torch.zeros(2, 1))
+        assert len(reads) == expected

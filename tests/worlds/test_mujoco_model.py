@@ -59,3 +59,12 @@ def test_motors_with_states_of_their_own_are_refused() -> None:
     slow = PENDULUM.replace('<motor joint="hinge"', '<general dyntype="filter" dynprm="0.1" joint="hinge"')
     with pytest.raises(BadInputError, match="1 actuator states"):
         MujocoModel(mujoco.MjModel.from_xml_string(slow), 1, substeps=1)
+
+
+def test_a_state_that_diverges_does_not_jump_to_the_initial_pose(model: mujoco.MjModel) -> None:
+    simulator = MujocoModel(model, 2, substeps=1)
+    simulator.reset_to(torch.tensor([[0.5, 2e10], [0.5, 1.0]]))
+    wild, calm = simulator.step(torch.zeros(2, 1))
+    assert not wild.isfinite().all() or abs(float(wild[1])) > 1e9
+    assert calm.isfinite().all() and float(calm[0]) > 0.5
+    assert not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
