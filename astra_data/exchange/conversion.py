@@ -15,6 +15,8 @@ from astra_data.exchange.recording import Block
 Mask = NDArray[np.bool_]
 EXACT = 2**53
 """Floats represent whole numbers below this exactly."""
+_LARGE = 2**24
+"""The same of float32."""
 _KINDS = {"U": "text", "S": "text", "O": "what no number can hold, such as nothing"}
 
 
@@ -50,10 +52,10 @@ class Converter:
                 values = _transformed(np.concatenate([fields[f] for f in spec.fields], axis=1), spec)
                 column = self._converted.get(name) or column_of(name, spec, values.shape[1])
                 if values.shape[1] != column.size:
-                    raise BadInputError(f"{name}: {values.shape[1]} values, before there were {column.size}")
+                    raise BadInputError(f"{values.shape[1]} values, before there were {column.size}")
                 cast, ok = _cast(values, column)
             except BadInputError as error:
-                faults.append(str(error))
+                faults.append(f"columns.{name}: {error}")
                 continue
             self._converted[name] = column
             columns[name] = cast[:, 0] if column.size == 1 else cast
@@ -87,6 +89,9 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
         BadInputError: lists do not have that many entries.
     """
     lists: dict[str, Sequence[str]] = {"unit": spec.unit, "frame": spec.frame, "role": spec.role}
+    for key, words in lists.items():
+        if len(words) not in (0, 1, size):
+            raise BadInputError(f"{key} has {len(words)} words for {size} values")
     astra = {key: list(words) * (size if len(words) == 1 else 1) for key, words in lists.items() if words}
     dtype = spec.dtype or ("bool" if name in FLAGS else "float32")
     # Fields of one value each name what they hold; `size` tells that none holds more.
@@ -141,23 +146,43 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
     if column.dtype == "float32":
         if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
             raise BadInputError(
-                f'{column.name}: integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or '
-                "an offset that makes them small"
+                'integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or an offset that '
+                "makes them small"
             )
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)
+        _check_told_apart(sound, cast[finite], column)
         return cast, finite & np.isfinite(cast).all(axis=1)
     if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
-        raise BadInputError(f"{column.name}: expected true and false, or 1 and 0")
+        raise BadInputError("expected true and false, or 1 and 0")
     if column.dtype == "int64" and sound.dtype.kind == "f":
         if not (sound == np.floor(sound)).all():
-            raise BadInputError(f"{column.name}: expected whole numbers")
+            raise BadInputError("expected whole numbers")
         if (abs(sound.astype(float)) >= EXACT).any():
             raise BadInputError(
-                f"{column.name}: numbers of 2^53 or more came as floats, which cannot represent them; "
+                "numbers of 2^53 or more came as floats, which cannot represent them; "
                 "expected integers: no fractions or empty cells among them, no field of floats beside them, "
                 "no scale, offset or clip"
             )
     elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
-        raise BadInputError(f"{column.name}: expected whole numbers below 2^63")
+        raise BadInputError("expected whole numbers below 2^63")
     return np.where(finite[:, None], values, 0).astype(column.dtype), finite
+
+
+def _check_told_apart(values: Array, cast: Array, column: Column) -> None:
+    """Refuse large `values` (n, size) most of whose changes are lost as they are `cast` to float32."""
+    size = np.abs(values.astype(np.float64)).max(axis=0, initial=0.0)
+    large = size > _LARGE
+    if not large.any():
+        return
+    changes = np.diff(values, axis=0) != 0
+    with np.errstate(invalid="ignore"):
+        lost = changes & (np.diff(cast, axis=0) == 0) & large
+    [entries] = np.nonzero(2 * lost.sum(axis=0) > changes.sum(axis=0))
+    if len(entries):
+        named = column.names or [f"entry {entry}" for entry in range(column.size)]
+        raise BadInputError(
+            f"{', '.join(named[entry] for entry in entries)}: numbers as large as {size[entries].max():.3g} "
+            "change by less than float32 can hold; leave out what is a time, set an offset that makes them "
+            'small, or dtype = "int64"'
+        )

@@ -11,8 +11,8 @@ from astra_data.worlds.registry import task_named
 
 
 def write_errors(experiment: Experiment, selection: Selection) -> Path | None:
-    """Write the errors of the groundings of `selection`; return the page, None if no row grounds."""
-    rows = [*selection.methods, reference_of(selection.methods)]
+    """Write the errors of the groundings that `selection` needs; return the page, None if no row grounds."""
+    rows = [*selection.methods, reference_of(experiment.recipe.methods)]
     grounding = dict.fromkeys(grounded_as(row) for row in rows if row and method_named(row).grounds)
     return write_held_out(
         experiment.path.stem,

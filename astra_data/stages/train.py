@@ -87,6 +87,10 @@ def train(
     initial_file = initial and initial / POLICY
     correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
+    if beginning and beginning.simulation and beginning.simulation.world.limits_commands:
+        raise BadInputError(
+            f"{initial} was trained with command_limit, which does not reach '{method}': train it without"
+        )
     grounding_digest = file_digest(grounding_file) if grounding_file else None
     initial_digest = file_digest(initial_file) if initial_file else None
     settings_text = as_json(

@@ -5,9 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.gymnasium_robot import Env, made
 from astra_data.worlds.numpy_simulator import Floats, NumpySimulator
 from astra_data.worlds.robot import State
+
+_TOLERANCE = 1e-4
+"""Of a state that was written and read again: states are float32."""
 
 
 class GymnasiumSimulator(NumpySimulator):
@@ -46,7 +50,8 @@ class GymnasiumSimulator(NumpySimulator):
             env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0".
             size: of a state, X.
             read: returns the abstract state (X,) of the environment, without its wrappers.
-            write: sets it. All that a step depends on has to be in it.
+            write: sets it, so that `read` returns it; the first batch of states is tried. All that a step
+                depends on has to be in it.
             parameters: numbers or texts about it, by default none.
             options: of the environment.
 
@@ -55,13 +60,26 @@ class GymnasiumSimulator(NumpySimulator):
         """
         env = made(env_id, **options)
         env.reset(seed=0)
+        is_checked = False
 
         def step_each(states: Floats, commands: Floats) -> Floats:
+            nonlocal is_checked
             landed = np.empty_like(states)
             for row, (state, command) in enumerate(zip(states, commands, strict=True)):
                 write(env, state)
+                if not is_checked:
+                    _check_written(env_id, state, np.asarray(read(env)))
                 env.step(command)
                 landed[row] = read(env)
+            is_checked = True
             return landed
 
         super().__init__(num_envs, function=step_each, size=size, parameters=parameters)
+
+
+def _check_written(env_id: str, state: Floats, shown: Floats) -> None:
+    if shown.shape != state.shape or not np.allclose(shown, state, rtol=_TOLERANCE, atol=_TOLERANCE):
+        raise BadInputError(
+            f"{env_id}: after write(env, {state.tolist()}) expected the same of read(env), "
+            f"got {shown.tolist()}: write has to set what read returns"
+        )

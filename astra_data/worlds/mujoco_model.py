@@ -1,5 +1,7 @@
 """Abstract simulators that are MuJoCo models, reset and stepped in batches by `mujoco.rollout`."""
 
+import copy
+
 import mujoco
 import numpy as np
 import torch
@@ -39,9 +41,11 @@ class MujocoModel(FreeStates):
             raise BadInputError(
                 f"the model has {model.na} actuator states: expected actuators without states"
             )
-        self.model = model
+        # MuJoCo would put a diverging state back to the initial pose, as if the robot had jumped there.
+        self.model = copy.deepcopy(model)
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.substeps = substeps
-        self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]
+        self._data = [mujoco.MjData(self.model) for _ in range(min(num_threads or cores(), num_envs))]
         self._rollout = Rollout(nthread=len(self._data))
         initial = np.concatenate([model.qpos0, np.zeros(model.nv)])
         super().__init__(torch.from_numpy(np.tile(initial, (num_envs, 1))).float())

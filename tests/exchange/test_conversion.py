@@ -65,12 +65,12 @@ def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
 @pytest.mark.parametrize(
     ("spec", "values", "told"),
     [
-        ({"dtype": "bool"}, [0, 1, 2], "c: expected true and false, or 1 and 0"),
-        ({"dtype": "int64"}, [1.0, 1.5], "c: expected whole numbers"),
-        ({"dtype": "int64"}, np.array([2**63], np.uint64), r"c: expected whole numbers below 2\^63"),
-        ({"take": (2,)}, [[1, 2]], r"take \[2\]: f hold 2 values, counted from 0"),
-        ({"scale": (1.0, 2.0, 3.0)}, [[1, 2]], "scale has 3 numbers for 2 values"),
-        ({"offset": (1.0, 2.0)}, [1], "offset has 2 numbers for 1 values"),
+        ({"dtype": "bool"}, [0, 1, 2], "columns.c: expected true and false, or 1 and 0"),
+        ({"dtype": "int64"}, [1.0, 1.5], "columns.c: expected whole numbers"),
+        ({"dtype": "int64"}, np.array([2**63], np.uint64), r"columns.c: expected whole numbers below 2\^63"),
+        ({"take": (2,)}, [[1, 2]], r"columns.c: take \[2\]: f hold 2 values, counted from 0"),
+        ({"scale": (1.0, 2.0, 3.0)}, [[1, 2]], "columns.c: scale has 3 numbers for 2 values"),
+        ({"offset": (1.0, 2.0)}, [1], "columns.c: offset has 2 numbers for 1 values"),
         ({}, ["a"], "field 'f': expected numbers, got text$"),
         (
             {},
@@ -195,3 +195,18 @@ def test_only_next_states_that_are_made_up_are_called_so(flag: str, terminal: st
     made.convert(Block({"f": np.zeros(2)}, "log"))
     meanings = {column.name: column.meaning for column in made.columns}
     assert meanings[NEXT_STATE] == "the state, one step later"
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.float64])
+def test_numbers_that_float32_cannot_tell_apart_are_refused(dtype: type) -> None:
+    """Times in ms since 1970, say; not large ones that it does, nor small changes of small ones."""
+    stamps: Array = (1_700_000_000_000 + 100 * np.arange(9)).astype(dtype)
+    with pytest.raises(BadInputError, match=r"columns\.c: entry 1: numbers as large as 1.7e\+12 change"):
+        convert({}, np.stack([np.arange(9.0), stamps], axis=1).tolist())
+    for sound in (
+        1e6 * np.arange(9),
+        np.full(9, 1.7e12),
+        1.0 + 1e-12 * np.arange(9),
+        2.0**24 + 2 * np.arange(9),
+    ):
+        convert({}, sound.tolist())

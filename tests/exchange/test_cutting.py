@@ -275,14 +275,14 @@ def test_the_largest_whole_number_is_the_largest_of_its_kind() -> None:
         ({"take": (2,)}, r"take \[2\]: x hold 2 values"),
         ({"scale": (1.0, 1.0, 1.0)}, "scale has 3 numbers for 2 values"),
         ({"names": ("x",)}, "1 names for 2 values"),
-        ({"unit": ("m", "m", "m")}, "3 words in astra's unit for 2 values"),
+        ({"unit": ("m", "m", "m")}, "unit has 3 words for 2 values"),
         ({"dtype": "bool"}, "expected true and false"),
         ({"dtype": "int64", "scale": (0.5,)}, "expected whole numbers"),
     ],
 )
 def test_columns_that_do_not_fit_are_told(spec: dict[str, Any], told: str) -> None:
     columns = {"pose": {"fields": ("x",)} | spec, ACTION: {"fields": ("a",), "take": (7,)}}
-    with pytest.raises(BadInputError, match=f"log: .*{told}.*; take"):
+    with pytest.raises(BadInputError, match=f"log: columns.pose: .*{told}.*; columns.action: take"):
         cut(cutter(columns=columns), x=[[1, 3], [5, 7]])
 
 

@@ -321,3 +321,20 @@ def test_trainings_without_a_simulator_are_made_once(
     monkeypatch.setitem(METHODS, "behavior_cloning", learned)
     make(task, "behavior_cloning", paired, None, tmp_path / "cloned", TRAIN.model_copy(update={"tries": 2}))
     assert "tries" not in json.loads((tmp_path / "cloned/curve.json").read_text())
+
+
+def test_a_policy_of_short_commands_is_no_start_of_fine_tuning(
+    task: str, paired: Path, tmp_path: Path
+) -> None:
+    limited = TRAIN.model_copy(update={"command_limit": 0.5})
+    make(task, "direct_transfer", paired, None, tmp_path / "limited", limited)
+    with pytest.raises(BadInputError, match="command_limit, which does not reach 'direct_transfer_iql'"):
+        train(
+            task,
+            "direct_transfer_iql",
+            TRAIN,
+            dataset=paired,
+            initial=tmp_path / "limited",
+            out=tmp_path / "tuned",
+        )
+    assert not (tmp_path / "tuned").exists()

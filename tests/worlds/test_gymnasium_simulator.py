@@ -61,9 +61,7 @@ def test_what_is_written_has_to_be_what_is_read() -> None:
 
     simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=read, write=swapped)
     simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
-    with pytest.raises(
-        BadInputError, match=r"^Pendulum-v1: after write\(env, \[1.0, 0.25\]\) .* \[0.25, 1.0\]"
-    ):
+    with pytest.raises(BadInputError, match=r"^Pendulum-v1: .*write\(env, \[1.0, 0.25\]\) .* \[0.25, 1.0\]"):
         simulator.step(torch.zeros(2, 1))
     reads = []
 
