@@ -3,10 +3,10 @@
 Every name below is loaded when it is first used, so that reading a dataset needs neither torch nor MuJoCo.
 
 data        Dataset  DatasetWriter  StagedWriter  Episode  Column  Frames
-edits       augment  pair  subset  merge
+edits       augment  label  pair  subset  merge
 sharing     push  pull
 worlds      Task  Objective  Simulator  TASKS
-learning    METHODS  ground  train  align  evaluate  load_policy
+learning    METHODS  collect  ground  train  align  evaluate  load_policy
 all of it   run
 """
 
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from astra_data.methods import METHODS as METHODS
     from astra_data.stages.align import align as align
     from astra_data.stages.augment import augment as augment
+    from astra_data.stages.collect import collect as collect
     from astra_data.stages.evaluate import evaluate as evaluate
     from astra_data.stages.ground import ground as ground
+    from astra_data.stages.label import label as label
     from astra_data.stages.pair import pair as pair
     from astra_data.stages.train import train as train
     from astra_data.worlds.objective import Objective as Objective
@@ -54,8 +56,10 @@ _MODULES = {
     "Task": "worlds.task",
     "align": "stages.align",
     "augment": "stages.augment",
+    "collect": "stages.collect",
     "evaluate": "stages.evaluate",
     "ground": "stages.ground",
+    "label": "stages.label",
     "load_policy": "experiments.trained_policy",
     "merge": "dataset.edit",
     "pair": "stages.pair",

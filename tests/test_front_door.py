@@ -18,8 +18,8 @@ from astra_data.stages.collect import CollectConfig, collect
 
 PUBLIC = [
     *("Column", "Dataset", "DatasetWriter", "Episode", "Frames", "METHODS", "Objective", "Simulator"),
-    *("StagedWriter", "TASKS", "Task", "align", "augment", "evaluate", "ground", "load_policy", "merge"),
-    *("pair", "pull", "push", "run", "subset", "train"),
+    *("StagedWriter", "TASKS", "Task", "align", "augment", "collect", "evaluate", "ground", "label"),
+    *("load_policy", "merge", "pair", "pull", "push", "run", "subset", "train"),
 ]
 RECIPE = """
 task = "antmaze-umaze"

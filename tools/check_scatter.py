@@ -42,7 +42,7 @@ def main(
     """Print two tables for each fresh seed."""
     world = task_named(task)
     grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / "grounding.safetensors")
-    if not isinstance(grounding, HistoryGrounding) or grounding.scatters is None:
+    if not isinstance(grounding, HistoryGrounding) or grounding.scatter_model is None:
         raise typer.BadParameter(f"{row} has no scatter model: expected [ground] scatter = true")
     torch.manual_seed(0)
     for one in fresh:

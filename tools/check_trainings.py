@@ -32,7 +32,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
-from astra_data.training.own_world import trial
+from astra_data.training.own_world import reached_in_own_world
 from astra_data.training.train import Training
 from astra_data.worlds.registry import task_named
 
@@ -109,7 +109,7 @@ def trained(run: Path, row: str, seed: int, changes: dict[str, Any], policy: int
         began = time.process_time()
         made, _ = learn(training)
         seconds = time.process_time() - began
-    reached = trial(training.task, made, grounding, seed)
+    reached = reached_in_own_world(training.task, made, grounding, seed)
     return Trained(reached.success, reached.steps, seconds)
 
 

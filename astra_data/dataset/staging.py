@@ -27,7 +27,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.staged_episode import load_staged, write_staged
 from astra_data.dataset.writer import DatasetWriter
 
-_PLAN = "plan.json"
+_SETTINGS = "plan.json"
 
 
 class StagedWriter:
@@ -92,7 +92,7 @@ class StagedWriter:
         self.folder = root.parent / f".{root.name}.staged"
         self._columns = list(columns)
         self._schema = layout.data_schema(columns)
-        self._plan = {
+        self._settings = {
             "columns": {column.name: column.feature() for column in columns},
             "fps": fps,
             "task": task,
@@ -126,7 +126,7 @@ class StagedWriter:
                 )
             if self.root.exists():
                 self._refuse_root()
-            self._agree_on_the_plan()
+            self._agree_on_the_settings()
             for path in sorted(self.folder.glob("*.arrow")):
                 episode = self._restore(path)
                 self.staged[int(path.stem)], self.lengths[int(path.stem)] = episode.metadata, len(episode)
@@ -204,9 +204,9 @@ class StagedWriter:
         del self.staged[position], self.lengths[position]
 
     def _holds_work(self) -> bool:
-        """Return whether there is anything to resume beside the plan."""
+        """Return whether there is anything to resume beside the settings."""
         kept = (path for path in self.folder.glob("*") if not path.name.startswith("."))
-        return any(path.name != _PLAN and path.suffix != ".partial" for path in kept)
+        return any(path.name != _SETTINGS and path.suffix != ".partial" for path in kept)
 
     def _left(self) -> str:
         """Describe what can be resumed."""
@@ -241,9 +241,9 @@ class StagedWriter:
 
     def _described(self) -> Mapping[str, Any]:
         """Return the description of the recording that was interrupted, by default of this one."""
-        plan = read_object(self.folder / _PLAN)
-        found = plan.get("description") if isinstance(plan, dict) else None
-        return found if isinstance(found, dict) else self._plan["description"]
+        settings = read_object(self.folder / _SETTINGS)
+        found = settings.get("description") if isinstance(settings, dict) else None
+        return found if isinstance(found, dict) else self._settings["description"]
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"
@@ -257,10 +257,10 @@ class StagedWriter:
             raise BadInputError(f"{path}: {error} Delete it and resume the recording.") from error
         return episode
 
-    def _agree_on_the_plan(self) -> None:
-        """Write the plan, or check that what was staged is of the same one."""
-        now = json.loads(json.dumps(self._plan))
-        before = read_object(self.folder / _PLAN)
+    def _agree_on_the_settings(self) -> None:
+        """Write the settings, or check that what was staged was made with the same."""
+        now = json.loads(json.dumps(self._settings))
+        before = read_object(self.folder / _SETTINGS)
         if isinstance(before, dict):
             differing = [key for key, *_ in changed_values(before, now)]
             if differing:
@@ -270,11 +270,11 @@ class StagedWriter:
                 )
         elif self._holds_work():
             raise BadInputError(
-                f"{self.folder} holds {self._left()}, but {_PLAN} {before}, so that nobody knows of which "
-                f"recording: delete the folder to start again."
+                f"{self.folder} holds {self._left()}, but {_SETTINGS} {before}, so that nobody knows "
+                f"of which recording: delete the folder to start again."
             )
         else:
-            write_file(self.folder / _PLAN, json.dumps(self._plan, indent=1, sort_keys=True))
+            write_file(self.folder / _SETTINGS, json.dumps(self._settings, indent=1, sort_keys=True))
 
 
 def _is_same(one: Episode, other: Episode) -> bool:

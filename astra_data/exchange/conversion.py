@@ -151,7 +151,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             )
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)
-        _check_told_apart(sound, cast[finite], column)
+        _check_distinct(sound, cast[finite], column)
         return cast, finite & np.isfinite(cast).all(axis=1)
     if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
         raise BadInputError("expected true and false, or 1 and 0")
@@ -169,7 +169,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
     return np.where(finite[:, None], values, 0).astype(column.dtype), finite
 
 
-def _check_told_apart(values: Array, cast: Array, column: Column) -> None:
+def _check_distinct(values: Array, cast: Array, column: Column) -> None:
     """Refuse large `values` (n, size) most of whose changes are lost as they are `cast` to float32."""
     size = np.abs(values.astype(np.float64)).max(axis=0, initial=0.0)
     large = size > _LARGE

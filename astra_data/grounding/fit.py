@@ -163,10 +163,10 @@ class HistoryFit:
             metrics["clearance_m"] = clearance = recorded_clearance_m(fitting.task, fitting.training)
             grounding = replace(grounding, clearance_m=clearance)
         if config.scatter:
-            scatters, metrics["scatter"] = fit_scatter(
+            scatter_model, metrics["scatter"] = fit_scatter(
                 model, fitting.training, fitting.held_out, fitting.seed
             )
-            grounding = replace(grounding, scatters=scatters)
+            grounding = replace(grounding, scatter_model=scatter_model)
         if foresees:
             sizes = config.failure_members, fitting.seed, config.failure_steps
             failures = fit_failures(fitting.task, grounding, fitting.training, *sizes)

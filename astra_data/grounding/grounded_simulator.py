@@ -23,7 +23,7 @@ class GroundedSimulator(EpisodeSimulator):
         model: the trained grounding model; only read.
         members: models that were fitted to other draws of the episodes; only read.
         failures: the failure model, if one was fitted; only read.
-        scatters: the model of the target's scatter around the correction, if one was fitted; only read.
+        scatter_model: the model of the target's scatter around the correction, if one was fitted; only read.
         hidden: of the model's encoder, (B, Z). goal: (B, G).
         landed: where the simulator landed in the last step, before the correction, (B, X).
     """
@@ -36,16 +36,16 @@ class GroundedSimulator(EpisodeSimulator):
         failures: FailureModel | None = None,
         members: tuple[GroundingModel, ...] = (),
         clearance_m: float | None = None,
-        scatters: ScatterModel | None = None,
+        scatter_model: ScatterModel | None = None,
     ) -> None:
-        """Wrap `simulator`; `scatter`, of the same size at every moment, is added to that of `scatters`.
+        """Wrap `simulator`; `scatter`, of the same size at every moment, is added to that of `scatter_model`.
 
         Corrections end no closer to walls than `clearance_m`.
         """
         super().__init__(simulator, scatter=scatter)
         if clearance_m is not None and isinstance(simulator, WalledSimulator):
             simulator.keep_clear(clearance_m)
-        self.model, self.members, self.failures, self.scatters = model, members, failures, scatters
+        self.model, self.members, self.failures, self.scatter_model = model, members, failures, scatter_model
         shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size
         self.hidden = torch.zeros(count, shape.latent_size, device=device)
@@ -142,8 +142,10 @@ class GroundedSimulator(EpisodeSimulator):
             dim=1,
         )
         corrected = self._predictions.mean(0)
-        if self.scatters is not None:
-            corrected = corrected + self.scatters.draw(self.model.correction_inputs(latent, action, landed))
+        if self.scatter_model is not None:
+            corrected = corrected + self.scatter_model.draw(
+                self.model.correction_inputs(latent, action, landed)
+            )
         state = self._settle(before, corrected)
         self.hidden = _encoded(self.model, state, self.goal, action, self.hidden)
         if (hidden := self._own_hidden) is not None:

@@ -30,7 +30,7 @@ class HistoryGrounding(FittedGrounding):
         model: fitted to all training episodes. failures: the failure model, if there is one.
         members: models that were fitted to other draws of the episodes, and correct in its place.
         clearance_m: how close to walls corrections may end; None for as close as the simulator itself.
-        scatters: the model of the target's scatter around the correction, if one was fitted.
+        scatter_model: the model of the target's scatter around the correction, if one was fitted.
     """
 
     kind: ClassVar[str] = "history"
@@ -39,7 +39,7 @@ class HistoryGrounding(FittedGrounding):
     failures: FailureModel | None = None
     members: tuple[GroundingModel, ...] = ()
     clearance_m: float | None = None
-    scatters: ScatterModel | None = None
+    scatter_model: ScatterModel | None = None
 
     @property
     def encoder(self) -> GroundingModel:
@@ -63,12 +63,18 @@ class HistoryGrounding(FittedGrounding):
 
     def for_replay(self) -> "HistoryGrounding":
         """Return the model alone."""
-        return replace(self.reduced(members=False, failures=False), scatters=None)
+        return replace(self.reduced(members=False, failures=False), scatter_model=None)
 
     def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> GroundedSimulator:
         """Wrap `simulator`; see `Grounding.corrected`."""
         return GroundedSimulator(
-            simulator, self.model, scatter, self.failures, self.members, self.clearance_m, self.scatters
+            simulator,
+            self.model,
+            scatter=scatter,
+            failures=self.failures,
+            members=self.members,
+            clearance_m=self.clearance_m,
+            scatter_model=self.scatter_model,
         )
 
     @torch.no_grad()
@@ -89,7 +95,7 @@ class HistoryGrounding(FittedGrounding):
         """Return weights and sizes."""
         tensors = self.model.state_dict()
         metadata: dict[str, Any] = {"shape": asdict(self.model.shape), "target": self.model.target}
-        for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatters)):
+        for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatter_model)):
             if model is not None:
                 tensors |= _named(part, model)
                 metadata[part] = asdict(model.shape)
@@ -106,18 +112,18 @@ class HistoryGrounding(FittedGrounding):
         """Read what `to_file` returned."""
         prefixes = f"{_FAILURES}.", f"{_MEMBERS}.", f"{_SCATTER}."
         own = {name: one for name, one in tensors.items() if not name.startswith(prefixes)}
-        shape, failures, scatters = GroundingShape(**_tuples(metadata["shape"])), None, None
+        shape, failures, scatter_model = GroundingShape(**_tuples(metadata["shape"])), None, None
         if _FAILURES in metadata:
             failures = FailureModel(FailureShape(**_tuples(metadata[_FAILURES])))
             failures = _loaded(failures, _within(tensors, _FAILURES), device)
         if _SCATTER in metadata:
-            scatters = ScatterModel(ScatterShape(**_tuples(metadata[_SCATTER])))
-            scatters = _loaded(scatters, _within(tensors, _SCATTER), device)
+            scatter_model = ScatterModel(ScatterShape(**_tuples(metadata[_SCATTER])))
+            scatter_model = _loaded(scatter_model, _within(tensors, _SCATTER), device)
         others = [_within(tensors, f"{_MEMBERS}.{number}") for number in range(metadata.get(_MEMBERS, 0))]
         model, *members = (
             _loaded(GroundingModel(shape, metadata["target"]), weights, device) for weights in (own, *others)
         )
-        return cls(model, failures, tuple(members), metadata.get("clearance_m"), scatters)
+        return cls(model, failures, tuple(members), metadata.get("clearance_m"), scatter_model)
 
 
 def _loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], device: str) -> Module:

@@ -48,7 +48,7 @@ def replay_open_loop(
         hazard = None if history.failures is None else _replayed(task, foreseeing, episodes, seed=seed)[1]
         is_ensemble = bool(history.members) or history.model.shape.correction_heads > 1
         if count := len(history.members):
-            members = replace(history, failures=None, scatters=None)
+            members = replace(history, failures=None, scatter_model=None)
             apart = _replayed(task, members, episodes, seed=seed, copies=count)[2]
             disagreement = apart.unflatten(0, (count, len(episodes))).mean(0)
     return OpenLoopReplay(state, hazard, disagreement if is_ensemble else None)

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from astra_data.core.config import AtOnce, Config, Count, NotNegative, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress, part
+from astra_data.core.progress import Progress, part, silent
 from astra_data.core.provenance import machine
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
@@ -30,7 +30,7 @@ from astra_data.training.behaviors import (
     WallWatch,
     held_steps,
 )
-from astra_data.training.plan import Plan, PlannedCommands
+from astra_data.training.plan import PlannedCommands, RecordingPlan
 from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.recording import record
 from astra_data.worlds.registry import task_named
@@ -107,11 +107,11 @@ class CollectConfig(Config):
 
 def collect(
     task: str,
-    config: CollectConfig,
+    config: CollectConfig = CollectConfig(),
     *,
-    seed: int,
+    seed: int = 0,
     out: Path | None = None,
-    progress: Progress,
+    progress: Progress = silent,
     num_threads: int | None = None,
     name: str | None = None,
     resume: bool = True,
@@ -134,7 +134,7 @@ def collect(
         BadInputError: the task is unknown, `out` exists, or an artefact of the behavior is missing.
     """
     world = task_named(task)
-    plan = None if config.plan is None else Plan.load(config.plan, world)
+    plan = None if config.plan is None else RecordingPlan.load(config.plan, world)
     description = _description(world, config, seed, name)
     folder = out or place(description)
     with StagedWriter(
@@ -193,7 +193,7 @@ def _description(world: Task, config: CollectConfig, seed: int, name: str | None
 def _record(
     world: Task,
     config: CollectConfig,
-    plan: Plan | None,
+    plan: RecordingPlan | None,
     behavior: Behavior,
     seed: int,
     writer: StagedWriter,

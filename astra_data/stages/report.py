@@ -14,7 +14,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.manifest import write_manifest
 from astra_data.core.naming import place
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
 from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.assembly import assemble
@@ -62,18 +62,15 @@ class ReportConfig(Config):
     """Bootstrap resamples per interval."""
 
 
-DEFAULTS = ReportConfig()
-
-
 def report(
     recipe: Reported,
     *,
     root: Path,
     command: str,
-    publish: Path | None,
-    progress: Progress,
+    publish: Path | None = None,
+    progress: Progress = silent,
     add_to: Path | None = None,
-    config: ReportConfig = DEFAULTS,
+    config: ReportConfig = ReportConfig(),
 ) -> None:
     """Write results.json, .md and .html, the figures and eval_info.json to `root`/report.
 

@@ -53,9 +53,6 @@ class SelectConfig(Config):
     """Within how many steps that failure model foresees failures."""
 
 
-DEFAULTS = SelectConfig()
-
-
 @dataclass(frozen=True)
 class Entry:
     """A policy to judge: the keys of its artefacts in a run's folder; `grounding` is None without one."""
@@ -139,7 +136,7 @@ def digests(of: list[Bench], root: Path) -> dict[str, str]:
 
 def select(
     recipe: Reported,
-    config: SelectConfig = DEFAULTS,
+    config: SelectConfig = SelectConfig(),
     *,
     root: Path,
     progress: Progress = silent,

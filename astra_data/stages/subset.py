@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, silent
 from astra_data.dataset import edit
 from astra_data.dataset.reader import Dataset
 
 
-def subset(dataset: Path, *, percent: int, of: int | None = None, out: Path, progress: Progress) -> Path:
+def subset(
+    dataset: Path, *, percent: int, of: int | None = None, out: Path, progress: Progress = silent
+) -> Path:
     """Write `percent` per cent of `of` episodes of `dataset` to `out`, as a dataset of its own.
 
     Args:

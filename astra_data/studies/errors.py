@@ -22,7 +22,7 @@ REPLICATES = 1000
 
 
 @dataclass(frozen=True)
-class Trial:
+class Starts:
     """The starting moments at which all models are tested.
 
     Attributes:
@@ -35,7 +35,7 @@ class Trial:
     horizons: tuple[int, ...]
 
     @classmethod
-    def of(cls, sequences: Sequences, history: int, horizons: Sequence[int]) -> "Trial":
+    def of(cls, sequences: Sequences, history: int, horizons: Sequence[int]) -> "Starts":
         """Start at every row of `sequences` with a history before it; of too many, at `MOST_STARTS` evenly.
 
         Horizons that no start reaches are left out.

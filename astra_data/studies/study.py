@@ -17,7 +17,7 @@ from astra_data.core.progress import Progress, part
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import generator
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.studies.errors import Trial, summary
+from astra_data.studies.errors import Starts, summary
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import Piece, Recording
 from astra_data.studies.rollouts import fit
@@ -183,9 +183,9 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
     step_s = steps_config.rows / fps
     rounded = [max(1, round(seconds / step_s)) for seconds in recipe.horizons_s]
     asked = tuple(dict.fromkeys([1, *rounded]))
-    trial = Trial.of(Sequences.of_pieces(case.test, fps, steps_config), steps_config.history, asked)
-    horizons_s = [horizon * step_s for horizon in trial.horizons]
-    body = trial.stretch.body
+    starts = Starts.of(Sequences.of_pieces(case.test, fps, steps_config), steps_config.history, asked)
+    horizons_s = [horizon * step_s for horizon in starts.horizons]
+    body = starts.stretch.body
     fits = list(_fits(recipe, case, fps))
     squared: dict[float, dict[str, list[Any]]] = {}
     drawn_once: dict[tuple[float, int], Sequences] = {}
@@ -205,7 +205,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
                 drawn_once[drawn],
                 recipe,
                 seed,
-                trial,
+                starts,
                 path,
                 _labelled(share, f"{case.name}/{name}/{size}/{seed}"),
             )
@@ -218,7 +218,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
             "minutes": minutes,
             "models": summary(
                 {name: np.stack(values) for name, values in models.items()},
-                trial.piece,
+                starts.piece,
                 horizons_s,
                 axes=body.axes,
                 judged=body.judged,
@@ -226,7 +226,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         }
         for minutes, models in sorted(squared.items())
     ]
-    all_count = trial.stretch.counts.long().cumprod(1)[:, [horizon - 1 for horizon in trial.horizons]]
+    all_count = starts.stretch.counts.long().cumprod(1)[:, [horizon - 1 for horizon in starts.horizons]]
     return {
         "name": case.name,
         "title": case.title,
@@ -234,7 +234,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         "judged": list(body.judged),
         "horizons_s": horizons_s,
         "starts": all_count.sum(0).tolist(),
-        "pieces": len(np.unique(trial.piece)),
+        "pieces": len(np.unique(starts.piece)),
         "test_minutes": sum(map(len, case.test)) / fps / 60,
         "fit_cpu_seconds": cpu_seconds,
         "sizes": by_size,
@@ -249,7 +249,7 @@ def _fit_one(
     sequences: Sequences,
     recipe: GapRecipe,
     seed: int,
-    trial: Trial,
+    starts: Starts,
     path: Path,
     progress: Progress,
 ) -> None:
@@ -259,7 +259,7 @@ def _fit_one(
     tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"model": name, "seed": seed, **stopwatch.spent()}
-    save_tensors(path, tensors | {_ERRORS: trial.squared_errors(model)}, metadata)
+    save_tensors(path, tensors | {_ERRORS: starts.squared_errors(model)}, metadata)
 
 
 def _labelled(progress: Progress, label: str) -> Progress:

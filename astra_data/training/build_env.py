@@ -17,6 +17,7 @@ from astra_data.grounding.protocols import Grounding
 from astra_data.learning.recorded import Recorded
 from astra_data.training.ramp import Ramp
 from astra_data.training.simulator_env import DataStarts, RewardSource, SimulatorEnv, policy_observation
+from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
@@ -57,7 +58,7 @@ class EnvConfig(Config):
     change_penalty: NotNegative = Field(default=0.0, exclude_if=lambda weight: not weight)
     """Subtracted from the reward of a step, times the squared change of the command, from the start: robots
     fall and lose time where commands jump about."""
-    command_limit: Positive = Field(default=2.0, serialization_alias="command_limit_m_s")
+    command_limit: Positive = Field(default=NO_LIMIT, serialization_alias="command_limit_m_s")
     """Shorten longer commands to this, in training and in the target, as a multiple of the largest along an
     axis, which is 1 m/s for the ant; by default longer than any command."""
     ramp: Share = 0.0
@@ -99,7 +100,7 @@ class EnvConfig(Config):
     @property
     def limits_commands(self) -> bool:
         """Whether commands are shortened."""
-        return bool(self.command_limit != type(self).model_fields["command_limit"].default)
+        return self.command_limit != NO_LIMIT
 
 
 RENAMED = {

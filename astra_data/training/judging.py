@@ -59,8 +59,8 @@ class Judge:
         made = self.grounding
         history = made if isinstance(made, HistoryGrounding) else None
         foresees = history is not None and history.failures is not None
-        scatters = history is not None and history.scatters is not None
-        scatter = None if foresees or scatters else self.scatter
+        scatters_itself = history is not None and history.scatter_model is not None
+        scatter = None if foresees or scatters_itself else self.scatter
         if history is not None and foresees:
             made = history.foreseeing(self.task.objective)
         simulator = made.simulator(self.task, episodes, scatter=scatter)

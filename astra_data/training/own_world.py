@@ -78,7 +78,7 @@ class Reached:
     steps: float
 
 
-def trial(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
+def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
     """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions.
 
     Raises:

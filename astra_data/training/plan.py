@@ -28,7 +28,7 @@ class PlannedEpisode(Config):
     """What it is expected to teach, in nats, given those before it in the plan."""
 
 
-class Plan(Config):
+class RecordingPlan(Config):
     """Episodes to record, those that teach most first."""
 
     task: str

@@ -21,7 +21,7 @@ from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.committee import Committee, Rollouts
 from astra_data.training.behaviors import HoldTimes, RandomCommands, held_steps
-from astra_data.training.plan import Plan, PlannedEpisode, names_of
+from astra_data.training.plan import PlannedEpisode, RecordingPlan, names_of
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.task import Task
 
@@ -72,7 +72,7 @@ class Suggestion:
         information: what each was expected to teach, given those before, in nats, (E,).
     """
 
-    plan: Plan
+    plan: RecordingPlan
     proposals: Proposals
     rollouts: Rollouts
     taken: NDArray[np.intp]
@@ -116,7 +116,7 @@ def suggested(
         for number, gained in zip(taken.tolist(), information.tolist(), strict=True)
     )
     starts, commands = names_of(task)
-    plan = Plan(
+    plan = RecordingPlan(
         task=task.name,
         timestep_s=task.timestep_s,
         start_names=starts,

@@ -8,7 +8,7 @@ from astra_data.core.progress import part
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import CLOCKS
 from astra_data.grounding.protocols import Grounding
-from astra_data.training.own_world import Reached, trial
+from astra_data.training.own_world import Reached, reached_in_own_world
 from astra_data.training.policy_file import POLICY, PolicyFile
 from astra_data.training.train import Learn, Training
 
@@ -36,7 +36,9 @@ def with_restarts(
         attempt = _attempt(training, seed, number)
         policy, curve = learn(attempt)
         policy.save(attempt.folder / POLICY)
-        reached = trial(training.task, PolicyFile.load(attempt.folder / POLICY), grounding, training.seed)
+        reached = reached_in_own_world(
+            training.task, PolicyFile.load(attempt.folder / POLICY), grounding, training.seed
+        )
         made.append((reached, policy, curve))
         if _masters(reached, training):
             break

@@ -12,6 +12,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.history import LatentEncoder
 from astra_data.learning.networks.policy import Policy
 from astra_data.training.simulator_env import policy_observation
+from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.task import Task
 
 Given = Tensor | NDArray[np.float32] | NDArray[np.float64]
@@ -63,7 +64,7 @@ class RunningPolicy:
     policy: Policy
     source_encoder: LatentEncoder | None = None
     target_encoder: LatentEncoder | None = None
-    command_limit: float = 2.0
+    command_limit: float = NO_LIMIT
     observed: Observed = "abstract"
 
     @property

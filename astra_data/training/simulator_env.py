@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.worlds.batched import Step
-from astra_data.worlds.objective import Objective
+from astra_data.worlds.objective import NO_LIMIT, Objective
 from astra_data.worlds.plane.free_space import FreeSpace
 
 RewardSource = Literal["abstract", "predicted", "blend"]
@@ -66,7 +66,7 @@ class SimulatorEnv:
         reward: RewardSource = "abstract",
         topple: bool = False,
         risk_weight: float = 1.0,
-        command_limit: float = 2.0,
+        command_limit: float = NO_LIMIT,
         thinness: Tensor | None = None,
         disagreement_penalty: float = 0.0,
         change_penalty: float = 0.0,

@@ -34,7 +34,7 @@ _SAC_SIZES = (256, 256)
 type Metadata = dict[str, Any]
 """What a dataset records about the behavior."""
 
-_TRIALS = 32
+_TEST_EPISODES = 32
 """Test episodes after each iteration."""
 
 
@@ -134,16 +134,16 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
     Training episodes would underestimate it: they began when the policy was worse.
     """
     behavior, task = PolicyBehavior(running), running.task
-    env = task.target(_TRIALS, seed=derive(seed, "starts"), num_threads=num_threads)
+    env = task.target(_TEST_EPISODES, seed=derive(seed, "starts"), num_threads=num_threads)
     env.reset()
-    behavior.start(_TRIALS, seed)
-    active, lasted = torch.ones(_TRIALS, dtype=torch.bool), 0
+    behavior.start(_TEST_EPISODES, seed)
+    active, lasted = torch.ones(_TEST_EPISODES, dtype=torch.bool), 0
     for _ in range(task.objective.horizon):
         if not active.any():
             break
         lasted += int(active.sum())
         active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
-    return lasted / _TRIALS
+    return lasted / _TEST_EPISODES
 
 
 def _finished(policy: Policy, observed: Observed) -> PolicyFile:

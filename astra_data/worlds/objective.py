@@ -12,6 +12,9 @@ from torch import Tensor
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS, Score
 
+NO_LIMIT = 2.0
+"""Of the length of velocity commands: longer than any of ±1 on two axes."""
+
 
 @dataclass(frozen=True)
 class Objective(ABC):

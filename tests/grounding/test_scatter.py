@@ -156,7 +156,7 @@ def even(size: float = 0.05) -> ScatterModel:
 
 
 def test_corrected_states_are_scattered_and_replays_are_not() -> None:
-    grounding = HistoryGrounding(grounding_model(), scatters=even())
+    grounding = HistoryGrounding(grounding_model(), scatter_model=even())
     worlds = [one.simulator(TASK, 64) for one in (grounding, grounding.for_replay())]
     for world in worlds:
         torch.manual_seed(0)
@@ -170,16 +170,16 @@ def test_corrected_states_are_scattered_and_replays_are_not() -> None:
 def test_files_hold_it_and_are_as_before_without_it(tmp_path: Path) -> None:
     plain = HistoryGrounding(grounding_model())
     for scatters in (None, even()):
-        path, made = tmp_path / "grounding.safetensors", replace(plain, scatters=scatters)
+        path, made = tmp_path / "grounding.safetensors", replace(plain, scatter_model=scatters)
         save_grounding(path, made, no_episodes())
         loaded = load_grounding(path)
         assert isinstance(loaded, HistoryGrounding)
         tensors, metadata = made.to_file()
         assert ("scatter" in metadata) == any(name.startswith("scatter.") for name in tensors)
-        assert (loaded.scatters is None) == (scatters is None) == ("scatter" not in metadata)
-        if scatters is not None and loaded.scatters is not None:
-            assert torch.equal(loaded.scatters.forms, scatters.forms)
-            assert not any(one.requires_grad for one in loaded.scatters.parameters())
+        assert (loaded.scatter_model is None) == (scatters is None) == ("scatter" not in metadata)
+        if scatters is not None and loaded.scatter_model is not None:
+            assert torch.equal(loaded.scatter_model.forms, scatters.forms)
+            assert not any(one.requires_grad for one in loaded.scatter_model.parameters())
 
 
 def test_a_failure_model_is_fitted_to_replays_that_are_scattered() -> None:
@@ -189,7 +189,7 @@ def test_a_failure_model_is_fitted_to_replays_that_are_scattered() -> None:
     seen = []
     for scatters in (None, even(), even()):
         torch.manual_seed(0)
-        grounding = HistoryGrounding(grounding_model(), scatters=scatters)
+        grounding = HistoryGrounding(grounding_model(), scatter_model=scatters)
         seen.append(replayed_inputs(TASK, grounding, failures, episodes))
     assert torch.equal(seen[1], seen[2])
     assert not torch.allclose(seen[0], seen[1])
@@ -200,7 +200,7 @@ def test_an_open_loop_replay_shows_the_mean_path_and_the_hazards_of_scattered_on
     torch.manual_seed(5)
     failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).requires_grad_(False).eval()
     plain = HistoryGrounding(grounding_model(), failures)
-    wild = replace(plain, scatters=even())
+    wild = replace(plain, scatter_model=even())
     one, scattered, again = (replay_open_loop(TASK, made, episodes, seed=0) for made in (plain, wild, wild))
     assert torch.equal(one.state, scattered.state)
     assert one.hazard is not None and scattered.hazard is not None
@@ -215,7 +215,7 @@ def test_members_disagree_about_the_mean_path() -> None:
     plain = HistoryGrounding(grounding_model(), members=(others,))
     one, scattered = (
         replay_open_loop(TASK, made, scattered_episodes(0, episodes=4), seed=0).disagreement
-        for made in (plain, replace(plain, scatters=even()))
+        for made in (plain, replace(plain, scatter_model=even()))
     )
     assert one is not None and scattered is not None
     assert one.max() > 0
@@ -230,7 +230,7 @@ def test_a_fit_has_it_if_it_is_asked_to(tmp_path: Path, used: bool, quick: None)
         TASK, config, None, scattered_episodes(0), scattered_episodes(1), 0, "cpu", tmp_path, silent
     )
     grounding, metrics = HistoryFit(latent=False, reward=False)(fitting)
-    assert (grounding.scatters is not None) == ("scatter" in metrics) == used
+    assert (grounding.scatter_model is not None) == ("scatter" in metrics) == used
 
 
 @pytest.mark.parametrize("foresees", [False, True])

@@ -7,7 +7,7 @@ from small_cart import LOGS_ALONE, TASK
 
 from astra_data.grounding.committee import Rollouts
 from astra_data.reports.suggestion import CELLS, labels, maps_of, suggestion_page
-from astra_data.training.plan import Plan, names_of
+from astra_data.training.plan import RecordingPlan, names_of
 from astra_data.training.proposals import Proposals, Suggestion, planned
 from astra_data.worlds.registry import TASKS
 
@@ -21,7 +21,9 @@ def suggestion() -> Suggestion:
     reached = torch.tensor([[1.0, 1.0], [1.0, 1.0], [1.0, 0.5], [1.0, 0.0]])
     starts, commands = names_of(TASK)
     one = planned(TASK, torch.tensor([23.5]), action[:, 1], 5.0)
-    plan = Plan(task="rail", timestep_s=0.1, start_names=starts, command_names=commands, episodes=(one,))
+    plan = RecordingPlan(
+        task="rail", timestep_s=0.1, start_names=starts, command_names=commands, episodes=(one,)
+    )
     return Suggestion(
         plan,
         Proposals(state[0], torch.zeros(2, 1), action),

@@ -4,7 +4,7 @@ import torch
 from toy_walks import FPS, piece
 
 from astra_data.core.errors import BadInputError
-from astra_data.studies.errors import Trial, summary
+from astra_data.studies.errors import Starts, summary
 from astra_data.studies.predictors import Gains
 from astra_data.studies.sequences import Sequences, StepsConfig
 from astra_data.studies.walking import AXES
@@ -15,8 +15,8 @@ CONFIG = StepsConfig(rows=10, history=4)
 def test_errors_are_taken_in_the_bodys_and_the_fields_frame() -> None:
     walk = piece(400, 0)
     walk.broken[200] = True
-    trial = Trial.of(Sequences.of_pieces([walk], FPS, CONFIG), 4, (1, 3))
-    errors = trial.squared_errors(Gains()).double()
+    starts = Starts.of(Sequences.of_pieces([walk], FPS, CONFIG), 4, (1, 3))
+    errors = starts.squared_errors(Gains()).double()
     assert errors.shape[1:] == (2, 5)
     torch.testing.assert_close(errors[..., :2].sum(-1), errors[..., 3:].sum(-1), equal_nan=True)
     # A start one or two steps before the jump is judged after one step only.
@@ -26,21 +26,21 @@ def test_errors_are_taken_in_the_bodys_and_the_fields_frame() -> None:
 
 def test_of_too_many_starts_an_even_share_of_all_pieces_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     sequences = Sequences.of_pieces([piece(400, seed) for seed in range(3)], FPS, CONFIG)
-    every = Trial.of(sequences, 4, (1,))
+    every = Starts.of(sequences, 4, (1,))
     assert len(every.piece) > 300
     monkeypatch.setattr("astra_data.studies.errors.MOST_STARTS", 30)
-    some = Trial.of(sequences, 4, (1,))
+    some = Starts.of(sequences, 4, (1,))
     assert len(some.piece) == 30 and np.bincount(some.piece).min() >= 9
 
 
 def test_horizons_that_no_recording_reaches_are_left_out() -> None:
     """120 rows are 12 steps, of which 4 are the history."""
     sequences = Sequences.of_pieces([piece(120, 0)], FPS, CONFIG)
-    trial = Trial.of(sequences, 4, (1, 3, 8, 9, 40))
-    assert trial.horizons == (1, 3, 8)
-    assert trial.squared_errors(Gains()).isfinite().any(0).all()
+    starts = Starts.of(sequences, 4, (1, 3, 8, 9, 40))
+    assert starts.horizons == (1, 3, 8)
+    assert starts.squared_errors(Gains()).isfinite().any(0).all()
     with pytest.raises(BadInputError, match="expected 20 control steps that count"):
-        Trial.of(sequences, 4, (20, 40))
+        Starts.of(sequences, 4, (20, 40))
 
 
 def test_summaries_weigh_starts_and_compare_with_the_raw_simulator() -> None:

@@ -11,7 +11,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
 from astra_data.exchange.importing import import_dataset
-from astra_data.studies.errors import Trial
+from astra_data.studies.errors import Starts
 from astra_data.studies.joints import ALL, Joints, JointsConfig
 from astra_data.studies.predictors import Response
 from astra_data.studies.recordings import read_recordings
@@ -31,7 +31,7 @@ QUICK = FitConfig(
     hidden_sizes=(16,),
 )
 SEQUENCES = Sequences.of_pieces([piece(1600, seed) for seed in range(2)], FPS, CONFIG)
-TEST = Trial.of(Sequences.of_pieces([piece(1200, 7)], FPS, CONFIG), 6, (1, 10))
+TEST = Starts.of(Sequences.of_pieces([piece(1200, 7)], FPS, CONFIG), 6, (1, 10))
 
 
 def error(name: str, config: FitConfig = QUICK) -> float:
@@ -142,7 +142,7 @@ def test_joints_without_targets_are_predicted_from_their_past(name: str) -> None
     pieces = [piece(800, seed, has_targets=False) for seed in range(2)]
     sequences = Sequences.of_pieces(pieces, FPS, CONFIG)
     short = FitConfig(**{**QUICK.model_dump(), "updates": 2})
-    errors = Trial.of(sequences, 6, (1,)).squared_errors(fit(name, sequences, 6, short, 0, silent))
+    errors = Starts.of(sequences, 6, (1,)).squared_errors(fit(name, sequences, 6, short, 0, silent))
     still = float(sequences.motion.square().mean())
     assert float(errors[..., 0].mean()) <= (1.05 if name == "raw" else 0.3) * still
 

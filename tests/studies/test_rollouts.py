@@ -3,7 +3,7 @@ import torch
 from toy_walks import FPS, GAINS, piece
 
 from astra_data.core.progress import silent
-from astra_data.studies.errors import Trial
+from astra_data.studies.errors import Starts
 from astra_data.studies.motion import MIRROR
 from astra_data.studies.predictors import Gains
 from astra_data.studies.rollouts import FITS, FitConfig, fit, predict
@@ -20,7 +20,7 @@ QUICK = FitConfig(
     head_sizes=(16,),
     hidden_sizes=(32,),
 )
-TEST = Trial.of(Sequences.of_pieces([piece(900, 10)], FPS, CONFIG), 4, (1, 6))
+TEST = Starts.of(Sequences.of_pieces([piece(900, 10)], FPS, CONFIG), 4, (1, 6))
 SEQUENCES = Sequences.of_pieces([piece(1200, seed) for seed in range(2)], FPS, CONFIG)
 
 
@@ -31,7 +31,7 @@ def error(name: str) -> torch.Tensor:
 
 def test_the_raw_simulator_predicts_a_robot_that_follows_commands_at_once() -> None:
     sequences = Sequences.of_pieces([piece(300, 0, gains=(1.0, 1.0, 1.0), late_rows=0)], FPS, CONFIG)
-    errors = Trial.of(sequences, 4, (1, 5)).squared_errors(Gains())
+    errors = Starts.of(sequences, 4, (1, 5)).squared_errors(Gains())
     assert errors.nan_to_num().max() < 1e-8
 
 

@@ -9,7 +9,7 @@ from toy_walks import FPS, piece
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.core.progress import silent
-from astra_data.studies.errors import Trial
+from astra_data.studies.errors import Starts
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.predictors import Gains
 from astra_data.studies.recordings import Piece, Recording
@@ -95,8 +95,8 @@ def test_errors_are_those_of_the_fitted_models_and_fits_are_kept(tmp_path: Path)
     (case,) = found["cases"]
     small, whole = case["sizes"]
     assert (small["minutes"], whole["minutes"]) == pytest.approx((0.1, 1200 / FPS / 60))
-    trial = Trial.of(Sequences.of_pieces(A.pieces, FPS, STEPS), 4, (1, 3))
-    raw = trial.squared_errors(Gains()).double().numpy()
+    starts = Starts.of(Sequences.of_pieces(A.pieces, FPS, STEPS), 4, (1, 3))
+    raw = starts.squared_errors(Gains()).double().numpy()
     cell = whole["models"]["raw"]["0.5"]["forward_m"]
     assert cell["rmse"] == pytest.approx(np.sqrt(np.nanmean(raw[:, 1, 0])), abs=1e-5)
     assert case["starts"] == [int(np.isfinite(raw[:, k, 0]).sum()) for k in range(2)]

@@ -86,9 +86,9 @@ def test_a_judge_that_scatters_by_the_moment_adds_no_other_scatter(judge: Judge)
     state_size, inputs = whole.model.shape.state_size, whole.model.corrections[0][0].in_features
     scatters = ScatterModel(ScatterShape(inputs, state_size, 1)).requires_grad_(False)
     for known in (None, scatters):
-        made = replace(judge, grounding=replace(whole, failures=None, scatters=known))
+        made = replace(judge, grounding=replace(whole, failures=None, scatter_model=known))
         simulator: Any = made.simulator(2).simulator
-        assert simulator.scatters is known
+        assert simulator.scatter_model is known
         assert (simulator.scatter is None) == (known is not None)
 
 

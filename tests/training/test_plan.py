@@ -7,7 +7,7 @@ import torch
 from small_cart import TASK
 
 from astra_data.core.errors import BadInputError
-from astra_data.training.plan import Plan, PlannedCommands
+from astra_data.training.plan import PlannedCommands, RecordingPlan
 
 GOOD: dict[str, Any] = {
     "task": "rail-cart",
@@ -28,7 +28,7 @@ def written(folder: Path, **changed: object) -> Path:
 
 
 def test_commands_are_held_in_turn_and_the_last_one_on(tmp_path: Path) -> None:
-    plan = Plan.load(written(tmp_path), TASK)
+    plan = RecordingPlan.load(written(tmp_path), TASK)
     assert plan.starts.tolist() == [[0.5], [0.0]] and plan.longest == 3
     # -1 to 4 m/s are -1 to 1; 1.5 m/s are in the middle.
     assert plan.actions(TASK)[..., 0].T.tolist() == [[-1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
@@ -65,9 +65,9 @@ def test_they_are_played_step_by_step_and_again_from_the_start() -> None:
 )
 def test_a_plan_of_another_robot_is_refused(tmp_path: Path, changed: dict[str, object], message: str) -> None:
     with pytest.raises(BadInputError, match=message):
-        Plan.load(written(tmp_path, **changed), TASK)
+        RecordingPlan.load(written(tmp_path, **changed), TASK)
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"nowhere\.json cannot be read as a plan: No such file"):
-        Plan.load(tmp_path / "nowhere.json", TASK)
+        RecordingPlan.load(tmp_path / "nowhere.json", TASK)

@@ -135,7 +135,7 @@ def test_all_tries_meet_the_same_starts_and_goals(tmp_path: Path, monkeypatch: p
         seeds.append(seed)
         return Reached(0.0, 40.0)
 
-    monkeypatch.setattr("astra_data.training.restarts.trial", tested)
+    monkeypatch.setattr("astra_data.training.restarts.reached_in_own_world", tested)
     restarted(tmp_path, [-1.0, -0.9], tries=2)
     assert seeds == [7, 7]
 
