@@ -6,8 +6,9 @@ from typing import Annotated, Any
 import typer
 
 from astra_data.cli.arguments import NewName, Out, Source
-from astra_data.cli.recipes import RUNS, Jobs, Root, Seeds, refuse, resumable, run_stage
+from astra_data.cli.recipes import Jobs, Root, Seeds, refuse, resumable, run_stage
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import RUNS
 
 Task = Annotated[
     str,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.naming import RUNS
 
 RecipePath = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="A recipe, a TOML file.", show_default=False)
@@ -35,8 +36,6 @@ Publish = Annotated[
 Add = Annotated[
     bool, typer.Option("--add", help="Add to the published results: those that are not in --root are kept.")
 ]
-
-RUNS = Path("runs")
 
 
 def run(

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.recipes import RUNS, Root
+from astra_data.cli.recipes import Root
+from astra_data.core.naming import RUNS
 
 
 def suggest(

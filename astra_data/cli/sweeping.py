@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.recipes import RUNS, Device, Jobs, RecipePath, Root, Seeds, Until, resumable, show_made
+from astra_data.cli.recipes import Device, Jobs, RecipePath, Root, Seeds, Until, resumable, show_made
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import RUNS
 
 
 class Engine(StrEnum):

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, Tag, TypeAdapter, ValidationE
 from pydantic_core import ErrorDetails
 
 from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.wording import shortened
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 AtOnce = Annotated[int, Field(ge=1, le=10**6)]
@@ -192,7 +193,7 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
     if expected == message:
         return f"{key}: {message[0].lower()}{message[1:]}"
-    return f"{key}: expected {expected}, got {_shortened(error['input'])}"
+    return f"{key}: expected {expected}, got {_shown(error['input'])}"
 
 
 def _choice_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
@@ -265,6 +266,5 @@ def _with_tuples(value: object) -> object:
     return value
 
 
-def _shortened(value: object, limit: int = 60) -> str:
-    text = repr(list(value) if isinstance(value, tuple) else value)
-    return text if len(text) <= limit else f"{text[:limit]}…"
+def _shown(value: object) -> str:
+    return shortened(repr(list(value) if isinstance(value, tuple) else value), 60)

@@ -9,6 +9,8 @@ AstraDataError          all expected errors; the command line prints one line an
 └── DiskError           a disk is full, read-only, failing or gone
 """
 
+from astra_data.core.wording import shortened
+
 
 class AstraDataError(Exception):
     """Any expected error; the command line prints it without a traceback."""
@@ -46,4 +48,4 @@ def in_short(error: Exception) -> str:
     """Return the first sentence of an error message, of bounded length and printable."""
     line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
     shown = "".join(sign if sign.isprintable() else "\ufffd" for sign in line)
-    return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}…"
+    return shortened(shown, _LONGEST)

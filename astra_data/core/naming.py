@@ -4,8 +4,12 @@ A row is a method's name, or that name followed by `_plus`: the method trained w
 """
 
 from collections.abc import Iterable
+from pathlib import Path
 
 PLUS = "_plus"
+
+RUNS = Path("runs")
+"""The folder of the folders of runs, unless another is given."""
 
 
 def is_plus(row: str) -> bool:

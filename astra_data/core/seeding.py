@@ -21,6 +21,11 @@ def generator(seed: int, purpose: str) -> np.random.Generator:
     return np.random.default_rng(derive(seed, purpose))
 
 
+def fresh_seed() -> int:
+    """Return a seed that nobody gave, another one at each call."""
+    return int(np.random.default_rng().integers(2**62))
+
+
 def held_out_episodes(episodes: int, share: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Draw a `share` of so many episodes to hold out, at least one if it is not 0.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.wording import shortened
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
@@ -100,13 +101,8 @@ def _line(ancestor: Ancestor) -> str:
     if ancestor.folder is None:
         return f"{ancestor.reference}  {ancestor.content_hash[:8]}  (not found here)"
     settings = ", ".join(
-        f"{key} {_brief(value)}" for key, value in ancestor.config.items() if value is not None
+        f"{key} {shortened(str(value), 40)}" for key, value in ancestor.config.items() if value is not None
     )
     return f"{ancestor.reference}  {ancestor.content_hash[:8]}  {ancestor.stage}" + (
         f": {settings}" if settings else ""
     )
-
-
-def _brief(value: object, limit: int = 40) -> str:
-    text = str(value)
-    return text if len(text) <= limit else f"{text[:limit]}…"

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column
 from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, TERMINATED, Array, Column
 from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
 from astra_data.exchange.mapping import FLAGS, ColumnMapping, ImportMapping
@@ -58,7 +59,7 @@ class Converter:
                 faults.append(f"columns.{name}: {error}")
                 continue
             self._converted[name] = column
-            columns[name] = cast[:, 0] if column.size == 1 else cast
+            columns[name] = as_column(cast)
             finite &= ok
         if not faults:
             faults += self._size_faults()

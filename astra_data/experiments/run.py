@@ -13,6 +13,7 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
+from astra_data.core.naming import RUNS
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -34,7 +35,6 @@ from astra_data.worlds.own_code import is_own_code
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
 
-RUNS = Path("runs")
 SET_ASIDE = "set_aside"
 """The folder of a run for artefacts that are made again: what took hours to make is not deleted."""
 

@@ -11,7 +11,7 @@ from astra_data.core.config import Config, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
-from astra_data.core.naming import place, reference_of
+from astra_data.core.naming import RUNS, place, reference_of
 from astra_data.core.progress import Progress, part, silent
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.own_methods import add_all
@@ -47,7 +47,7 @@ def suggest(
     row: str | None = None,
     seed: int = 0,
     out: Path | None = None,
-    root: Path = Path("runs"),
+    root: Path = RUNS,
     progress: Progress = silent,
     **settings: Any,  # noqa: ANN401 - of SuggestConfig
 ) -> tuple[Path, Suggestion, str]:

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import RUNS
 from astra_data.core.optional import optional
 from astra_data.experiments.board import board, progress_text
 from astra_data.experiments.display import display
@@ -26,7 +27,7 @@ from astra_data.experiments.held_out import write_errors
 from astra_data.experiments.plan import plan, stage_of, stages_until
 from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
-from astra_data.experiments.run import RUNS, make
+from astra_data.experiments.run import make
 from astra_data.reports.artefacts import CURVE, EVALUATION, Artefact, Evaluation, read_json
 
 TIMED = {"ground": "metrics.json", "train": CURVE, "align": "metrics.json", "evaluate": EVALUATION}

@@ -56,13 +56,13 @@ def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
     save_tensors(path, encoder.state_dict(), {"kind": _TARGET_ENCODER, "sizes": encoder.sizes})
 
 
-def load_target_encoder(path: Path | str, device: str = "cpu") -> TargetEncoder:
+def load_target_encoder(path: Path | str) -> TargetEncoder:
     """Read a target encoder; its parameters are frozen.
 
     Raises:
         BadInputError: the file is missing, holds something else, or is from an older version.
     """
-    with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), device) as (tensors, metadata):
+    with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
         encoder = TargetEncoder(**metadata["sizes"])
         encoder.load_state_dict(tensors)
-    return encoder.to(device).requires_grad_(False).eval()
+    return encoder.requires_grad_(False).eval()

@@ -10,7 +10,7 @@ from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.failure import FailureModel
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.scatter import ScatterModel
-from astra_data.worlds.protocols import PlacedSimulator, WalledSimulator
+from astra_data.worlds.protocols import PlacedSimulator, keep_clear
 
 
 class GroundedSimulator(EpisodeSimulator):
@@ -43,8 +43,8 @@ class GroundedSimulator(EpisodeSimulator):
         Corrections end no closer to walls than `clearance_m`.
         """
         super().__init__(simulator, scatter=scatter)
-        if clearance_m is not None and isinstance(simulator, WalledSimulator):
-            simulator.keep_clear(clearance_m)
+        if clearance_m is not None:
+            keep_clear(simulator, clearance_m)
         self.model, self.members, self.failures, self.scatter_model = model, members, failures, scatter_model
         shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size

@@ -100,9 +100,8 @@ def _bars(results: Results, score: Score) -> Figure:
     rows, simulated = results.methods, f"simulated_{score.measure}"
     intervals = {}
     for method, row in rows.items():
-        summary = row.summary[score.measure]
-        low, high = (np.nan if end is None else end for end in (summary.low, summary.high))
-        intervals[method] = (summary.iqm, low, high)
+        scored = _scored(row, score)
+        intervals[method] = (scored.middle, scored.low, scored.high)
     return score_bars(
         score,
         {method: np.array(row.measures()[score.measure]) for method, row in rows.items()},

@@ -21,6 +21,10 @@ from astra_data.studies.windows import WindowModel
 
 STRENGTHS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Penalties of ridge regression, of which the best is chosen."""
+_EMA_RATE = 0.01
+"""By which ASTRA's target encoder follows, as `GroundConfig.ema_rate` is by default."""
+_LEAST = 1e-3
+"""Least spread that errors are divided by, in the unit of motions: a joint that stands is not all."""
 
 
 class FitConfig(DescentConfig):
@@ -206,11 +210,6 @@ def _descend[M: (WindowModel, HistoryModel)](
         if descent.done % 20 == 0:
             progress(descent.share, f"error² {float(missed.detach()):.3f}")
     return model.requires_grad_(False)
-
-
-_EMA_RATE = 0.01
-_LEAST = 1e-3
-"""Least spread that errors are divided by, in the unit of motions: a joint that stands is not all."""
 
 
 def _noisy(stretch: Stretch, size: float) -> Stretch:

@@ -18,6 +18,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.seeding import fresh_seed
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv, Step
@@ -52,7 +53,7 @@ class SeededSimulatorEnv:
         self.env = env
         self.num_envs = env.num_envs
         self.observation_size, self.action_size = env.observation_size, env.action_size
-        self.reseed(_fresh_seed())
+        self.reseed(fresh_seed())
 
     @property
     def failed(self) -> Tensor:
@@ -185,13 +186,9 @@ def _spaces(env: SeededEnv) -> tuple[Box, Box]:
     return observation, Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-def _fresh_seed() -> int:
-    return int(np.random.default_rng().integers(2**62))
-
-
 def ant_maze(task: str, **options: Any) -> SingleEnv:  # noqa: ANN401 - handed on
     """Build one target environment of `task`; `options` as for `AntMazeEnv`."""
-    return SingleEnv(task_named(task).target(1, seed=_fresh_seed(), **options))
+    return SingleEnv(task_named(task).target(1, seed=fresh_seed(), **options))
 
 
 def ant_maze_vector(
@@ -201,7 +198,7 @@ def ant_maze_vector(
     **options: Any,  # noqa: ANN401 - handed on
 ) -> BatchedVectorEnv:
     """Build `num_envs` target environments of `task`; `options` as for `AntMazeEnv`."""
-    env = task_named(task).target(num_envs, seed=_fresh_seed(), **options)
+    env = task_named(task).target(num_envs, seed=fresh_seed(), **options)
     return BatchedVectorEnv(env, max_episode_steps)
 
 

@@ -5,7 +5,7 @@ Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thre
 `MjData`, which therefore stays in the core's cache; `mj_step` releases the interpreter lock.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -19,6 +19,11 @@ Bools = NDArray[np.bool_]
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
+
+
+def attribute(numbers: Iterable[float]) -> str:
+    """Return numbers as an attribute of MuJoCo's XML."""
+    return " ".join(repr(float(number)) for number in numbers)
 
 
 def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.protocols import SteppedSimulator, WalledSimulator
+from astra_data.worlds.protocols import SteppedSimulator, keep_clear
 from astra_data.worlds.variation import VariedSimulator, noisy_command
 
 
@@ -53,8 +53,7 @@ class DrivenSimulator:
 
     def keep_clear(self, distance_m: float) -> None:
         """Let corrections end no closer to walls than `distance_m`, where there are walls."""
-        if isinstance(self.simulator, WalledSimulator):
-            self.simulator.keep_clear(distance_m)
+        keep_clear(self.simulator, distance_m)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""

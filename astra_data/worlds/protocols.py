@@ -116,6 +116,12 @@ class WalledSimulator(Protocol):
         ...
 
 
+def keep_clear(simulator: object, distance_m: float) -> None:
+    """Let corrections of `simulator` end no closer to walls than `distance_m`, where there are walls."""
+    if isinstance(simulator, WalledSimulator):
+        simulator.keep_clear(distance_m)
+
+
 class VariableSimulator(PlacedSimulator, Protocol):
     """A simulator whose parameters can be set row by row."""
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.core.config import Config, in_order
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.protocols import VariableSimulator, WalledSimulator
+from astra_data.worlds.protocols import VariableSimulator, keep_clear
 
 
 def _above_zero(ends: tuple[float, float]) -> tuple[float, float]:
@@ -220,8 +220,7 @@ class VariedSimulator(ABC):
 
     def keep_clear(self, distance_m: float) -> None:
         """Let corrections end no closer to walls than `distance_m`, where there are walls."""
-        if isinstance(self.simulator, WalledSimulator):
-            self.simulator.keep_clear(distance_m)
+        keep_clear(self.simulator, distance_m)
 
     def by_name(self) -> dict[str, Tensor]:
         """Return the parameters by name, (B, 1) each."""

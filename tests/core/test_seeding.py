@@ -1,6 +1,6 @@
 import numpy as np
 
-from astra_data.core.seeding import derive, generator, held_out_episodes
+from astra_data.core.seeding import derive, fresh_seed, generator, held_out_episodes
 
 
 def test_streams_are_the_same_on_every_machine() -> None:
@@ -25,3 +25,8 @@ def test_episodes_are_held_out_as_many_as_asked_for_and_at_least_one() -> None:
         assert len(held_out) == count and sorted([*training, *held_out]) == list(range(20))
     same, other = (held_out_episodes(20, 0.25, seed)[1].tolist() for seed in (3, 4))
     assert held_out_episodes(20, 0.25, 3)[1].tolist() == same != other
+
+
+def test_a_seed_that_nobody_gave_is_another_each_time() -> None:
+    seeds = {fresh_seed() for _ in range(5)}
+    assert len(seeds) == 5 and all(0 <= seed < 2**63 for seed in seeds)

@@ -1,6 +1,6 @@
 """Lists in sentences."""
 
-from astra_data.core.wording import first_few
+from astra_data.core.wording import first_few, shortened
 
 
 def test_as_many_as_are_shown_are_all_named() -> None:
@@ -16,3 +16,9 @@ def test_others_are_counted() -> None:
 def test_of_nothing_nothing_is_said() -> None:
     """No separator stands alone."""
     assert first_few([], 2) == ""
+
+
+def test_a_long_text_is_cut_and_says_so() -> None:
+    """One that fits stays as it is."""
+    assert shortened("grounding", 9) == "grounding"
+    assert shortened("grounding", 8) == "groundin…"

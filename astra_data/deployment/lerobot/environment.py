@@ -17,6 +17,7 @@ from lerobot.utils.constants import OBS_STR
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import fresh_seed
 from astra_data.dataset.columns import ACTION, GOAL, STATE
 from astra_data.deployment.lerobot.files import TYPE
 from astra_data.worlds.registry import task_named
@@ -86,8 +87,7 @@ class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
         Raises:
             BadInputError: it has none.
         """
-        seed = int(np.random.default_rng().integers(2**62))
-        self._env, self._task = task.target(1, seed=seed, num_threads=1), task
+        self._env, self._task = task.target(1, seed=fresh_seed(), num_threads=1), task
         self.task, self.task_description = task.name, task.instruction
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": task.fps}
         self.render_mode = "rgb_array"

@@ -10,6 +10,9 @@ from torch.nn.functional import elu
 
 from astra_data.core.config import AtOnce, Config, Count, NotNegative, Positive, Share
 
+_STEPS = 200
+"""Gradient steps that move causes."""
+
 
 class CausalConfig(Config):
     """How a causal model is fitted; `sparsity` and `mask_threshold` are its authors'."""
@@ -98,9 +101,7 @@ def fit_causes(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalised
     return model.requires_grad_(False)
 
 
-def descend(
-    model: CausalModel, mask: Tensor, start: Tensor, moves: Tensor, others: Tensor, *, steps: int = 200
-) -> Tensor:
+def descend(model: CausalModel, mask: Tensor, start: Tensor, moves: Tensor, others: Tensor) -> Tensor:
     """Move causes to where a frozen model expects the smallest effects, in the mean over samples.
 
     Args:
@@ -109,14 +110,13 @@ def descend(
         start: the first P causes, the same in all samples, in [-1, 1].
         moves: which of them are moved, (P,) bool.
         others: the other causes of N samples, (N, I - P).
-        steps: gradient steps.
 
     Returns:
         the moved causes (P,), in [-1, 1].
     """
     causes = start.clone().requires_grad_()
     optimizer = torch.optim.Adam([causes], lr=0.02)
-    for _ in range(steps):
+    for _ in range(_STEPS):
         optimizer.zero_grad()
         expected = model(torch.cat([causes.expand(len(others), -1), others], dim=-1), mask).mean()
         (gradient,) = torch.autograd.grad(expected, causes)

@@ -3,7 +3,6 @@
 Lengths, masses, joints and motors are read from the humanoid's model in its initial pose.
 """
 
-from collections.abc import Iterable
 from functools import cache
 
 import mujoco
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from astra_data.worlds.batched_mujoco import Floats
+from astra_data.worlds.batched_mujoco import Floats, attribute
 from astra_data.worlds.humanoid.model import (
     COMMANDED,
     DAMPING,
@@ -79,12 +78,12 @@ class _Mjcf:
         }
         rest = [body for body in range(1, self.humanoid.nbody) if body not in legs]
         head, hip = self.data.geom("head").xpos, self.data.joint("left_hip_y").xanchor
-        trunk = f'<geom type="capsule" size="0.07" fromto="{_text([hip[0], 0, hip[2], *head])}"/>'
+        trunk = f'<geom type="capsule" size="0.07" fromto="{attribute([hip[0], 0, hip[2], *head])}"/>'
         upper = [self._inertia(rest, np.zeros(3)), trunk, self._leg("left"), self._leg("right")]
         names = ("left_hip", "left_knee", "right_hip", "right_knee")
         actuators = []
         for number, name in zip(COMMANDED, names, strict=True):
-            torques = _text(self.humanoid.actuator_forcerange[number])
+            torques = attribute(self.humanoid.actuator_forcerange[number])
             gains = f'kp="{STIFFNESS}" kv="{DAMPING}"'
             actuators.append(f'<position joint="{name}" {gains} forcerange="{torques}"/>')
         return _MODEL.format(upper="\n".join(upper), actuators="\n".join(actuators))
@@ -94,9 +93,9 @@ class _Mjcf:
         foot = self.data.body(f"{side}_foot").xpos
         return _LEG.format(
             side=side,
-            hip=_text(hip),
-            knee=_text(knee - hip),
-            ankle=_text(foot - knee),
+            hip=attribute(hip),
+            knee=attribute(knee - hip),
+            ankle=attribute(foot - knee),
             hip_joint=self._joint(f"{side}_hip_y"),
             knee_joint=self._joint(f"{side}_knee"),
             thigh=self._part(f"{side}_thigh", hip),
@@ -108,7 +107,7 @@ class _Mjcf:
         joint = self.humanoid.joint(name)
         words = {key: float(getattr(joint, key)[0]) for key in ("armature", "damping", "stiffness")}
         attributes = " ".join(f'{key}="{value!r}"' for key, value in words.items())
-        return f'{attributes} limited="true" range="{_text(joint.range)}"'
+        return f'{attributes} limited="true" range="{attribute(joint.range)}"'
 
     def _part(self, name: str, origin: Floats) -> str:
         """Return the body `name` in a frame at `origin`."""
@@ -117,10 +116,12 @@ class _Mjcf:
         radius, half_length, _ = self.humanoid.geom_size[geom]
         centre = self.data.geom_xpos[geom] - origin
         if self.humanoid.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
-            shape = f'type="sphere" size="{radius}" pos="{_text(centre)}"'
+            shape = f'type="sphere" size="{radius}" pos="{attribute(centre)}"'
         else:
             along = half_length * self.data.geom_xmat[geom].reshape(3, 3)[:, 2]
-            shape = f'type="capsule" size="{radius}" fromto="{_text([*(centre - along), *(centre + along)])}"'
+            shape = (
+                f'type="capsule" size="{radius}" fromto="{attribute([*(centre - along), *(centre + along)])}"'
+            )
         return f"{self._inertia([body], origin)}<geom {shape}/>"
 
     def _inertia(self, bodies: list[int], origin: Floats) -> str:
@@ -130,12 +131,8 @@ class _Mjcf:
         turns = self.data.ximat[bodies].reshape(-1, 3, 3)
         own = (turns[:, 1] ** 2 * self.humanoid.body_inertia[bodies]).sum()
         about_y = own + masses @ ((places - centre)[:, [0, 2]] ** 2).sum(axis=1)
-        where = f'pos="{_text(centre - origin)}" mass="{float(masses.sum())!r}"'
-        return f'<inertial {where} diaginertia="{_text([about_y] * 3)}"/>'
-
-
-def _text(values: Iterable[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
+        where = f'pos="{attribute(centre - origin)}" mass="{float(masses.sum())!r}"'
+        return f'<inertial {where} diaginertia="{attribute([about_y] * 3)}"/>'
 
 
 @cache

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.worlds.batched_mujoco import attribute
 from astra_data.worlds.nao.links import (
     ARM,
     FOOT_HEIGHT_M,
@@ -92,7 +93,7 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False, friction: float =
     actuators, sensors = ElementTree.SubElement(root, "actuator"), ElementTree.SubElement(root, "sensor")
     for side, sign in SIDES:
         x, y, z = SHOULDER_M
-        shoulder = ElementTree.SubElement(torso, "body", pos=_words((x, sign * y, z)), euler="0 90 0")
+        shoulder = ElementTree.SubElement(torso, "body", pos=attribute((x, sign * y, z)), euler="0 90 0")
         for link in ARM:
             _body(shoulder, link, side + link.name, sign)
         foot = _leg(torso, side, sign, actuators, ball=ball)
@@ -102,7 +103,7 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False, friction: float =
             name, radius = f"{side}Sole{number}", (_SOLE_POINT_RADIUS_M,)
             place = (along, sign * across, _SOLE_POINT_RADIUS_M - FOOT_HEIGHT_M)
             _geom(foot, name, "sphere", radius, at=place, friction=(0, 0, 0), collides=(0, _FLOOR))
-            ElementTree.SubElement(foot, "site", name=name, pos=_words(place), size="0.008")
+            ElementTree.SubElement(foot, "site", name=name, pos=attribute(place), size="0.008")
             ElementTree.SubElement(sensors, "touch", name=name, site=name)
     equality = ElementTree.SubElement(root, "equality")
     ElementTree.SubElement(equality, "joint", joint1="LHipYawPitch", joint2="RHipYawPitch")
@@ -146,9 +147,9 @@ def _leg(
 def _body(parent: ElementTree.Element, link: Link, name: str, sign: float) -> ElementTree.Element:
     """Add a link's body with its joint, mirrored for `sign` -1."""
     x, y, z = link.offset_m
-    body = ElementTree.SubElement(parent, "body", name=name, pos=_words((x, sign * y, z)))
+    body = ElementTree.SubElement(parent, "body", name=name, pos=attribute((x, sign * y, z)))
     x, y, z = link.centre_m
-    centre, inertia = _words((x, sign * y, z)), _words(link.inertia)
+    centre, inertia = attribute((x, sign * y, z)), attribute(link.inertia)
     ElementTree.SubElement(body, "inertial", pos=centre, mass=str(link.mass_kg), diaginertia=inertia)
     if link.axis is not None:
         low, high = joint_limits_deg(link, sign)
@@ -157,7 +158,7 @@ def _body(parent: ElementTree.Element, link: Link, name: str, sign: float) -> El
             body,
             "joint",
             name=name,
-            axis=_words((x, y, sign * z)),
+            axis=attribute((x, y, sign * z)),
             range=f"{low} {high}",
             armature=str(ARMATURE_KG_M2),
         )
@@ -186,15 +187,11 @@ def _geom(
         "geom",
         name=name,
         type=shape,
-        size=_words(size),
-        pos=_words(at),
-        euler=_words(euler),
-        friction=_words(friction),
+        size=attribute(size),
+        pos=attribute(at),
+        euler=attribute(euler),
+        friction=attribute(friction),
         contype=str(collides[0]),
         conaffinity=str(collides[1]),
         mass="0",
     )
-
-
-def _words(numbers: Sequence[float]) -> str:
-    return " ".join(str(float(number)) for number in numbers)
