@@ -20,6 +20,8 @@ from astra_data.core.durable import (
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 
+CHECKPOINT = "checkpoint.safetensors"
+"""Name, or the end of it, of the file that a training goes on from."""
 _SETTINGS = "config.json"
 """Name of the file of the settings in a folder."""
 
@@ -94,7 +96,7 @@ def _empty(folder: Path) -> None:
 
 def remove_checkpoints(folder: Path) -> None:
     """Remove what trainings in `folder` would have been resumed from; they are over."""
-    for checkpoint in folder.glob("*checkpoint.safetensors"):
+    for checkpoint in folder.glob(f"*{CHECKPOINT}"):
         checkpoint.unlink()
 
 

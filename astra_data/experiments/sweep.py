@@ -28,9 +28,9 @@ from astra_data.experiments.plan import plan, stage_of, stages_until
 from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
 from astra_data.experiments.run import make
-from astra_data.reports.artefacts import CURVE, EVALUATION, Artefact, Evaluation, read_json
+from astra_data.reports.artefacts import CURVE, EVALUATION, METRICS, Artefact, Evaluation, read_json
 
-TIMED = {"ground": "metrics.json", "train": CURVE, "align": "metrics.json", "evaluate": EVALUATION}
+TIMED = {"ground": METRICS, "train": CURVE, "align": METRICS, "evaluate": EVALUATION}
 """Stages that are run for few points at once, and the file with the time that they took."""
 
 COLUMNS = (

@@ -9,6 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from astra_data.core.artefact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Number, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part
@@ -181,7 +182,7 @@ def _fitted(
 ) -> tuple[GroundingModel, dict[str, Any]]:
     """Fit model `number` of `count`, and return its figures; 0 is fitted to all the training episodes."""
     config, training, seed = whole.config, whole.training, whole.seed
-    name = "checkpoint.safetensors"
+    name = CHECKPOINT
     if number:
         seed, name = derive(seed, f"member {number}"), f"member_{number}_{name}"
         drawn = generator(seed, "bootstrap").integers(len(training), size=len(training))

@@ -15,6 +15,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from astra_data.core.artefact import CHECKPOINT
 from astra_data.core.checkpoint import resumed, save_tensors
 from astra_data.core.config import AtOnce, Count, own_settings
 from astra_data.core.errors import BadInputError
@@ -124,7 +125,7 @@ def identify(fitting: Fitting) -> tuple[IdentifiedParameters, dict[str, Any]]:
     """
     wide = fitting.task.varied.wide
     config = own_settings(fitting.settings, CompassConfig(**wide.model_dump()))
-    checkpoint = fitting.folder / "checkpoint.safetensors"
+    checkpoint = fitting.folder / CHECKPOINT
     ranges = config.of_kind(type(wide))
     if not set(ranges.steering).intersection(_varied(ranges)):
         raise BadInputError(f"[compass]: expected a range for at least one of {', '.join(ranges.steering)}")

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from astra_data.core.artefact import CHECKPOINT
 from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
@@ -101,7 +102,7 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
 
 def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
     """Train to the end, resuming from the checkpoint in the folder if there is one; return the losses."""
-    logbook = Logbook(training.folder / "checkpoint.safetensors", iql.load_state_dict)
+    logbook = Logbook(training.folder / CHECKPOINT, iql.load_state_dict)
     points, stopwatch = logbook.points, logbook.stopwatch
     while not iql.done:
         losses = iql.iterate()

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from astra_data.core.artefact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Count, Positive, own_settings
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive, generator
@@ -61,7 +62,7 @@ def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> d
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
 
-    logbook = Logbook(fitting.folder / "checkpoint.safetensors", restore)
+    logbook = Logbook(fitting.folder / CHECKPOINT, restore)
     points, stopwatch = logbook.points, logbook.stopwatch
     for epoch in range(len(points), config.epochs):
         order = generator(fitting.seed, f"grounding epoch {epoch}").permutation(count)

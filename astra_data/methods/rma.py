@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from astra_data.core.artefact import CHECKPOINT
 from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import part
@@ -56,7 +57,7 @@ class TeacherThenStudent(InSimulator):
         adaptation = Adaptation(
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )
-        curve["adaptation"] = optimise(adaptation, env, Ramp(), phase_2, "adaptation_checkpoint.safetensors")
+        curve["adaptation"] = optimise(adaptation, env, Ramp(), phase_2, f"adaptation_{CHECKPOINT}")
         for clock in CLOCKS:
             curve[clock] += curve["adaptation"][clock]
         episodes = training.episodes

@@ -17,6 +17,8 @@ from astra_data.reports.schema import Machine
 EVALUATION = "evaluation.json"
 TRAJECTORIES = "trajectories.safetensors"
 CURVE = "curve.json"
+METRICS = "metrics.json"
+GAP = "gap.json"
 
 
 class Artefact(BaseModel):

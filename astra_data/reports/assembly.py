@@ -11,6 +11,8 @@ from astra_data.core.provenance import origin
 from astra_data.reports.artefacts import (
     CURVE,
     EVALUATION,
+    GAP,
+    METRICS,
     TRAJECTORIES,
     Artefact,
     Band,
@@ -110,10 +112,10 @@ def _read(
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
     episodes = check_alike(evaluations, task)
-    metrics = read.optional("ground", "metrics.json", Metrics)
-    gaps = read.optional("ground", "gap.json", Gap)
+    metrics = read.optional("ground", METRICS, Metrics)
+    gaps = read.optional("ground", GAP, Gap)
     curves = read.optional("train", CURVE, CurveFile)
-    alignments = read.optional("align", "metrics.json", Metrics)
+    alignments = read.optional("align", METRICS, Metrics)
     datasets = {stage: read.datasets(stage) for stage in DATASET_STAGES}
     gap_means = {owner: mean_gap(of_seeds) for owner, of_seeds in gaps.items()}
     rows, uses = {}, {}

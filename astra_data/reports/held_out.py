@@ -11,7 +11,7 @@ from astra_data.core.durable import write_file
 from astra_data.core.naming import place
 from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
-from astra_data.reports.artefacts import Foresight, Gap, Metrics, read_json
+from astra_data.reports.artefacts import GAP, METRICS, Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill, measured
 from astra_data.reports.schema import GapMeans, judged_horizon, shared_horizons
@@ -51,9 +51,7 @@ def write_held_out(
     found: dict[str, dict[int | None, GapMeans]] = {}
     for method in groundings:
         for percent in sorted(percents) or (None,):
-            files = {
-                seed: root / "ground" / method / place(seed, percent) / "gap.json" for seed in sorted(seeds)
-            }
+            files = {seed: root / "ground" / method / place(seed, percent) / GAP for seed in sorted(seeds)}
             gaps = {seed: read_json(Gap, file) for seed, file in files.items() if file.is_file()}
             if gaps:
                 found.setdefault(method, {})[percent] = mean_gap(gaps)
@@ -119,7 +117,7 @@ def _measured(
     """Return how well each part of a grounding foresees failures, on the seeds where some were held out."""
     measured: dict[str, list[Foresight]] = {}
     for seed in seeds:
-        file = root / "ground" / method / place(seed, percent) / "metrics.json"
+        file = root / "ground" / method / place(seed, percent) / METRICS
         for part, one in read_json(Metrics, file).failures.items() if file.is_file() else ():
             if one.auc:
                 measured.setdefault(part, []).append(one)

@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.artefact import finished_folder, remove_checkpoints
+from astra_data.core.artefact import CHECKPOINT, finished_folder, remove_checkpoints
 from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.manifest import write_manifest
@@ -21,6 +21,7 @@ from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.paired_windows import PairedWindows
+from astra_data.reports.artefacts import METRICS
 
 _KEEP_EVERY = 50
 
@@ -88,7 +89,7 @@ def align(
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
     with finished_folder(out, config=settings_text) as folder:
-        descent = Descent(encoder, config, checkpoint=folder / "checkpoint.safetensors")
+        descent = Descent(encoder, config, checkpoint=folder / CHECKPOINT)
         while not descent.is_over:
             torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
             windows, state = training.draw_windows(config.batch_windows, config.window)
@@ -107,7 +108,7 @@ def align(
             "points": descent.points,
             **_agreement(model, encoder, held_out, bandwidths),
         }
-        (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
+        (folder / METRICS).write_text(json.dumps(metrics, indent=1))
         remove_checkpoints(folder)
         write_manifest(folder, {"dataset": episodes.content_hash, "grounding": grounding_digest})
 

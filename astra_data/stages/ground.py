@@ -15,6 +15,7 @@ from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
+from astra_data.reports.artefacts import GAP, METRICS
 from astra_data.worlds.registry import task_named
 
 
@@ -70,7 +71,7 @@ def ground(
         progress(1.0, "gap report")
         gap = gap_report(world, grounding, held_out, seed=seed)
         save_grounding(folder / GROUNDING, grounding, episodes)
-        (folder / "metrics.json").write_text(json.dumps(made | spent | metrics, indent=1))
-        (folder / "gap.json").write_text(json.dumps(gap, indent=1))
+        (folder / METRICS).write_text(json.dumps(made | spent | metrics, indent=1))
+        (folder / GAP).write_text(json.dumps(gap, indent=1))
         remove_checkpoints(folder)
         write_manifest(folder, {"dataset": episodes.content_hash})

@@ -15,6 +15,7 @@ import torch
 from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
+from astra_data.core.artefact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Number, Share, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
@@ -253,7 +254,7 @@ def optimise(
     env: ResumableEnv,
     ramp: Ramp,
     training: Training,
-    checkpoint_name: str = "checkpoint.safetensors",
+    checkpoint_name: str = CHECKPOINT,
 ) -> dict[str, Any]:
     """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
 
