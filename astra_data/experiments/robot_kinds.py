@@ -12,6 +12,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.field_names import HEADING, LENGTH
 from astra_data.exchange.guessing import Field, Floats, Logs
+from astra_data.experiments.kind_errors import errors
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|rot|steer).*")
 _SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
@@ -109,21 +110,32 @@ class Direct:
     Attributes:
         logs: what was recorded.
         moved: the state that each command moves, those of the first commands.
-        is_rate: whether commands are rates of change; otherwise they are where to be.
+        is_rate: of each of these commands, whether it is a rate of change; otherwise it is where to be.
     """
 
     logs: Logs
     moved: tuple[Field, ...]
-    is_rate: bool
+    is_rate: tuple[bool, ...]
 
     template = "direct.py"
 
     @property
     def simulator(self) -> str:
         """What it is and what moves it, in a few words."""
-        pairs = zip(self.moved, self.logs.of("command"), strict=False)
-        listed = ", ".join(f"{state.short} by {command.short}" for state, command in pairs)
-        return f"values that {'change' if self.is_rate else 'are where they are put'} as commanded: {listed}"
+        moves = zip(self.is_rate, self.moved, self.logs.of("command"), strict=False)
+        listed: dict[str, list[str]] = {"change": [], "are where they are put": []}
+        for is_rate, state, command in moves:
+            listed["change" if is_rate else "are where they are put"].append(
+                f"{state.short} by {command.short}"
+            )
+        return "; ".join(
+            f"values that {what} as commanded: {', '.join(pairs)}" for what, pairs in listed.items() if pairs
+        )
+
+    @property
+    def angles(self) -> tuple[bool, ...]:
+        """Which of the states are headings, of which whole turns do not count."""
+        return tuple(HEADING.fullmatch(field.short) is not None for field in self.moved)
 
     @classmethod
     def of(cls, logs: Logs) -> Self:
@@ -144,47 +156,55 @@ class Direct:
             raise BadInputError(
                 "found no state that a command could move: name it as its command, cmd_q1 and q1"
             )
-        return cls(logs, found, cls._are_rates(logs, found))
+        as_rates, as_targets = (
+            errors(cls(logs, found, (is_rate,) * len(found)), 1)[0] for is_rate in (True, False)
+        )
+        return cls(logs, found, tuple((as_rates <= as_targets).tolist()))
 
-    @staticmethod
-    def _are_rates(logs: Logs, moved: tuple[Field, ...]) -> bool:
-        """Return whether states follow better where commands are rates than where they are positions."""
-        errors = np.zeros(2)
-        commands = logs.values(logs.of("command")[: len(moved)])
-        for state, command in zip(logs.values(moved), commands, strict=True):
-            landed = state[:-1] + command[:-1] / logs.rate, command[:-1]
-            errors += [float(np.abs(state[1:] - there).sum()) for there in landed]
-        return bool(errors[0] <= errors[1])
+    def states(self) -> list[Floats]:
+        """Return the values (T, D) of each episode that commands move."""
+        return self.logs.values(self.moved)
+
+    def step(self, state: Floats, command: Floats) -> Floats:
+        """Return where states (B, D) land by commands (B, A)."""
+        command = command[:, : len(self.moved)]
+        return np.where(self.is_rate, state + command / self.logs.rate, command)
 
     def values(self) -> dict[str, str]:
         """Return what its templates name."""
         order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
-        episodes = self.logs.values(self.moved)
+        episodes = self.states()
         starts = np.array([values[0] for values in episodes])
         span = np.ptp(np.concatenate(episodes), axis=0)
         goal, close = _typical([values / span for values in episodes])
         actions, moved = len(self.logs.of("command")), len(self.moved)
         command = "command" if actions == moved else f"command[:, :{moved}]"
-        step, before = 1 / self.logs.rate, np.arange(moved)
-        landed = before + step if self.is_rate else np.ones(moved)
+        rate = f"self.state + TIMESTEP_S * {command}"
+        sentence, step = {
+            (True,): ("Values that change as they are commanded to.", rate),
+            (False,): ("Values that are where they are commanded to be.", command),
+            (False, True): (
+                "Values that change as they are commanded to, or are where they are commanded to be.",
+                f"torch.where(torch.tensor({[*self.is_rate]}), {rate}, {command})",
+            ),
+        }[tuple(sorted(set(self.is_rate)))]
+        before, given = np.arange(moved, dtype=float), np.ones(actions)
         return {
             "names": texts(field.short for field in self.moved),
             "units": texts(field.unit for field in self.moved),
             "goal": _numbers(goal * span, "()"),
             "close": f"{close:.2g}",
             "range": _numbers(span, "()"),
-            "sentence": "Values that change as they are commanded to."
-            if self.is_rate
-            else "Values that are where they are commanded to be.",
+            "sentence": sentence,
             "indices": str([order[field.name] for field in self.moved]),
-            "step": f"self.state + TIMESTEP_S * {command}" if self.is_rate else command,
+            "step": step,
             "actions": str(actions),
             "lows": _numbers(starts.min(axis=0)),
             "highs": _numbers(starts.max(axis=0)),
             "phi": _numbers(episodes[0][0]),
             "before": _numbers(before),
-            "command": _numbers(np.ones(actions)),
-            "after": _numbers(landed),
+            "command": _numbers(given),
+            "after": _numbers(self.step(before, given[None])[0]),
         }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
@@ -82,6 +83,19 @@ def test_logs_of_an_arm_give_its_task(tmp_path: Path) -> None:
     columns = Dataset.open("pairs").columns(["abstract.next_state", "abstract.simulated_next_state"])
     recorded, simulated = columns.values()
     np.testing.assert_allclose(simulated, recorded, atol=1e-4)
+
+
+def test_a_rate_and_a_target_are_stepped_as_the_logs_were(tmp_path: Path) -> None:
+    commands = np.random.default_rng(0).uniform([-1, -90], [1, 90], (60, 2))
+    x = np.concatenate([[0], np.cumsum(0.1 * commands[:-1, 0])])
+    table = np.column_stack([np.arange(60) / 10, x, np.concatenate([[0], commands[:-1, 1]]), commands])
+    np.savetxt("grip.csv", table, "%.6f", ",", header="time,x,grip,cmd_vx,cmd_grip", comments="")
+    write_robot("grip", Path("grip"), [Path("grip.csv")])
+    runpy.run_path("grip/test_grip.py")["test_a_step_of_the_simulator"]()
+    simulator = task_named("grip/grip.py:TASK").make_simulator(59)
+    simulator.reset_to(torch.from_numpy(table[:-1, 1:3]).float())
+    landed = simulator.step(torch.from_numpy(commands[:-1]).float())
+    np.testing.assert_allclose(landed, table[1:, 1:3], atol=1e-4)
 
 
 def test_torques_of_an_arm_give_a_task(tmp_path: Path) -> None:

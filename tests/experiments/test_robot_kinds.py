@@ -89,7 +89,7 @@ def test_others_are_no_unicycle(tmp_path: Path) -> None:
 def test_commands_move_the_states_of_their_names_or_the_first(tmp_path: Path) -> None:
     slow, fast = np.cumsum(T % 5) / 10, np.cumsum(T % 3) / 10
     named = Direct.of(logs(tmp_path, load=T % 4, q2=slow, q1=fast, cmd_q1=T % 3, cmd_q2=T % 5))
-    assert [field.short for field in named.moved] == ["q1", "q2"] and named.is_rate
+    assert [field.short for field in named.moved] == ["q1", "q2"] and named.is_rate == (True, True)
     assert named.values()["indices"] == "[2, 1]"
     assert named.values()["step"] == "self.state + TIMESTEP_S * command"
     assert (named.values()["names"], named.values()["command"]) == ('("q1", "q2")', "[1.0, 1.0]")
@@ -136,8 +136,23 @@ def test_positions_may_be_called_px_and_py(tmp_path: Path) -> None:
 def test_commands_may_be_where_to_be(tmp_path: Path) -> None:
     q = np.concatenate([[0.0], T[:-1] % 5])
     kind = Direct.of(logs(tmp_path, q1=q, cmd_q1=T % 5, cmd_q2=T % 3))
-    assert not kind.is_rate
+    assert kind.is_rate == (False,)
     assert kind.values()["step"] == "command[:, :1]" and kind.values()["after"] == "[1.0]"
+
+
+def test_each_command_is_a_rate_or_a_target_by_itself(tmp_path: Path) -> None:
+    speed, grip = np.sin(T), 90 * np.cos(T)  # errors of the grip alone would outweigh those of x
+    x = np.concatenate([[0], np.cumsum(0.1 * speed)[:-1]])
+    found = logs(tmp_path, x=x, grip=np.concatenate([[0], grip[:-1]]), cmd_vx=speed, cmd_grip=grip)
+    kind = Direct.of(found)
+    assert [field.short for field in kind.moved] == ["x", "grip"] and kind.is_rate == (True, False)
+    assert kind.simulator == (
+        "values that change as commanded: x by vx; "
+        "values that are where they are put as commanded: grip by grip"
+    )
+    step = "torch.where(torch.tensor([True, False]), self.state + TIMESTEP_S * command, command)"
+    assert kind.values()["step"] == step
+    assert (kind.values()["before"], kind.values()["after"]) == ("[0.0, 1.0]", "[0.1, 1.0]")
 
 
 def test_something_has_to_move(tmp_path: Path) -> None:
